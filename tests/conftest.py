@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from sgsst_core.errors import WeightsError
+from sgsst_core.weights import BackboneWeights, fetch_weights, load_weights
+
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -15,3 +18,13 @@ def shared_data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"no real scenes at {DATA}: see README, 'Real data'")
     return DATA
+
+
+@pytest.fixture(scope="session")
+def vgg16_weights() -> BackboneWeights:
+    """The real VGG16 from the user's cache folder, fetched into it once; a test that cannot get it fails."""
+    try:
+        fetch_weights("vgg16")
+        return load_weights("vgg16")
+    except WeightsError as error:
+        pytest.fail(f"the tests need VGG16: {error}")
