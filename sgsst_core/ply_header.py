@@ -1,0 +1,228 @@
+"""PLY headers: what a file declares, checked against its size before anything is read or allocated.
+
+The format is that of Greg Turk, "The PLY Polygon File Format" (1994), with the type names (`float32`, `int8`, ...) that
+came later, and LF, CR LF or CR line ends.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sgsst_core.errors import SceneError
+
+#: A 3DGS header takes 2 kB. A megabyte leaves room for long comments, and keeps a file that is no PLY from being
+#: searched to its end for `end_header`.
+MAX_HEADER_BYTES = 1 << 20
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float32": "f4", "float64": "f8"},
+}
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class PlyProperty:
+    """One `property` line; `kind` and `length_kind` are numpy codes such as f4, the latter for lists only."""
+
+    name: str
+    kind: str
+    length_kind: str | None = None
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """One `element` line with its properties; `count_span` is where the header's bytes hold the count."""
+
+    name: str
+    count: int
+    count_span: tuple[int, int]
+    properties: tuple[PlyProperty, ...] = ()
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether rows differ in length."""
+        return any(prop.length_kind for prop in self.properties)
+
+    def dtype(self, byte_order: str) -> np.dtype:
+        """One row as it lies in a binary file; only for elements without lists."""
+        return np.dtype([(prop.name, byte_order + prop.kind) for prop in self.properties])
+
+    def least_row_bytes(self, text: bool) -> int:
+        """Bytes that a row takes at least; in text a value is a digit and a separator, a list may be empty."""
+        if text:
+            return 2 * len(self.properties)
+        return sum(np.dtype(prop.length_kind or prop.kind).itemsize for prop in self.properties)
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What the header says.
+
+    Attributes:
+        byte_order: "<", ">" or, in text files, "".
+        raw: the header's bytes, `end_header` and its line end included; the data starts at len(raw).
+        elements: in the file's order.
+    """
+
+    byte_order: str
+    raw: bytes
+    elements: tuple[PlyElement, ...]
+
+    @property
+    def text(self) -> bool:
+        """Whether the data is text ("ascii")."""
+        return not self.byte_order
+
+    @property
+    def names(self) -> list[str]:
+        """The elements' names, in the file's order."""
+        return [element.name for element in self.elements]
+
+    @property
+    def vertex(self) -> PlyElement:
+        """The element that holds the Gaussians; raises ValueError where there is none."""
+        return self.elements[self.names.index("vertex")]
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Parse the header of a PLY file, and nothing behind it.
+
+    Raises:
+        SceneError: missing or unreadable file, no PLY header, or a line that the format does not know.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(MAX_HEADER_BYTES)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    opening = re.match(rb"ply(\r\n|\n|\r)", start)
+    if not opening:
+        raise SceneError(f"{path}: has no PLY header (it does not start with 'ply'). Give a 3DGS scene as .ply file.")
+    newline = opening[1]
+    end = start.find(newline + b"end_header" + newline)
+    if end < 0:
+        raise SceneError(f"{path}: the PLY header has no 'end_header' line: the file is truncated or no PLY.")
+    raw = start[: end + len(b"end_header") + 2 * len(newline)]
+    return _parse(path, raw, newline)
+
+
+def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
+    byte_order: str | None = None
+    elements: list[PlyElement] = []
+    position = 0
+    for number, line in enumerate(raw.split(newline), start=1):
+        words = [word.decode("latin-1") for word in line.split()]
+        match words:
+            case [] | ["comment" | "obj_info", *_] | ["end_header"]:
+                pass
+            case ["ply"] if number == 1:
+                pass
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS and byte_order is None:
+                byte_order = _BYTE_ORDERS[name]
+            # 18 digits are more than any file holds, and keep int() away from its limit on long strings
+            case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and byte_order is not None:
+                stop = position + len(line.rstrip())
+                elements.append(PlyElement(name, int(count), (stop - len(count), stop)))
+            case ["property", *definition] if elements and (prop := _property(definition)):
+                elements[-1] = _with_property(path, elements[-1], prop)
+            case _:
+                shown = line[:80].decode("latin-1")
+                raise SceneError(f"{path}: line {number} of the PLY header makes no sense: {shown!r}. Export it again.")
+        position += len(line) + len(newline)
+    if byte_order is None:
+        raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
+    _check_elements(path, elements)
+    return PlyHeader(byte_order, raw, tuple(elements))
+
+
+def _property(definition: list[str]) -> PlyProperty | None:
+    match definition:
+        case ["list", length, kind, name] if length in _TYPES and kind in _TYPES and _TYPES[length][0] != "f":
+            return PlyProperty(name, _TYPES[kind], _TYPES[length])
+        case [kind, name] if kind in _TYPES:
+            return PlyProperty(name, _TYPES[kind])
+    return None
+
+
+def _with_property(path: Path, element: PlyElement, prop: PlyProperty) -> PlyElement:
+    if any(prop.name == other.name for other in element.properties):
+        raise SceneError(f"{path}: the PLY header declares {element.name}.{prop.name} twice. Export the scene again.")
+    return PlyElement(element.name, element.count, element.count_span, (*element.properties, prop))
+
+
+def _check_elements(path: Path, elements: list[PlyElement]) -> None:
+    names = [element.name for element in elements]
+    for element in elements:
+        if names.count(element.name) > 1:
+            raise SceneError(f"{path}: the PLY header declares element {element.name!r} twice. Export the scene again.")
+        if element.count and not element.properties:
+            raise SceneError(f"{path}: element {element.name!r} of the PLY header has no property. Export it again.")
+
+
+def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
+    """Check that the file holds what its header declares; nothing is allocated for it.
+
+    Returns:
+        Where each element's rows start, bytes from the start of a binary file; empty for text, whose rows have no
+        fixed length: there the check is a lower bound, and the rest shows when the rows are parsed.
+
+    Raises:
+        SceneError: the file is shorter than declared.
+    """
+    size = path.stat().st_size
+    position = len(header.raw)
+    least = sum(element.count * element.least_row_bytes(header.text) for element in header.elements)
+    if position + least - (1 if header.text else 0) > size:  # the last line may go without its line end
+        declared = ", ".join(f"{element.count} {element.name}" for element in header.elements)
+        raise SceneError(
+            f"{path}: the header declares {declared}, which takes at least {least} bytes, but only {size - position} "
+            "follow it: the file is truncated or its header is wrong. Copy or export it again."
+        )
+    if header.text:
+        return {}
+    offsets: dict[str, int] = {}
+    for element in header.elements:
+        offsets[element.name] = position
+        if element.has_lists and element.count:
+            position = _end_of_lists(path, element, header.byte_order, position)
+        elif element.count:
+            position += element.count * element.dtype(header.byte_order).itemsize
+        if position > size:
+            raise _truncated(path, element)
+    return offsets
+
+
+def _end_of_lists(path: Path, element: PlyElement, byte_order: str, position: int) -> int:
+    """Step over rows of differing length, each list's own length read and believed only as far as the file goes."""
+    steps = [
+        (struct.Struct(byte_order + np.dtype(prop.length_kind).char) if prop.length_kind else None, np.dtype(prop.kind))
+        for prop in element.properties
+    ]
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for _ in range(element.count):
+            for length, kind in steps:
+                items = 1
+                if length is not None:
+                    if position + length.size > len(data):
+                        raise _truncated(path, element)
+                    items = length.unpack_from(data, position)[0]
+                    if items < 0:
+                        raise SceneError(f"{path}: element {element.name!r} holds a list of length {items}: corrupt.")
+                    position += length.size
+                position += items * kind.itemsize
+        return position
+
+
+def _truncated(path: Path, element: PlyElement) -> SceneError:
+    return SceneError(
+        f"{path}: ends within element {element.name!r}: the file is truncated or its header is wrong. "
+        "Copy or export it again."
+    )
