@@ -254,7 +254,7 @@ def _after_camera(data: bytes, position: int) -> int:
 
 
 def _after_image(data: bytes, position: int) -> int:
-    """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, then 24 bytes each)."""
+    """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, 24 bytes each)."""
     end_of_name = data.index(b"\0", position + 64)
     return end_of_name + 9 + 24 * struct.unpack_from("<Q", data, end_of_name + 1)[0]
 

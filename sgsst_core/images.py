@@ -52,7 +52,9 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     with _opened(path) as image:
         width, height = image.size
-        turned = image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # those that swap the sides
+        # a PNG's EXIF may come behind its pixels, and Pillow would decode them all to look for it
+        known = "exif" in image.info or image.format != "PNG"
+        turned = known and image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # those that swap the sides
         return (height, width) if turned else (width, height)
 
 

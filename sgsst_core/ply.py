@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -219,7 +220,8 @@ class _AsciiHeader(io.BufferedReader):
 def _read_vertices(path: Path, header: PlyHeader) -> NDArray:
     """[rows] structured array of element vertex, memory-mapped for binary files."""
     try:
-        with _AsciiHeader(path, len(header.raw)) as stream:
+        with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list in text
             return PlyData.read(stream)["vertex"].data
     except (PlyParseError, ValueError, OverflowError) as error:
         raise SceneError(f"{path}: cannot be read as PLY: {error}. Export the scene again.") from error
