@@ -1,0 +1,62 @@
+"""The image pyramid: exact 2^s x 2^s box averages, their adjoint, and the number of scales."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+#: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST).
+COARSEST_SHORTER_SIDE = 511
+#: A style image is downscaled only where it is larger than the view by more than this factor.
+STYLE_SIZE_TOLERANCE = 1.1
+
+
+def scale_count(height: int, width: int) -> int:
+    """n_s: halve the shorter side (integer division) until it is at most 511; a small view has one scale."""
+    count, side = 1, min(height, width)
+    while side > COARSEST_SHORTER_SIDE:
+        side //= 2
+        count += 1
+    return count
+
+
+def downscale(image: Tensor, scale: int) -> Tensor:
+    """Box average of image [H, W] or [H, W, c] over 2^scale x 2^scale blocks: [H >> scale, W >> scale, ...].
+
+    Rows and columns that do not fill a block are left out.
+    """
+    if scale == 0:
+        return image
+    side = 1 << scale
+    height, width = image.shape[0] // side, image.shape[1] // side
+    blocks = image[: height * side, : width * side].reshape(height, side, width, side, *image.shape[2:])
+    return blocks.mean(dim=(1, 3))
+
+
+def add_upscaled_(target: Tensor, gradient: Tensor, scale: int, factor: float = 1.0) -> None:
+    """Add the adjoint of `downscale` to target [H, W, c], in place: each pixel of a block gets 4^-scale of its value.
+
+    Args:
+        target: [H, W, c], receives factor * downscale^T gradient.
+        gradient: [H >> scale, W >> scale, c].
+    """
+    side = 1 << scale
+    height, width = gradient.shape[:2]
+    view = target[: height * side, : width * side].unflatten(1, (width, side)).unflatten(0, (height, side))
+    view.add_(gradient[:, None, :, None, :], alpha=factor / side**2)
+
+
+def style_size(style: tuple[int, int], view: tuple[int, int]) -> tuple[int, int]:
+    """Size (height, width) at which a style image is used for views of a size: never enlarged.
+
+    A style whose shorter side is more than 1.1 times the view's is brought down to the view's shorter side.
+    """
+    shorter, target = min(style), min(view)
+    if shorter <= STYLE_SIZE_TOLERANCE * target:
+        return style
+    factor = target / shorter
+    return max(1, round(style[0] * factor)), max(1, round(style[1] * factor))
+
+
+def coverage_pyramid(coverage: Tensor, levels: int) -> list[Tensor]:
+    """Coverage [H, W] box-averaged to each of the first `levels` powers of two."""
+    return [downscale(coverage, level) for level in range(levels)]

@@ -1,0 +1,23 @@
+"""Pictures that tests make: smooth structure with some texture, so that features are neither dead nor noise."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def picture(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    """A picture [height, width, 3] in 0..1 with edges, gradients and texture."""
+    generator = torch.Generator().manual_seed(seed)
+    result = torch.zeros((1, 3, height, width), dtype=torch.float64)
+    for cell, strength in ((64, 0.5), (16, 0.3), (4, 0.2)):
+        coarse = torch.rand((1, 3, height // cell + 2, width // cell + 2), generator=generator, dtype=torch.float64)
+        result += strength * F.interpolate(coarse, size=(height, width), mode="bilinear")
+    return result[0].permute(1, 2, 0).contiguous().to(dtype)
+
+
+def relative_error(value: Tensor, expected: Tensor) -> float:
+    """Norm of the difference over the norm of what is expected."""
+    expected = expected.double()
+    return float((value.double() - expected).norm() / expected.norm())

@@ -1,0 +1,43 @@
+import pytest
+import torch
+
+from sgsst_core.partition import choose_tile_size, partition
+from sgsst_core.vgg import STYLE_LAYERS, layer_stride
+
+
+@pytest.mark.parametrize("size", [(500, 730), (333, 517), (256, 1031), (64, 64), (15, 17), (1, 1)])
+@pytest.mark.parametrize("tile_size", [64, 128, 272, None])
+def test_every_cell_of_every_layer_has_one_owner(size, tile_size):
+    tiles = partition(*size, tile_size, 64)
+    for layer in STYLE_LAYERS:
+        stride = layer_stride(layer)
+        owners = torch.zeros((size[0] // stride, size[1] // stride), dtype=torch.int64)
+        for tile in tiles:
+            view, own = tile.owned_cells(layer, size)
+            owners[view.slices] += 1
+            assert (own.bottom - own.top, own.right - own.left) == (view.bottom - view.top, view.right - view.left)
+            assert own.top >= 0
+            assert own.left >= 0
+            assert own.bottom <= (tile.outer.bottom - tile.outer.top) // stride
+            assert own.right <= (tile.outer.right - tile.outer.left) // stride
+        assert (owners == 1).all()
+
+
+def test_halo_is_clipped_to_the_view():
+    for tile in partition(500, 730, 128, 64):
+        assert tile.outer.top == max(tile.inner.top - 64, 0)
+        assert tile.outer.right == min(tile.inner.right + 64, 730)
+
+
+@pytest.mark.parametrize(("tile_size", "halo"), [(0, 64), (100, 64), (128, 70)])
+def test_misaligned_partitions_are_refused(tile_size, halo):
+    with pytest.raises(ValueError, match="multiples of 16"):
+        partition(500, 730, tile_size, halo)
+
+
+def test_whole_view_where_it_fits_and_a_tile_that_fits_where_not():
+    assert choose_tile_size(512, 512, 64, held=512 * 512 * 1.5, working=0.5) is None
+    for held in (4e6, 1e6, 3e5, 1e5):
+        size = choose_tile_size(3361, 5187, 64, held=held, working=0.5)
+        assert max(tile.outer.pixels for tile in partition(3361, 5187, size, 64)) * 1.5 <= held
+    assert choose_tile_size(3361, 5187, 64, held=1, working=0.5) == 64
