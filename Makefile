@@ -1,0 +1,41 @@
+# Two commands on a fresh machine: `make demo` and `make test`. Both work in an environment of their own, .venv.
+PYTHON ?= python3
+VENV ?= .venv
+DEMO ?= demo
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: demo test clean
+
+# Stylize the built-in scene and say where the results are.
+demo: $(VENV)/installed
+	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/sgsst demo --out $(DEMO)
+
+# Layout, lint, types and all tests.
+test: $(VENV)/installed-dev
+	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+# A file stands for each finished step: a step that was interrupted runs again, one that is up to date does not.
+$(VENV)/created:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "Python 3.11, 3.12 or 3.13 is needed; $(PYTHON) is not one. Try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+$(VENV)/installed: $(VENV)/created pyproject.toml constraints.txt
+	@echo "Installing into $(VENV): some minutes the first time"
+	$(PIP_INSTALL) --editable .
+	@touch $@
+
+$(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt
+	@echo "Installing into $(VENV): some minutes the first time"
+	$(PIP_INSTALL) --editable ".[dev]"
+	@touch $@ $(VENV)/installed
