@@ -16,6 +16,8 @@ from sgsst_core.scene import Scene
 ORBIT_FOCAL = 1.1
 #: Points that place an orbit. A few ten thousand give its distance to well under a percent.
 _ORBIT_SAMPLE = 20_000
+#: Directions from which the framing is tried at most: one each 10 degrees, so that long orbits cost no more.
+_ORBIT_TRIALS = 36
 #: Share of the scene's weight that an orbit's framing looks at: the rest are floaters.
 _ORBIT_QUANTILE = 0.99
 #: A point farther from the centre than this many weighted median distances is background. An object's own points lie
@@ -153,11 +155,11 @@ def orbit(
         raise SettingsError(f"An orbit with up = {list(up)} and elevation = {elevation} degrees has no direction.")
     axis = axis / axis.norm()
     centre, offsets = _robust_points(scene)
-    directions = _ring(count, axis, math.radians(elevation))
+    tilt = math.radians(elevation)
     focal = ORBIT_FOCAL * width
     origin = torch.zeros(3, dtype=torch.float64)
     distance = 0.0
-    for direction in directions:
+    for direction in _ring(min(count, _ORBIT_TRIALS), axis, tilt):
         turned = look_at("", direction, origin, axis, width=width, height=height, focal=focal).world_to_camera[:3, :3]
         x, y, z = (offsets @ turned.T).unbind(1)
         # in view: |x| focal <= (distance + z) width / 2, and the same for y; in front: distance + z >= near
@@ -165,7 +167,7 @@ def orbit(
         distance = max(distance, float((_ORBIT_MARGIN * needed.amax(0) - z).max()))
     return [
         look_at(f"orbit_{i:04d}", centre + distance * d, centre, axis, width=width, height=height, focal=focal)
-        for i, d in enumerate(directions)
+        for i, d in enumerate(_ring(count, axis, tilt))
     ]
 
 
