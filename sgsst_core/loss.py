@@ -52,6 +52,10 @@ class LossTerms:
         """E_style + E_content."""
         return self.gram + self.mean + self.std + self.content
 
+    def divided(self, count: int) -> LossTerms:
+        """Each part divided by a count: the mean of a sum."""
+        return LossTerms(self.gram / count, self.mean / count, self.std / count, self.content / count)
+
     def __add__(self, other: LossTerms) -> LossTerms:
         return LossTerms(
             self.gram + other.gram, self.mean + other.mean, self.std + other.std, self.content + other.content

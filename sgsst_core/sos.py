@@ -17,6 +17,7 @@ from sgsst_core.loss import LayerTarget, LossTerms, StyleGradient, content_loss,
 from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, partition
 from sgsst_core.pyramid import add_upscaled_, coverage_pyramid, downscale, scale_count, style_size
 from sgsst_core.statistics import LayerStatistics, layer_statistics, merge
+from sgsst_core.timing import Timer
 from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, Activations, FeatureGradient, FeatureNetwork, layer_stride
 
 ScaleTarget = Mapping[str, LayerTarget]
@@ -65,6 +66,7 @@ class SosLoss:
         content_weight: lambda_c; 0 leaves the content branch out.
         memory: bytes that activations may take.
         tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
+        timer: receives the seconds of `vgg_forward`, `vgg_backward` and `statistics`.
     """
 
     def __init__(
@@ -74,11 +76,13 @@ class SosLoss:
         content_weight: float = 1.0,
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
+        timer: Timer | None = None,
     ) -> None:
         self.network = network
         self.content_weight = content_weight
         self.memory = memory
         self.tile_size = tile_size
+        self.timer = timer or Timer()
         self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
 
     def tiles(self, height: int, width: int) -> list[PartitionTile]:
@@ -134,7 +138,7 @@ class SosLoss:
         result = torch.empty(shape, dtype=self.network.dtype, device=self.network.device)
         for tile in self.tiles(*size):
             view, own = tile.owned_cells(CONTENT_LAYER, size)
-            features = self.network.forward(image[tile.outer.slices], keep=False).features[CONTENT_LAYER]
+            features = self._forward(image, tile, keep=False).features[CONTENT_LAYER]
             result[view.slices] = features[own.slices]
         return result
 
@@ -182,8 +186,9 @@ class SosLoss:
             return terms, None
         result = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=image.device)
         for tile in list(kept):
-            activations = kept.pop(tile) or self.network.forward(image[tile.outer.slices])
-            result[tile.outer.slices] += self.network.backward(activations, pass_.feature_gradient(tile))
+            activations = kept.pop(tile) or self._forward(image, tile)
+            with self.timer("vgg_backward"):
+                result[tile.outer.slices] += self.network.backward(activations, pass_.feature_gradient(tile))
         return terms, result
 
     def _content(self, view: ViewTarget, scale: int) -> Tensor | None:
@@ -213,14 +218,19 @@ class SosLoss:
         for tile in tiles:
             keep_this = keep and (len(tiles) == 1 or tile.outer.pixels * held <= budget)
             budget -= tile.outer.pixels * held if keep_this else 0
-            activations = self.network.forward(image[tile.outer.slices], keep=keep_this)
-            for layer in self.style_layers:
-                view, own = tile.owned_cells(layer, pass_.size)
-                part = layer_statistics(activations.features[layer][own.slices], pass_.weights(layer, view))
-                merged[layer] = merge(merged[layer], part)
-            content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
+            activations = self._forward(image, tile, keep=keep_this)
+            with self.timer("statistics"):
+                for layer in self.style_layers:
+                    view, own = tile.owned_cells(layer, pass_.size)
+                    part = layer_statistics(activations.features[layer][own.slices], pass_.weights(layer, view))
+                    merged[layer] = merge(merged[layer], part)
+                content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
             kept[tile] = activations if keep_this else None
         return merged, content, kept
+
+    def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
+        with self.timer("vgg_forward"):
+            return self.network.forward(image[tile.outer.slices], keep=keep)
 
 
 class _ScalePass:
@@ -234,6 +244,7 @@ class _ScalePass:
         self._scale = scale
         self._coverage = view.coverage
         self._content_weight = loss.content_weight
+        self._timer = loss.timer
         self._content = content
         self._content_count = 0.0
         if content is not None:
@@ -264,6 +275,10 @@ class _ScalePass:
         """dE/dfeatures of one tile, zero on cells that it does not own."""
 
         def gradient(layer: str, features: Tensor) -> Tensor | None:
+            with self._timer("statistics"):
+                return timed(layer, features)
+
+        def timed(layer: str, features: Tensor) -> Tensor | None:
             view, own = tile.owned_cells(layer, self.size)
             if layer == CONTENT_LAYER:
                 owned = self.content_loss(tile, features)[1]

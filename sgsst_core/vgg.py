@@ -39,13 +39,20 @@ FeatureGradient = Callable[[str, Tensor], Tensor | None]
 
 
 @dataclass
-class _Step:
-    """One layer of the network as it runs: a convolution with its ReLU, or a max pool."""
+class _Convolution:
+    """A 3x3 convolution with its ReLU."""
 
-    name: str  # "conv1_1" or "pool1"
-    weight: Tensor | None = None  # [out, in, 3, 3]
-    bias: Tensor | None = None
-    backward_weight: Tensor | None = None  # [in, out, 3, 3], transposed and flipped
+    layer: str  # "relu1_1"
+    weight: Tensor  # [out, in, 3, 3]
+    bias: Tensor  # [out]
+    backward_weight: Tensor  # [in, out, 3, 3], transposed and flipped
+
+
+class _Pool:
+    """A 2x2 max pool."""
+
+
+_Step = _Convolution | _Pool
 
 
 @dataclass
@@ -96,14 +103,14 @@ class FeatureNetwork:
         left = set(self.layers)
         for block, count in enumerate(CONVOLUTIONS[weights.name], start=1):
             if block > 1:
-                steps.append(_Step(f"pool{block - 1}"))
+                steps.append(_Pool())
             for index in range(1, count + 1):
                 name = f"conv{block}_{index}"
                 weight, bias = weights.convolutions[name]
                 weight = weight.to(self.device, self.dtype)
                 steps.append(
-                    _Step(
-                        name,
+                    _Convolution(
+                        f"relu{block}_{index}",
                         weight.contiguous(memory_format=torch.channels_last),
                         bias.to(self.device, self.dtype),
                         weight.transpose(0, 1).flip(2, 3).contiguous(memory_format=torch.channels_last),
@@ -135,7 +142,7 @@ class FeatureNetwork:
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         kept = Activations({}, size=(height, width))
         for step in self._steps:
-            if step.weight is None:
+            if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
                     break
                 x, positions = F.max_pool2d(x, 2, return_indices=True)
@@ -145,12 +152,12 @@ class FeatureNetwork:
             x = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
             if keep:
                 kept.outputs.append(x)
-            layer = "relu" + step.name[4:]
-            if layer in self.layers:
-                kept.features[layer] = x[0].permute(1, 2, 0)
+            if step.layer in self.layers:
+                kept.features[step.layer] = x[0].permute(1, 2, 0)
         for layer in self.layers:
             if layer not in kept.features:
-                kept.features[layer] = x.new_empty((0, 0, self.channels(layer)))
+                stride = layer_stride(layer)
+                kept.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
         return kept
 
     @torch.no_grad()
@@ -169,12 +176,12 @@ class FeatureNetwork:
         steps = self._steps[: len(kept.outputs)]
         for step in reversed(steps):
             output = kept.outputs.pop()
-            if step.weight is None:
+            if isinstance(step, _Pool):
                 gradient = self._pool_backward(gradient, output, kept)
                 continue
-            features = kept.features.pop("relu" + step.name[4:], None)
+            features = kept.features.pop(step.layer, None)
             if features is not None and features.numel():
-                own = feature_gradient("relu" + step.name[4:], features)
+                own = feature_gradient(step.layer, features)
                 if own is not None:
                     own = own.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
                     gradient = own if gradient is None else gradient.add_(own)
@@ -203,7 +210,7 @@ class FeatureNetwork:
         size = torch.finfo(self.dtype).bits // 8
         held, stride, channels = 0.0, 1, 3
         for step in self._steps:
-            if step.weight is None:
+            if isinstance(step, _Pool):
                 stride *= 2
                 held += 8 * channels / stride**2
             else:

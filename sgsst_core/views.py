@@ -1,0 +1,119 @@
+"""The views of a job: what each is compared with, and what of it is kept in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from sgsst_core.budget import Shelf
+from sgsst_core.camera import Camera
+from sgsst_core.errors import CameraError
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scene import Scene
+from sgsst_core.settings import PositionWeights
+from sgsst_core.sos import SosLoss, ViewTarget
+from sgsst_core.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
+
+#: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
+UNCOVERED_SHARE = 0.01
+#: Below this coverage nothing can be seen of a pixel's colour in 8 bits.
+SEEN_COVERAGE = 1 / 255
+
+PhotoLoader = Callable[[int], Tensor]
+
+
+class Views:
+    """Renders views, and prepares their targets at first use.
+
+    Args:
+        scene: supplies the colours' frozen part and the content (the unstylized render).
+        cameras: one for each view.
+        rasterizer: renders them.
+        loss: prepares the targets.
+        photos: content image [H, W, 3] of a view by its index; None for the unstylized render.
+        position_weights: see `Settings`.
+        memory: bytes that content features, coverage and colours of views may take.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        rasterizer: Rasterizer,
+        loss: SosLoss,
+        *,
+        photos: PhotoLoader | None = None,
+        position_weights: PositionWeights = "auto",
+        memory: int = 1 << 30,
+    ) -> None:
+        self.scene = scene
+        self.cameras = list(cameras)
+        self.rasterizer = rasterizer
+        self.loss = loss
+        self._photos = photos
+        self._sh_rest = scene.sh_rest.to(rasterizer.device)
+        self._means = scene.means.to(rasterizer.device)
+        self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
+        self._targets: Shelf[int, ViewTarget] = Shelf(memory - memory // 4, _target_bytes)
+        self.covered, self.uncovered_share = self._look()
+        self.weighted = position_weights == "on" or (
+            position_weights == "auto" and self.uncovered_share > UNCOVERED_SHARE
+        )
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def _look(self) -> tuple[list[int], float]:
+        """Indices of the views that see anything, and the share of uncovered pixels in those."""
+        covered, uncovered, pixels = [], 0.0, 0
+        for index, camera in enumerate(self.cameras):
+            coverage = self.rasterizer.coverage(camera)
+            if float(coverage.amax()) > SEEN_COVERAGE:
+                covered.append(index)
+                uncovered += float((1 - coverage).sum(dtype=torch.float64))
+                pixels += coverage.numel()
+        if not covered:
+            raise CameraError(
+                f"None of the {len(self.cameras)} cameras sees a Gaussian. Check that cameras and scene belong "
+                "together (same training run, same world), or let --orbit make cameras."
+            )
+        return covered, uncovered / pixels
+
+    def colours(self, index: int, sh_dc: Tensor) -> Tensor:
+        """Colours [N, 3] of a view."""
+        if self.scene.sh_degree == 0:
+            return view_colours(sh_dc, torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device))
+        rest = self._rest.get(index, lambda: rest_colours(self._sh_rest, self._means, self.cameras[index]))
+        return view_colours(sh_dc, rest)
+
+    def render(self, index: int, colours: Tensor) -> Tensor:
+        """Image [H, W, 3] of a view with its colours [N, 3]."""
+        return self.rasterizer.render(colours, self.cameras[index])
+
+    def gradient(self, index: int, image_gradient: Tensor, colours: Tensor) -> Tensor:
+        """dL/dsh_dc [N, 3] from dL/dimage [H, W, 3] and the colours that were rendered."""
+        return view_colours_gradient(self.rasterizer.colour_gradient(image_gradient, self.cameras[index]), colours)
+
+    def content(self, index: int) -> Tensor:
+        """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
+        if self._photos is not None:
+            return self._photos(index)
+        return self.render(index, self.colours(index, self.scene.sh_dc.to(self.rasterizer.device)))
+
+    def target(self, index: int) -> ViewTarget:
+        """What the view is compared with; kept where memory allows."""
+        return self._targets.get(index, lambda: self._make_target(index))
+
+    def _make_target(self, index: int) -> ViewTarget:
+        coverage = self.rasterizer.coverage(self.cameras[index]) if self.weighted else None
+        return self.loss.view_target(self.content(index), coverage)
+
+
+def _tensor_bytes(tensor: Tensor) -> int:
+    return tensor.numel() * tensor.element_size()
+
+
+def _target_bytes(target: ViewTarget) -> int:
+    return sum(_tensor_bytes(t) for t in [*target.content.values(), *(target.coverage or [])])
