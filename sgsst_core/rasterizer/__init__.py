@@ -6,23 +6,32 @@ and the gradient with respect to the colours is W^T dL/dimage.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
+import torch
 from torch import Tensor
 
 from sgsst_core.camera import Camera
+from sgsst_core.constants import NEAR
+from sgsst_core.errors import SettingsError
+from sgsst_core.rasterizer.arguments import Rows
+from sgsst_core.scene import Scene
 
-Rows = tuple[int, int]
+__all__ = ["Rasterizer", "RasterizerName", "Rows", "make_rasterizer"]
+
+RasterizerName = Literal["reference", "cpu", "cached", "cuda"]
 
 
 class Rasterizer(Protocol):
     """Renders one scene's frozen geometry with any colours.
 
     `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colours` are the
-    colours of one view, after spherical harmonics and clamp.
+    colours of one view, after spherical harmonics and clamp. Arguments may come in any floating dtype and from any
+    device; results are on `device`, in float32 (`reference`: in its own dtype). A wrong shape is a ValueError.
     """
 
     name: str
+    device: torch.device
 
     def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Image [h, width, 3] of colours [N, 3] in the camera's rows, over the background."""
@@ -35,3 +44,48 @@ class Rasterizer(Protocol):
     def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
         ...
+
+
+def make_rasterizer(
+    name: str,
+    scene: Scene,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    near: float = NEAR,
+    device: torch.device | str | None = None,
+    **options: Any,
+) -> Rasterizer:
+    """The rasterizer called `name` (`reference`, `cpu`, `cached` or `cuda`) for a scene.
+
+    Args:
+        name: `cpu` computes blend weights in every call, `cached` keeps them (its options `precision` and `max_bytes`),
+            `cuda` is gsplat, `reference` is slow and float64.
+        scene: its geometry must not change while the rasterizer lives.
+        background: three values added where Gaussians leave pixels uncovered.
+        near: near plane in world units.
+        device: for `cached` and `cuda`; None is the CPU and the current CUDA device.
+        options: of the implementation's own constructor.
+
+    Raises:
+        SettingsError: no such rasterizer, a device it cannot use, or gsplat or a GPU missing for `cuda`.
+    """
+    settings: dict[str, Any] = {"background": background, "near": near, **options}
+    if name in ("reference", "cpu"):
+        if device is not None and torch.device(device).type != "cpu":
+            raise SettingsError(f"rasterizer {name!r} runs on the CPU, not on {device}: choose 'cached' or 'cuda'")
+        if name == "cpu":
+            from sgsst_core.rasterizer.cpu import CpuRasterizer
+
+            return CpuRasterizer(scene, **settings)
+        from sgsst_core.rasterizer.reference import ReferenceRasterizer
+
+        return ReferenceRasterizer(scene, **settings)
+    if name == "cached":
+        from sgsst_core.rasterizer.cached import CachedRasterizer
+
+        return CachedRasterizer(scene, device=device or "cpu", **settings)
+    if name == "cuda":
+        from sgsst_core.rasterizer.cuda import CudaRasterizer
+
+        return CudaRasterizer(scene, device=device or "cuda", **settings)
+    raise SettingsError(f"no rasterizer is called {name!r}: choose reference, cpu, cached or cuda")

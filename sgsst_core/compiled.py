@@ -1,0 +1,45 @@
+"""Numba as this package uses it: a decorator, and the one way in which threads run compiled kernels."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numba
+import torch
+
+#: Numba's `workqueue` threading layer, the only one that is always there, aborts the process when two Python threads
+#: are inside a parallel kernel at once. A kernel uses every core anyway, so kernels of one process take turns.
+_TURN = threading.RLock()
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit` with the machine code kept on disk, or in memory only where no folder can be written.
+
+    Numba checks a kept kernel against its own source file alone, so a kernel calls compiled functions of its own
+    module. Multiply-adds are contracted; nothing is reordered unless a kernel asks for it, so results do not depend on
+    threads.
+    """
+    settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, **options}
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **settings)(function)
+        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache can be written
+            return numba.njit(**settings)(function)
+
+    return decorate
+
+
+@contextmanager
+def kernel_threads() -> Iterator[None]:
+    """Run parallel kernels inside: one Python thread at a time, on as many cores as PyTorch was told to use.
+
+    Following `torch.set_num_threads` lets several ranks of one machine share its cores with one setting.
+    """
+    with _TURN:
+        available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        numba.set_num_threads(max(1, min(torch.get_num_threads(), available)))
+        yield

@@ -1,0 +1,61 @@
+"""The numbers of the splatting model, each with the reason for its value.
+
+They are those of gsplat 1.6 and of the method it implements, because a scene is only rendered right with the constants
+that it was trained with. The compiled kernels bake these values in: change them here, nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+
+#: Real spherical harmonics in the order and with the signs of 3DGS files (Sloan, "Efficient Spherical Harmonic
+#: Evaluation", JCGT 2013). Degree 0: 1 / (2 sqrt(pi)).
+SH_C0 = 0.5 / math.sqrt(math.pi)
+#: Degree 1: sqrt(3 / (4 pi)).
+SH_C1 = math.sqrt(0.75 / math.pi)
+#: Degree 2, in the order xy, yz, 2zz - xx - yy, xz, xx - yy.
+SH_C2 = (
+    math.sqrt(15.0 / math.pi) / 2,
+    -math.sqrt(15.0 / math.pi) / 2,
+    math.sqrt(5.0 / math.pi) / 4,
+    -math.sqrt(15.0 / math.pi) / 2,
+    math.sqrt(15.0 / math.pi) / 4,
+)
+#: Degree 3, in the order y(3xx - yy), xyz, y(4zz - xx - yy), z(2zz - 3xx - 3yy), x(4zz - xx - yy), z(xx - yy),
+#: x(xx - 3yy).
+SH_C3 = (
+    -math.sqrt(17.5 / math.pi) / 4,
+    math.sqrt(105.0 / math.pi) / 2,
+    -math.sqrt(10.5 / math.pi) / 4,
+    math.sqrt(7.0 / math.pi) / 4,
+    -math.sqrt(10.5 / math.pi) / 4,
+    math.sqrt(105.0 / math.pi) / 4,
+    -math.sqrt(17.5 / math.pi) / 4,
+)
+
+#: Files store colours around mid-grey, so that coefficients of zero are grey.
+COLOUR_OFFSET = 0.5
+
+#: Variance in square pixels added to both axes of a projected Gaussian: the pixel's own width, without which a Gaussian
+#: smaller than a pixel falls between the pixel centres.
+EPS2D = 0.3
+
+#: A Gaussian never hides everything behind it, so that transmittance stays above zero. gsplat 1.6 and the original use
+#: 0.99; gsplat 1.5.3, the version on the package index, uses 0.999.
+ALPHA_MAX = 0.99
+
+#: Below one grey level of an 8-bit image a contribution is skipped. This also gives a Gaussian a finite support.
+ALPHA_MIN = 1.0 / 255.0
+
+#: A pixel is finished when its transmittance would fall to this: (1 - ALPHA_MAX)^2, two opaque Gaussians.
+TRANSMITTANCE_MIN = 1e-4
+
+#: Nearest depth that is drawn, in world units: what the original viewers use. gsplat trains with 0.01.
+NEAR = 0.2
+
+#: Where the linearised perspective is evaluated: at most this share of the half field of view outside the image, beyond
+#: which the linearisation of a far-off Gaussian would smear it over the picture.
+FRUSTUM_MARGIN = 0.3
+
+#: Edge of a raster tile in pixels. 16 neighbouring pixels of a row fill one 512-bit or two 256-bit vectors.
+RASTER_TILE = 16

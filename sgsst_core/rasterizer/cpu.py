@@ -1,0 +1,142 @@
+"""`cpu`: float32 on all cores; blend weights are recomputed in every call, the lists of Gaussians a view are kept."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.camera import Camera
+from sgsst_core.compiled import kernel_threads
+from sgsst_core.constants import ALPHA_MAX, NEAR
+from sgsst_core.rasterizer import kernels
+from sgsst_core.rasterizer.arguments import (
+    CameraKey,
+    Rows,
+    camera_key,
+    check_colours,
+    check_image_gradient,
+    check_rows,
+)
+from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
+from sgsst_core.scene import Scene
+
+#: Lists are some 15 to 20 bytes for each Gaussian and tile: a few megabytes a view at 1280x720.
+DEFAULT_LIST_BYTES = 1 << 30
+_CPU = torch.device("cpu")
+
+
+class CpuRasterizer:
+    """The protocol of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
+
+    The order of summation is fixed, so results are the same bits for any number of threads, and bands of rows put
+    together are the same bits as the whole view. Lists of views are kept until `max_list_bytes` are reached; of the
+    views beyond only the last is held. (Views come round in turn, and evicting the least recently used would then evict
+    each just before it is needed.)
+
+    Args:
+        scene: its geometry must not change while this object lives.
+        background: three values added where Gaussians leave pixels uncovered.
+        near: near plane in world units.
+        alpha_max: clamp of alpha.
+        max_list_bytes: see above.
+    """
+
+    name = "cpu"
+    device = _CPU
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        near: float = NEAR,
+        alpha_max: float = ALPHA_MAX,
+        max_list_bytes: int = DEFAULT_LIST_BYTES,
+    ) -> None:
+        self.scene = scene
+        self.near = near
+        self.alpha_max = alpha_max
+        self.background: NDArray[np.float32] = np.asarray(background, dtype=np.float32)
+        self._max_list_bytes = max_list_bytes
+        self._lists: dict[CameraKey, RasterLists] = {}
+        self._latest: tuple[CameraKey, RasterLists] | None = None
+        self._kept_bytes = 0
+        self._lock = threading.Lock()
+
+    def lists(self, camera: Camera) -> RasterLists:
+        """The view's Gaussians by raster tile, kept or new.
+
+        Raises:
+            TooManyIntersectionsError: see `build_raster_lists`.
+        """
+        key = camera_key(camera)
+        with self._lock:
+            if key in self._lists:
+                return self._lists[key]
+            if self._latest is not None and self._latest[0] == key:
+                return self._latest[1]
+            self._latest = None  # free its memory before the next one is built
+            lists = build_raster_lists(self.scene, camera, near=self.near)
+            if self._kept_bytes + lists.nbytes <= self._max_list_bytes:
+                self._lists[key] = lists
+                self._kept_bytes += lists.nbytes
+            else:
+                self._latest = (key, lists)
+            return lists
+
+    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
+        values = check_colours(colours, len(self.scene), torch.float32, _CPU).numpy()
+        return self._render(values, camera, check_rows(camera, rows))[0]
+
+    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        nothing = np.zeros((len(self.scene), 3), dtype=np.float32)
+        return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
+
+    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
+        band = check_rows(camera, rows)
+        pixels = check_image_gradient(image_gradient, camera, band, torch.float32, _CPU).numpy()
+        lists = self.lists(camera)
+        projection = lists.projection
+        slot_gradients = np.empty((len(lists.ranks), 3), dtype=np.float32)
+        gradient = np.zeros((len(self.scene), 3), dtype=np.float32)
+        with kernel_threads():
+            kernels.colour_gradient(
+                lists.ranks,
+                lists.slots,
+                lists.starts,
+                projection.values,
+                pixels,
+                band[0],
+                self.alpha_max,
+                slot_gradients,
+            )
+            kernels.add_slots(slot_gradients, lists.first_slots, projection.gaussians, gradient)
+        return torch.from_numpy(gradient)
+
+    def _render(self, colours: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+        """Image and final transmittance of a band."""
+        lists = self.lists(camera)
+        height = band[1] - band[0]
+        image = np.empty((height, camera.width, 3), dtype=np.float32)
+        transmittance = np.empty((height, camera.width), dtype=np.float32)
+        with kernel_threads():
+            kernels.render(
+                lists.ranks,
+                lists.starts,
+                lists.projection.values,
+                lists.projection.gaussians,
+                colours,
+                self.background,
+                band[0],
+                self.alpha_max,
+                image,
+                transmittance,
+            )
+        return torch.from_numpy(image), torch.from_numpy(transmittance)

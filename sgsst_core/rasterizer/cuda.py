@@ -1,0 +1,180 @@
+"""`cuda`: gsplat's kernels (extra `[cuda]`), versions 1.5.3 and 1.6.
+
+gsplat's `rasterization` is taken apart into its public stages. Geometry is frozen, so projection and tile lists are
+computed once a view; and a band is exact, because the projection (whose slopes are clamped to the whole view's frustum)
+does not see the band: the projected centres are moved up by its first row, and tiles that no longer lie in the image
+drop out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from sgsst_core.camera import Camera
+from sgsst_core.constants import EPS2D, NEAR, RASTER_TILE
+from sgsst_core.errors import SettingsError
+from sgsst_core.rasterizer.arguments import (
+    CameraKey,
+    Rows,
+    camera_key,
+    check_colours,
+    check_image_gradient,
+    check_rows,
+)
+from sgsst_core.scene import Scene
+
+
+def load_gsplat() -> ModuleType:
+    """The gsplat module.
+
+    Raises:
+        SettingsError: gsplat is not installed or cannot be loaded.
+    """
+    try:
+        import gsplat
+    except (ImportError, OSError) as error:
+        raise SettingsError(
+            f"rasterizer 'cuda' needs gsplat, which cannot be imported ({error}): install the extra, "
+            "pip install 'sgsst-service[cuda]', on a machine with a CUDA GPU, or choose rasterizer 'cpu' or 'cached'"
+        ) from error
+    return gsplat
+
+
+def gsplat_alpha_max(version: str) -> float:
+    """What gsplat clamps alpha at: 0.99 from version 1.6 on, 0.999 before. It cannot be set."""
+    major, minor = (int("".join(filter(str.isdigit, part)) or 0) for part in version.split(".")[:2])
+    return 0.99 if (major, minor) >= (1, 6) else 0.999
+
+
+@dataclass(frozen=True)
+class _Splats:
+    """A band's Gaussians as gsplat wants them: one image, packed [1, N, ...]."""
+
+    means: Tensor
+    conics: Tensor
+    opacities: Tensor
+    tile_offsets: Tensor
+    flat_ids: Tensor
+
+
+class CudaRasterizer:
+    """The protocol of `sgsst_core.rasterizer.Rasterizer` on one GPU.
+
+    Results are those of gsplat in float32; its backward adds atomically, so gradients repeat to rounding, not to the
+    bit. Projection and lists of the last view and band are kept.
+
+    Args:
+        scene: its geometry must not change while this object lives.
+        background: three values added where Gaussians leave pixels uncovered.
+        near: near plane in world units.
+        device: a CUDA device.
+
+    Raises:
+        SettingsError: gsplat or the GPU is missing.
+    """
+
+    name = "cuda"
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        near: float = NEAR,
+        device: torch.device | str = "cuda",
+    ) -> None:
+        self._gsplat = load_gsplat()
+        self.device = torch.device(device)
+        if self.device.type != "cuda" or not torch.cuda.is_available():
+            raise SettingsError(
+                f"rasterizer 'cuda' on device {str(device)!r}: PyTorch sees no CUDA GPU; choose 'cpu' or 'cached'"
+            )
+        self.scene = scene
+        self.near = near
+        self.alpha_max = gsplat_alpha_max(self._gsplat.__version__)
+        self._background = torch.tensor(background, dtype=torch.float32, device=self.device)
+        self._means = scene.means.to(self.device)
+        self._quats = scene.quats.to(self.device)
+        self._scales = scene.scales.to(self.device).exp()
+        self._opacities = scene.opacities.to(self.device).sigmoid()
+        self._latest: tuple[CameraKey, Rows, _Splats] | None = None
+
+    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
+        band = check_rows(camera, rows)
+        values = check_colours(colours, len(self.scene), torch.float32, self.device)
+        with torch.no_grad():
+            image, alpha = self._rasterize(values, camera, band)
+        return image + (1 - alpha) * self._background
+
+    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        nothing = torch.zeros(len(self.scene), 3, device=self.device)
+        with torch.no_grad():
+            return self._rasterize(nothing, camera, check_rows(camera, rows))[1][..., 0]
+
+    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows.
+
+        The image is linear in the colours, so the gradient is that of <image, image_gradient> at any colours.
+        """
+        band = check_rows(camera, rows)
+        pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
+        with torch.enable_grad():
+            colours = torch.zeros(len(self.scene), 3, device=self.device, requires_grad=True)
+            image, _ = self._rasterize(colours, camera, band)
+            (gradient,) = torch.autograd.grad(image, colours, pixels)
+        return gradient
+
+    def _rasterize(self, colours: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+        """Image [h, width, 3] over black and 1 - T_final [h, width, 1]."""
+        splats = self._splats(camera, band)
+        image, alpha = self._gsplat.rasterize_to_pixels(
+            splats.means,
+            splats.conics,
+            colours[None],
+            splats.opacities,
+            camera.width,
+            band[1] - band[0],
+            RASTER_TILE,
+            splats.tile_offsets,
+            splats.flat_ids,
+        )
+        return image[0], alpha[0]
+
+    def _splats(self, camera: Camera, band: Rows) -> _Splats:
+        """Projection of the whole view, moved into the band, and the band's tile lists."""
+        key = camera_key(camera)
+        if self._latest is None or self._latest[:2] != (key, band):
+            self._latest = None  # free its memory before the next one is built
+            self._latest = (key, band, self._project(camera, band))
+        return self._latest[2]
+
+    @torch.no_grad()
+    def _project(self, camera: Camera, band: Rows) -> _Splats:
+        pose = camera.world_to_camera.to(device=self.device, dtype=torch.float32)[None]
+        intrinsics = torch.tensor(
+            [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=self.device
+        )[None]
+        radii, means, depths, conics, _ = self._gsplat.fully_fused_projection(
+            self._means,
+            None,
+            self._quats,
+            self._scales,
+            pose,
+            intrinsics,
+            camera.width,
+            camera.height,
+            eps2d=EPS2D,
+            near_plane=self.near,
+            opacities=self._opacities,
+        )
+        means = means - means.new_tensor([0, band[0]])
+        across, down = -(-camera.width // RASTER_TILE), -(-(band[1] - band[0]) // RASTER_TILE)
+        _, ids, flat_ids = self._gsplat.isect_tiles(means, radii, depths, RASTER_TILE, across, down)
+        offsets = self._gsplat.isect_offset_encode(ids, 1, across, down)
+        return _Splats(means, conics, self._opacities[None], offsets.reshape(1, down, across), flat_ids)

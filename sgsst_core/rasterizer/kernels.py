@@ -1,0 +1,375 @@
+"""The compiled kernels behind the CPU rasterizers.
+
+Everything goes front to back through the Gaussians of one raster tile, with the blend weights of one Gaussian in a
+block of 16 x 16 that stays in the first-level cache (`_blend`). What is done with the block differs: add it to the
+image times a colour, multiply it with dL/dimage, or keep it. All therefore see the same weights to the last bit.
+
+Accuracy. Offsets between a pixel and a Gaussian are taken in float64 once a row and rounded after the large terms have
+cancelled; along the row at most 15 pixels are added in float32. So neither far-off centres nor needles lose digits.
+
+Determinism. A tile belongs to one thread. A gradient is first kept by itself for each (Gaussian, tile) in a slot of its
+own, the slots of a Gaussian lying side by side; then each Gaussian's slots are added in order.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.compiled import compiled
+from sgsst_core.constants import ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.rasterizer.vectors import LANES, add_scaled, dot_pixels, keep_vector
+
+#: 2^f on [-0.5, 0.5] by interpolation in Chebyshev points: relative error 3e-9, which float32 does not see.
+_EXP2 = np.polynomial.Chebyshev.interpolate(np.exp2, 6, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
+_E0, _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(c) for c in _EXP2)
+_ONE = np.float32(1.0)
+_ZERO = np.float32(0.0)
+#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which then stands in the low bits.
+_ROUNDER = np.float32(12582912.0)
+_EXPONENT_BIAS = np.int32(127)
+_EXPONENT_SHIFT = np.int32(23)
+_LOG2_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
+#: Anything below the cut is skipped; the clamp only keeps the exponent in range.
+_LOG2_FLOOR = np.float32(-64.0)
+_SUPPORT = -math.log2(ALPHA_MIN)
+_T_MIN = np.float32(TRANSMITTANCE_MIN)
+_TILE = RASTER_TILE
+_LAST = RASTER_TILE - 1
+_PIXELS = RASTER_TILE**2
+
+
+@compiled()
+def _blend_row(block, row, u, u_scale, log2_alpha, alpha_max):
+    """Blend one Gaussian into one row of a tile: block[0] is transmittance, block[1] receives the weights.
+
+    A finished pixel's transmittance is stored negated: then no later weight can pass, and one comparison serves both
+    the cut and the memory of it. Returns how many pixels of the row go on.
+    """
+    going_on = 0
+    for i in range(_TILE):
+        offset = u + u_scale * np.float32(i)
+        power = max(log2_alpha - offset * offset, _LOG2_FLOOR)
+        rounded = np.float32(power + _ROUNDER)
+        f = power - (rounded - _ROUNDER)
+        series = _E0 + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
+        two_to = np.int32((rounded.view(np.int32) + _EXPONENT_BIAS) << _EXPONENT_SHIFT).view(np.float32)
+        alpha = min(series * two_to, alpha_max)
+        alpha = alpha if power >= _LOG2_ALPHA_MIN else _ZERO
+        before = block[0, row, i]
+        after = before * (_ONE - alpha)
+        passes = after > _T_MIN
+        block[1, row, i] = alpha * before if passes else _ZERO
+        block[0, row, i] = after if passes else -abs(before)
+        going_on += 1 if passes else 0
+    return going_on
+
+
+@compiled()
+def _blend(block, alive, value, x, y, low, high, alpha_max):
+    """Blend one Gaussian into rows low..high of the tile at pixel (x, y); returns the rows (first, stop) it reached.
+
+    block[1, first:stop] then holds its weights. alive[row] counts the row's unfinished pixels, alive[16] the rows with
+    any.
+    """
+    dx = x + 0.5 - value[0]
+    top = y + 0.5 - value[1]
+    skew, u_scale, w_scale, log2_opacity, extent_y = value[2], value[3], value[4], value[5], value[7]
+    begin = max(np.float64(low), math.ceil(-extent_y - top))
+    end = min(np.float64(high), math.floor(extent_y - top) + 1.0)
+    first, stop = 0, 0
+    for row in range(int(begin), int(end)):
+        if alive[row] == 0:
+            continue
+        dy = top + row
+        w = dy * w_scale
+        rest = log2_opacity + _SUPPORT - w * w
+        u = (dx - skew * dy) * u_scale
+        u_end = u + _LAST * u_scale
+        nearest = max(u, -u_end)
+        if rest < 0 or (nearest > 0 and nearest * nearest > rest):
+            continue
+        if stop == 0:
+            first = row
+            stop = row
+        for gap in range(stop, row):
+            for i in range(_TILE):
+                block[1, gap, i] = _ZERO
+        going_on = _blend_row(
+            block, row, np.float32(u), np.float32(u_scale), np.float32(log2_opacity - w * w), np.float32(alpha_max)
+        )
+        stop = row + 1
+        if going_on == 0:
+            alive[_TILE] -= 1
+        alive[row] = going_on
+    return first, stop
+
+
+@compiled()
+def _start_tile(block, alive, columns, low, high):
+    """Full transmittance in the tile's pixels; those beyond the image or the band start finished."""
+    alive[:] = 0
+    for row in range(_TILE):
+        for i in range(_TILE):
+            inside = low <= row < high and i < columns
+            block[0, row, i] = _ONE if inside else -_ONE
+    for row in range(low, high):
+        alive[row] = columns
+    alive[_TILE] = max(high - low, 0)
+
+
+@compiled()
+def _load_pixels(image, y, x, low, high, columns, pixels):
+    """Rows low..high of a patch of `image` at (y, x) into `pixels` [P, 3, 8]; zero where the patch sticks out."""
+    pixels[:] = _ZERO
+    across = pixels.shape[0] // _TILE
+    for row in range(low, high):
+        line = image[y + row, x : x + columns]
+        for i in range(columns):
+            vector, lane = row * across + i // LANES, i % LANES
+            pixels[vector, 0, lane] = line[i, 0]
+            pixels[vector, 1, lane] = line[i, 1]
+            pixels[vector, 2, lane] = line[i, 2]
+
+
+@compiled()
+def _store_pixels(pixels, transmittance, background, y, x, low, high, columns, image):
+    """The inverse of `_load_pixels`, over the background."""
+    red, green, blue = background[0], background[1], background[2]
+    across = pixels.shape[0] // _TILE
+    for row in range(low, high):
+        line, left = image[y + row, x : x + columns], transmittance[y + row, x : x + columns]
+        for i in range(columns):
+            vector, lane = row * across + i // LANES, i % LANES
+            line[i, 0] = pixels[vector, 0, lane] + left[i] * red
+            line[i, 1] = pixels[vector, 1, lane] + left[i] * green
+            line[i, 2] = pixels[vector, 2, lane] + left[i] * blue
+
+
+@compiled(parallel=True)
+def render(entries, starts, values, gaussians, colours, background, first_row, alpha_max, image, transmittance):
+    """Image [h, width, 3] and final transmittance [h, width] of the rows that begin at `first_row`."""
+    width, last_row = image.shape[1], first_row + image.shape[0]
+    across = (width + _LAST) // _TILE
+    first_tile = first_row // _TILE * across
+    for step in numba.prange((last_row + _LAST) // _TILE * across - first_tile):
+        tile = first_tile + step
+        x, y = tile % across * _TILE, tile // across * _TILE
+        low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
+        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+        alive = np.empty(_TILE + 1, dtype=np.int32)
+        pixels = np.zeros((_PIXELS // LANES, 3, LANES), dtype=np.float32)
+        weights = block.reshape(2 * _PIXELS)
+        _start_tile(block, alive, columns, low, high)
+        for position in range(starts[tile], starts[tile + 1]):
+            if alive[_TILE] == 0:
+                break
+            rank = entries[position]
+            first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
+            colour = colours[gaussians[rank]]
+            begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
+            add_scaled(weights, _PIXELS + begin * LANES, vectors, pixels, begin, colour[0], colour[1], colour[2])
+        for row in range(low, high):
+            for i in range(columns):
+                transmittance[y + row - first_row, x + i] = abs(block[0, row, i])
+        _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
+
+
+@compiled(parallel=True)
+def colour_gradient(entries, slots, starts, values, image_gradient, first_row, alpha_max, slot_gradients):
+    """dL/dcolour of every (Gaussian, tile) in its own slot [E, 3]; zero where the tile is outside the band."""
+    width, last_row = image_gradient.shape[1], first_row + image_gradient.shape[0]
+    across = (width + _LAST) // _TILE
+    for tile in numba.prange(starts.size - 1):
+        x, y = tile % across * _TILE, tile // across * _TILE
+        low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
+        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+        alive = np.empty(_TILE + 1, dtype=np.int32)
+        pixels = np.empty((_PIXELS // LANES, 3, LANES), dtype=np.float32)
+        weights = block.reshape(2 * _PIXELS)
+        _start_tile(block, alive, columns, low, high)
+        _load_pixels(image_gradient, y - first_row, x, low, high, columns, pixels)
+        for position in range(starts[tile], starts[tile + 1]):
+            first, stop = 0, 0
+            if alive[_TILE] > 0:
+                first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
+            begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
+            total = dot_pixels(weights, _PIXELS + begin * LANES, vectors, pixels, begin)
+            slot_gradients[slots[position], 0] = total[0]
+            slot_gradients[slots[position], 1] = total[1]
+            slot_gradients[slots[position], 2] = total[2]
+
+
+@compiled(parallel=True)
+def add_slots(slot_gradients, first_slots, gaussians, gradient):
+    """Add up each Gaussian's slots, in order and in float64, into its row of `gradient` [N, 3]."""
+    for rank in numba.prange(gaussians.size):
+        red, green, blue = 0.0, 0.0, 0.0
+        for slot in range(first_slots[rank], first_slots[rank + 1]):
+            red += slot_gradients[slot, 0]
+            green += slot_gradients[slot, 1]
+            blue += slot_gradients[slot, 2]
+        gaussian = gaussians[rank]
+        gradient[gaussian, 0], gradient[gaussian, 1], gradient[gaussian, 2] = red, green, blue
+
+
+# Kept weights. A strip is half a raster tile, 8 columns wide: as narrow as one 256-bit vector, so that little is stored
+# beside a small Gaussian's support. An item is one Gaussian's rows (first, stop) in one strip, its weights lying row by
+# row.
+
+STRIP = LANES
+_STRIPS = RASTER_TILE // STRIP
+
+
+class Strips(NamedTuple):
+    """Kept weights of a band; I items, R rows of 8 weights. Strips run along the rows of raster tiles.
+
+    Kernels unpack it before their parallel loop: Numba's loops take arrays, not fields of a tuple.
+    """
+
+    item_starts: NDArray[np.int64]  # [strips + 1]
+    row_starts: NDArray[np.int64]  # [strips + 1]
+    gaussians: NDArray[np.int32]  # [I], indices into the scene
+    slots: NDArray[np.int32]  # [I]; the slots of one Gaussian lie side by side
+    rows: NDArray[np.uint8]  # [I, 2], (first, stop) within the strip
+    weights: NDArray[np.float32] | NDArray[np.uint16]  # [8 R], float32 or half-precision bits (see `vectors`)
+
+
+@compiled()
+def _strip_rows(block, column, first, stop):
+    """The rows (first, stop) of a blended block that hold any weight in the strip's columns."""
+    low, high = stop, first
+    for row in range(first, stop):
+        largest = _ZERO
+        for i in range(STRIP):
+            largest = max(largest, block[1, row, column + i])
+        if largest > _ZERO:
+            low = min(low, row)
+            high = row + 1
+    return low, high
+
+
+@compiled(parallel=True)
+def count_weights(entries, slots, starts, values, band, width, alpha_max, items, rows, slot_items):
+    """Items and rows of every strip, and items of every slot: what has to be known before weights are kept."""
+    across = (width + _LAST) // _TILE
+    for tile in numba.prange(starts.size - 1):
+        x, y = tile % across * _TILE, tile // across * _TILE
+        low, high, columns = max(band[0] - y, 0), min(band[1] - y, _TILE), min(width - x, _TILE)
+        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+        alive = np.empty(_TILE + 1, dtype=np.int32)
+        _start_tile(block, alive, columns, low, high)
+        for position in range(starts[tile], starts[tile + 1]):
+            found = 0
+            if alive[_TILE] > 0:
+                first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
+                for side in range(_STRIPS):
+                    a, b = _strip_rows(block, side * STRIP, first, stop)
+                    if a < b:
+                        items[tile * _STRIPS + side] += 1
+                        rows[tile * _STRIPS + side] += b - a
+                        found += 1
+            slot_items[slots[position]] = found
+
+
+@compiled(parallel=True)
+def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slot_starts, strips, transmittance):
+    """Fill the items and weights that `count_weights` counted, and the final transmittance [h, width] of the band."""
+    item_starts, row_starts, item_gaussians, item_slots, item_rows, weights = strips
+    width = transmittance.shape[1]
+    across = (width + _LAST) // _TILE
+    for tile in numba.prange(starts.size - 1):
+        x, y = tile % across * _TILE, tile // across * _TILE
+        low, high, columns = max(band[0] - y, 0), min(band[1] - y, _TILE), min(width - x, _TILE)
+        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+        alive = np.empty(_TILE + 1, dtype=np.int32)
+        blended = block.reshape(2 * _PIXELS)
+        items = item_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
+        kept = row_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
+        _start_tile(block, alive, columns, low, high)
+        for position in range(starts[tile], starts[tile + 1]):
+            if alive[_TILE] == 0:
+                break
+            rank, slot = entries[position], slot_starts[slots[position]]
+            first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
+            for side in range(_STRIPS):
+                a, b = _strip_rows(block, side * STRIP, first, stop)
+                if a >= b:
+                    continue
+                for row in range(a, b):
+                    keep_vector(blended, _PIXELS + row * _TILE + side * STRIP, weights, kept[side] * STRIP)
+                    kept[side] += 1
+                item = items[side]
+                item_gaussians[item], item_slots[item] = gaussians[rank], slot
+                item_rows[item, 0], item_rows[item, 1] = a, b
+                items[side] += 1
+                slot += 1
+        for row in range(low, high):
+            for i in range(columns):
+                transmittance[y + row - band[0], x + i] = abs(block[0, row, i])
+
+
+@compiled(parallel=True)
+def apply_weights(strips, colours, background, transmittance, first_row, image):
+    """Image of kept weights: what `render` computes, without computing a weight."""
+    item_starts, row_starts, item_gaussians, _, item_rows, weights = strips
+    height, width = transmittance.shape
+    across = (width + _LAST) // _TILE * _STRIPS
+    for strip in numba.prange(item_starts.size - 1):
+        x, y = strip % across * STRIP, strip // across * _TILE
+        pixels = np.zeros((_TILE, 3, LANES), dtype=np.float32)
+        begin = row_starts[strip] * STRIP
+        for item in range(item_starts[strip], item_starts[strip + 1]):
+            first = np.int64(item_rows[item, 0])
+            vectors = np.int64(item_rows[item, 1]) - first
+            gaussian = item_gaussians[item]
+            red, green, blue = colours[gaussian, 0], colours[gaussian, 1], colours[gaussian, 2]
+            add_scaled(weights, begin, vectors, pixels, first, red, green, blue)
+            begin += vectors * STRIP
+        low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
+        columns = min(width - x, STRIP)
+        _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
+
+
+@compiled(parallel=True)
+def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
+    """dL/dcolour of every item in its slot: what `colour_gradient` computes, without computing a weight."""
+    item_starts, row_starts, _, item_slots, item_rows, weights = strips
+    height, width = image_gradient.shape[0], image_gradient.shape[1]
+    across = (width + _LAST) // _TILE * _STRIPS
+    for strip in numba.prange(item_starts.size - 1):
+        x, y = strip % across * STRIP, strip // across * _TILE
+        pixels = np.empty((_TILE, 3, LANES), dtype=np.float32)
+        low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
+        _load_pixels(image_gradient, y - first_row, x, low, high, min(width - x, STRIP), pixels)
+        begin = row_starts[strip] * STRIP
+        for item in range(item_starts[strip], item_starts[strip + 1]):
+            first = np.int64(item_rows[item, 0])
+            vectors = np.int64(item_rows[item, 1]) - first
+            total = dot_pixels(weights, begin, vectors, pixels, first)
+            slot = item_slots[item]
+            slot_gradients[slot, 0], slot_gradients[slot, 1], slot_gradients[slot, 2] = total
+            begin += vectors * STRIP
+
+
+@compiled(parallel=True)
+def locate_weights(strips, width, first_row, pixels, gaussians):
+    """Which pixel of the band and which Gaussian each kept weight [8 R] belongs to; padding lies in no pixel."""
+    item_starts, row_starts, item_gaussians, _, item_rows, _ = strips
+    across = (width + _LAST) // _TILE * _STRIPS
+    for strip in numba.prange(item_starts.size - 1):
+        x, y = strip % across * STRIP, strip // across * _TILE
+        place = row_starts[strip] * STRIP
+        for item in range(item_starts[strip], item_starts[strip + 1]):
+            for row in range(item_rows[item, 0], item_rows[item, 1]):
+                for i in range(STRIP):
+                    pixels[place] = (y + row - first_row) * width + x + i
+                    gaussians[place] = item_gaussians[item]
+                    place += 1

@@ -1,0 +1,165 @@
+"""Which Gaussians each raster tile blends, front to back: prepared once a camera, because geometry is frozen."""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.camera import Camera
+from sgsst_core.compiled import compiled, kernel_threads
+from sgsst_core.constants import ALPHA_MIN, NEAR, RASTER_TILE
+from sgsst_core.errors import TooManyIntersectionsError
+from sgsst_core.projection import Projection, project
+from sgsst_core.scene import Scene
+
+#: Positions in the lists are 32-bit numbers.
+MAX_INTERSECTIONS = 2**31 - 1
+_TILE = RASTER_TILE
+_SUPPORT_BITS = -math.log2(ALPHA_MIN)
+
+
+@dataclass(frozen=True)
+class RasterLists:
+    """A view's Gaussians and the raster tiles they touch.
+
+    A Gaussian touches a tile when its support covers a pixel row of the tile somewhere between two of the tile's
+    columns. Every pair has a *slot*; the slots of one Gaussian lie side by side.
+
+    Attributes:
+        projection: V Gaussians, front to back; the lists name them by their place in it, their *rank*.
+        starts: [tiles + 1] int64, where each tile's entries begin; tiles run row by row.
+        ranks: [E] int32, entry -> rank, front to back within a tile.
+        slots: [E] int32, entry -> slot.
+        first_slots: [V + 1] int64, rank -> first slot.
+    """
+
+    projection: Projection
+    starts: NDArray[np.int64]
+    ranks: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    first_slots: NDArray[np.int64]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the lists and the projection keep in memory."""
+        arrays = (
+            self.projection.gaussians,
+            self.projection.values,
+            self.starts,
+            self.ranks,
+            self.slots,
+            self.first_slots,
+        )
+        return sum(a.nbytes for a in arrays)
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """How many raster tiles a view has across and down."""
+    return -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
+
+
+def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> RasterLists:
+    """Project, sort by depth, and list the Gaussians of every raster tile.
+
+    Raises:
+        TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address; counted before
+            anything of that size is allocated.
+    """
+    projection = project(scene, camera, near=near)
+    counts = np.empty(len(projection.gaussians), dtype=np.int64)
+    with kernel_threads():
+        _count_tiles(projection.values, camera.width, camera.height, counts)
+    first_slots = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
+    total = int(first_slots[-1])
+    check_intersections(total, len(counts), camera)
+    across, down = tile_grid(camera)
+    starts = np.zeros(across * down + 1, dtype=np.int64)
+    ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
+    _fill_tiles(projection.values, camera.width, camera.height, starts, ranks, slots)
+    return RasterLists(projection, starts, ranks, slots, first_slots)
+
+
+def check_intersections(total: int, gaussians: int, camera: Camera) -> None:
+    """Raise TooManyIntersectionsError when `total` pairs of Gaussian and raster tile cannot be addressed."""
+    if total > MAX_INTERSECTIONS:
+        raise TooManyIntersectionsError(
+            f"view {camera.name!r} ({camera.width}x{camera.height}): its {gaussians:,} visible Gaussians touch raster "
+            f"tiles {total:,} times, more than the {MAX_INTERSECTIONS:,} that can be addressed. Render at a lower "
+            "resolution, or remove Gaussians so large that they cover much of the view."
+        )
+
+
+@compiled()
+def _tile_rows(value, height):
+    """Pixel rows (first, last) of the image inside a Gaussian's extents; last < first where there are none."""
+    first = max(0.0, math.ceil(value[1] - value[7] - 0.5))
+    last = min(height - 1.0, math.floor(value[1] + value[7] - 0.5))
+    return int(first), int(max(last, -1.0))
+
+
+@compiled()
+def _tile_span(value, first, last, width):
+    """Tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last, all inside its extents.
+
+    The right edge of an ellipse is concave in y and highest at dy = SKEW * EXTENT_Y^2 / EXTENT_X, the left one its
+    mirror image; over an interval each takes its extreme there or at the nearer end.
+    """
+    top, bottom = first + 0.5 - value[1], last + 0.5 - value[1]
+    widest = value[2] * value[7] * (value[7] / value[6]) if value[6] > 0 else 0.0
+    support = value[5] + _SUPPORT_BITS
+    right = min(max(widest, top), bottom)
+    left = min(max(-widest, top), bottom)
+    half_right = math.sqrt(max(support - (right * value[4]) ** 2, 0.0)) / value[3]
+    half_left = math.sqrt(max(support - (left * value[4]) ** 2, 0.0)) / value[3]
+    begin = max(0.0, math.ceil(value[0] + value[2] * left - half_left - 0.5))
+    end = min(width - 1.0, math.floor(value[0] + value[2] * right + half_right - 0.5))
+    if end < begin:
+        return 0, 0
+    return int(begin) // _TILE, int(end) // _TILE + 1
+
+
+@compiled(parallel=True)
+def _count_tiles(values, width, height, counts):
+    """How many tiles each Gaussian touches."""
+    for rank in numba.prange(values.shape[0]):
+        first, last = _tile_rows(values[rank], height)
+        total = 0
+        for down in range(first // _TILE, last // _TILE + 1):
+            begin, end = _tile_span(values[rank], max(first, down * _TILE), min(last, down * _TILE + _TILE - 1), width)
+            total += end - begin
+        counts[rank] = total
+
+
+@compiled()
+def _fill_tiles(values, width, height, starts, ranks, slots):
+    """Counting sort of all pairs by tile; Gaussians come in order of depth, so every tile's list does too."""
+    across = (width + _TILE - 1) // _TILE
+    for pass_ in range(2):
+        slot = 0
+        for rank in range(values.shape[0]):
+            first, last = _tile_rows(values[rank], height)
+            for down in range(first // _TILE, last // _TILE + 1):
+                begin, end = _tile_span(
+                    values[rank], max(first, down * _TILE), min(last, down * _TILE + _TILE - 1), width
+                )
+                for tile in range(down * across + begin, down * across + end):
+                    if pass_ == 0:
+                        starts[tile + 1] += 1
+                    else:
+                        ranks[starts[tile]] = rank
+                        slots[starts[tile]] = slot
+                        starts[tile] += 1
+                        slot += 1
+        if pass_ == 0:
+            for tile in range(starts.size - 1):
+                starts[tile + 1] += starts[tile]
+    for tile in range(starts.size - 1, 0, -1):
+        starts[tile] = starts[tile - 1]
+    starts[0] = 0

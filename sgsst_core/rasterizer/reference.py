@@ -1,0 +1,261 @@
+"""`reference`: plain PyTorch, float64 by default, written from the formulas and sharing no code with the compiled path.
+
+The fast rasterizers are tested against this one. In float32 it is also what a vectorised PyTorch rasterizer can do,
+which is what the benchmark compares with: raster tiles are batched by how many Gaussians they hold, and each batch is a
+handful of tensor operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sgsst_core.camera import Camera
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.rasterizer.arguments import (
+    CameraKey,
+    Rows,
+    camera_key,
+    check_colours,
+    check_image_gradient,
+    check_rows,
+)
+from sgsst_core.scene import Scene
+
+#: (pixel, Gaussian) pairs evaluated at a time; a batch holds about ten tensors of this many values.
+_BATCH_PAIRS = 1 << 20
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians on the image plane, front to back. All [V], float64; the power is (u^2 + w^2) / 2 with
+
+    w = dx / sqrt(p), u = (dy - (q / p) dx) sqrt(p / det) for a covariance [[p, q], [q, r]].
+    """
+
+    gaussians: Tensor  # int64, indices into the scene
+    x: Tensor
+    y: Tensor
+    w_scale: Tensor  # 1 / sqrt(p)
+    skew: Tensor  # q / p
+    u_scale: Tensor  # sqrt(p / det)
+    opacity: Tensor
+    extent_x: Tensor  # half extents in pixels of where alpha >= ALPHA_MIN
+    extent_y: Tensor
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any length but zero."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def perspective_derivative(centres: Tensor, camera: Camera) -> Tensor:
+    """Derivative [N, 2, 3] of the projection at centres [N, 3] in the camera's frame, slopes clamped to the frustum."""
+    x, y, z = centres.unbind(-1)
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    slope_y = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    zero = torch.zeros_like(z)
+    along_x = torch.stack([camera.fx / z, zero, -camera.fx * slope_x / z], dim=-1)
+    along_y = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], dim=-1)
+    return torch.stack([along_x, along_y], dim=-2)
+
+
+def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
+    """EWA projection (Zwicker et al. 2002) in float64; Gaussians that can reach no pixel are left out."""
+    pose = camera.world_to_camera.double()
+    centres = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
+    index = torch.nonzero(centres[:, 2] >= near)[:, 0]
+    centres = centres[index]
+    factor = perspective_derivative(centres, camera) @ pose[:3, :3] @ rotation_matrices(scene.quats[index].double())
+    factor = factor * scene.scales[index].double().exp()[:, None, :]  # covariance without blur: factor factor^T
+    m0, m1 = factor[:, 0], factor[:, 1]
+    p, q, r = (m0 * m0).sum(-1) + EPS2D, (m0 * m1).sum(-1), (m1 * m1).sum(-1) + EPS2D
+    minors = torch.linalg.cross(m0, m1).square().sum(-1)
+    det = minors + EPS2D * (p + r - EPS2D)  # Cauchy-Binet; p and r hold the blur already
+    opacity = scene.opacities[index].double().sigmoid()
+    reach = (2 * (opacity / ALPHA_MIN).log()).clamp_min(0).sqrt()
+    columns = torch.stack(
+        [
+            camera.fx * centres[:, 0] / centres[:, 2] + camera.cx,
+            camera.fy * centres[:, 1] / centres[:, 2] + camera.cy,
+            p.rsqrt(),
+            q / p,
+            (p / det).sqrt(),
+            opacity,
+            reach * p.sqrt(),
+            reach * r.sqrt(),
+        ]
+    )
+    keep = torch.nonzero(columns.isfinite().all(0) & (opacity >= ALPHA_MIN))[:, 0]
+    keep = keep[torch.sort(centres[keep, 2], stable=True).indices]
+    return Splats(index[keep], *columns[:, keep])
+
+
+class ReferenceRasterizer:
+    """The protocol of `sgsst_core.rasterizer.Rasterizer` in plain PyTorch on the CPU.
+
+    Memory is bounded by batches of about a million (pixel, Gaussian) pairs, whatever the size of view and scene. Of
+    what does not depend on colours, the projection and the lists of the last camera are kept.
+
+    Args:
+        scene: its geometry must not change while this object lives.
+        background: three values added where Gaussians leave pixels uncovered.
+        near: near plane in world units.
+        alpha_max: clamp of alpha.
+        dtype: of blending, image and gradient; the projection is float64 always.
+    """
+
+    name = "reference"
+    device = torch.device("cpu")
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        near: float = NEAR,
+        alpha_max: float = ALPHA_MAX,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        self.scene = scene
+        self.near = near
+        self.alpha_max = alpha_max
+        self.dtype = dtype
+        self.background = torch.tensor(background, dtype=dtype)
+        self._prepared: tuple[CameraKey, Splats, Tensor, Tensor] | None = None
+
+    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] of colours [N, 3] in the camera's rows, over the background."""
+        colours = check_colours(colours, len(self.scene), self.dtype, self.device)
+        start, stop = check_rows(camera, rows)
+        image = self.background.expand((stop - start) * camera.width + 1, 3).clone()
+        for pixels, gaussians, weights, left in self._blended(camera, (start, stop)):
+            image[pixels] = torch.bmm(weights, colours[gaussians]) + left[..., None] * self.background
+        return image[:-1].view(stop - start, camera.width, 3)
+
+    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
+        start, stop = check_rows(camera, rows)
+        coverage = torch.zeros((stop - start) * camera.width + 1, dtype=self.dtype)
+        for pixels, _, _, left in self._blended(camera, (start, stop)):
+            coverage[pixels] = 1 - left
+        return coverage[:-1].view(stop - start, camera.width)
+
+    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
+        band = check_rows(camera, rows)
+        flat = check_image_gradient(image_gradient, camera, band, self.dtype, self.device).view(-1, 3)
+        flat = torch.cat([flat, flat.new_zeros(1, 3)])
+        gradient = torch.zeros(len(self.scene), 3, dtype=self.dtype)
+        for pixels, gaussians, weights, _ in self._blended(camera, band):
+            gradient.index_add_(0, gaussians.flatten(), torch.bmm(weights.mT, flat[pixels]).flatten(0, 1))
+        return gradient
+
+    def near_cutoff(self, camera: Camera, tolerance: float, rows: Rows | None = None) -> Tensor:
+        """Pixels [h, width] bool where a decision is close: alpha or transmittance within `tolerance` of its cut.
+
+        There, and only there, another rasterizer's rounding may skip what this one blends, or the other way round.
+        """
+        start, stop = check_rows(camera, rows)
+        doubtful = torch.zeros((stop - start) * camera.width + 1, dtype=torch.bool)
+        for pixels, splats in self._batches(camera, (start, stop)):
+            alpha = self._alpha(splats, pixels, camera, start)
+            after = (1 - torch.where(alpha >= ALPHA_MIN, alpha, 0)).cumprod(-1)
+            before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
+            at_alpha = (alpha / ALPHA_MIN - 1).abs() < tolerance
+            at_end = (after / TRANSMITTANCE_MIN - 1).abs() < tolerance
+            running = before > TRANSMITTANCE_MIN * (1 - tolerance)
+            doubtful[pixels] = ((at_alpha | at_end) & running).any(-1)
+        return doubtful[:-1].view(stop - start, camera.width)
+
+    def _blended(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Batches of pixels [b, n] (indices into the band), Gaussians [b, k], weights [b, n, k], T_final [b, n]."""
+        for pixels, splats in self._batches(camera, band):
+            alpha = self._alpha(splats, pixels, camera, band[0])
+            alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+            after = (1 - alpha).cumprod(-1)
+            going_on = after > TRANSMITTANCE_MIN
+            before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
+            weights = torch.where(going_on, alpha * before, 0)
+            left = torch.where(going_on, after, 1).amin(-1)  # transmittance only falls: its last value is its smallest
+            yield pixels, splats.gaussians, weights, left
+
+    def _alpha(self, splats: Splats, pixels: Tensor, camera: Camera, first_row: int) -> Tensor:
+        """Clamped alpha [b, n, k] of splats [b, k] at pixels [b, n] of the band that begins at `first_row`."""
+        dx = (pixels % camera.width + 0.5).to(self.dtype)[..., None] - splats.x[:, None]
+        dy = (pixels // camera.width + (first_row + 0.5)).to(self.dtype)[..., None] - splats.y[:, None]
+        w = dx * splats.w_scale[:, None]
+        u = (dy - splats.skew[:, None] * dx) * splats.u_scale[:, None]
+        return (splats.opacity[:, None] * ((u * u + w * w) * -0.5).exp()).clamp_max(self.alpha_max)
+
+    def _batches(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Splats]]:
+        """Pixels [b, n] of b raster tiles with the splats [b, k] to blend in them; short lists end in empty splats."""
+        splats, ranks, counts = self._lists(camera)
+        starts = counts.cumsum(0) - counts
+        first_row = torch.arange(len(counts)) // -(-camera.width // RASTER_TILE) * RASTER_TILE
+        inside = (counts > 0) & (first_row < band[1]) & (first_row + RASTER_TILE > band[0])
+        order = torch.nonzero(inside)[:, 0]
+        order = order[counts[order].argsort(descending=True)]
+        while len(order) > 0:
+            longest = int(counts[order[0]])
+            tiles, order = order.tensor_split([max(1, _BATCH_PAIRS // (longest * RASTER_TILE**2))])
+            place = torch.arange(longest)
+            listed = ranks[torch.where(place < counts[tiles, None], starts[tiles, None] + place, len(ranks) - 1)]
+            batch = Splats(*(getattr(splats, field)[listed] for field in Splats.__dataclass_fields__))
+            at_once = max(1, _BATCH_PAIRS // (longest * len(tiles)))
+            for pixels in tile_pixels(tiles, camera, band).split(at_once, dim=1):
+                yield pixels, batch
+
+    def _lists(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
+        """Splats (one empty one added at the end), ranks by raster tile (the empty one last), list lengths."""
+        key = camera_key(camera)
+        if self._prepared is None or self._prepared[0] != key:
+            splats = splat(self.scene, camera, near=self.near)
+            ranks, counts = tile_lists(splats, camera)
+            empty = len(splats.gaussians)
+            ranks = torch.cat([ranks, torch.tensor([empty])])
+            fields = (getattr(splats, field) for field in Splats.__dataclass_fields__)
+            padded = Splats(*(torch.cat([f, f.new_zeros(1)]) for f in fields))
+            values = {f: getattr(padded, f).to(self.dtype) for f in Splats.__dataclass_fields__ if f != "gaussians"}
+            self._prepared = (key, Splats(padded.gaussians, **values), ranks, counts)
+        return self._prepared[1:]
+
+
+def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Ranks of the splats whose extents, a pixel wider, meet each raster tile; and the lists' lengths [tiles]."""
+    across, down = -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
+
+    def tiles(centre: Tensor, extent: Tensor, limit: int) -> tuple[Tensor, Tensor]:
+        first = ((centre - extent - 1) / RASTER_TILE).floor().clamp(0, limit).long()
+        end = ((centre + extent + 1) / RASTER_TILE).ceil().clamp(0, limit).long()
+        return first, (end - first).clamp_min(0)
+
+    left, width = tiles(splats.x, splats.extent_x, across)
+    top, height = tiles(splats.y, splats.extent_y, down)
+    touched = width * height
+    ranks = torch.arange(len(touched)).repeat_interleave(touched)
+    place = torch.arange(len(ranks)) - (touched.cumsum(0) - touched)[ranks]
+    tile = (top[ranks] + place // width[ranks]) * across + left[ranks] + place % width[ranks]
+    tile, order = torch.sort(tile, stable=True)
+    return ranks[order], torch.bincount(tile, minlength=across * down)
+
+
+def tile_pixels(tiles: Tensor, camera: Camera, band: Rows) -> Tensor:
+    """Pixels [b, 256] of raster tiles as indices into the band; one past its end for pixels outside view or band."""
+    across = -(-camera.width // RASTER_TILE)
+    place = torch.arange(RASTER_TILE**2)
+    x = (tiles % across * RASTER_TILE)[:, None] + place % RASTER_TILE
+    y = (tiles // across * RASTER_TILE)[:, None] + place // RASTER_TILE
+    inside = (x < camera.width) & (y >= band[0]) & (y < band[1])
+    return torch.where(inside, (y - band[0]) * camera.width + x, (band[1] - band[0]) * camera.width)
