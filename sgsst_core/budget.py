@@ -10,13 +10,16 @@ import psutil
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
-#: Share of the free memory that a job plans with; the rest is left to its buffers and to other programs.
-FREE_SHARE = 0.6
+#: Shares of all memory and of the free memory that a job plans with at most; the rest is left to its buffers and to
+#: other programs. The first rules as long as half of the memory is free, so that the same job on the same machine makes
+#: the same plan, and rounds the same, whatever else happens to run.
+TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
 
 
 def default_memory_limit() -> int:
     """Bytes that a job may plan with on this machine, now."""
-    return int(psutil.virtual_memory().available * FREE_SHARE)
+    memory = psutil.virtual_memory()
+    return int(min(memory.total * TOTAL_SHARE, memory.available * FREE_SHARE))
 
 
 class Shelf(Generic[K, V]):

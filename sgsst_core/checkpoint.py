@@ -23,15 +23,24 @@ from sgsst_core.stylizer import StepRecord, StylizerState
 
 #: Raised whenever the meaning of a stored value changes.
 FORMAT_VERSION = "1"
-#: Settings that may differ between a checkpoint and the run that goes on from it: they change no step.
+#: Settings that may differ between a checkpoint and the run that goes on from it: they change no step, or (the memory
+#: limit, which decides the partition) no more than its rounding.
 _FREE_SETTINGS = {"max_seconds", "memory_limit"}
 
 
-def fingerprint(scene: Scene, cameras: Sequence[Camera], style: Tensor, settings: Settings, weights: str) -> str:
-    """SHA-256 over all that decides the course of a job; `weights` is the digest of the feature network's."""
-    digest = hashlib.sha256(weights.encode())
+def fingerprint(
+    scene: Scene, cameras: Sequence[Camera], style: Tensor, settings: Settings, weights: str, photos: str = ""
+) -> str:
+    """SHA-256 over all that decides the course of a job.
+
+    Args:
+        weights: digest of the feature network's.
+        photos: whatever identifies the content images; empty for unstylized renders.
+    """
+    digest = hashlib.sha256(repr((weights, photos)).encode())
     for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
-        digest.update(tensor.contiguous().numpy().tobytes())
+        digest.update(repr(tuple(tensor.shape)).encode())
+        digest.update(tensor.contiguous().numpy())
     for camera in cameras:
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
@@ -58,6 +67,8 @@ def save_checkpoint(path: Path, state: StylizerState, job: str) -> None:
         "seconds": repr(state.seconds),
         "queue": json.dumps(state.queue),
         "history": json.dumps([asdict(record) for record in state.history]),
+        "seconds_by_part": json.dumps(state.seconds_by_part),
+        "memory": json.dumps(state.memory),
     }
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata)
@@ -91,6 +102,8 @@ def load_checkpoint(path: Path, job: str) -> StylizerState:
             generator=tensors["generator"].to(torch.uint8),
             queue=json.loads(metadata["queue"]),
             history=[_record(entry) for entry in json.loads(metadata["history"])],
+            seconds_by_part=json.loads(metadata["seconds_by_part"]),
+            memory=json.loads(metadata["memory"]),
         )
     except (SafetensorError, KeyError, ValueError, OSError) as error:
         raise CheckpointError(

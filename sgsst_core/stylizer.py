@@ -5,10 +5,11 @@ The loop prints nothing and writes nothing; what is to be shown or saved goes th
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -100,6 +101,8 @@ class StylizerState:
     generator: Tensor  # state of the random generator
     queue: list[int]  # views left in this round
     history: list[StepRecord] = field(default_factory=list)
+    seconds_by_part: dict[str, float] = field(default_factory=dict)
+    memory: int | None = None  # bytes planned with: partition and kept weights follow from it, and so does rounding
 
 
 class Stylizer:
@@ -136,14 +139,15 @@ class Stylizer:
         self.settings = settings
         self.timer = Timer()
         self.seconds = 0.0
+        self.seconds_by_part: dict[str, float] = {}
         self.step = 0
         self.history: list[StepRecord] = []
-        self._memory = settings.memory_limit or default_memory_limit()
+        self.memory = settings.memory_limit or default_memory_limit()
         self.network = self._network(weights or load_weights("auto"))
         self.loss = SosLoss(
             self.network,
             content_weight=settings.content_weight,
-            memory=int(self._memory * MEMORY_SHARES["activations"]),
+            memory=int(self.memory * MEMORY_SHARES["activations"]),
             timer=self.timer,
         )
         self.views = Views(
@@ -153,7 +157,7 @@ class Stylizer:
             self.loss,
             photos=photos,
             position_weights=settings.position_weights,
-            memory=int(self._memory * MEMORY_SHARES["views"]),
+            memory=int(self.memory * MEMORY_SHARES["views"]),
         )
         self._style = style
         self._style_targets: dict[tuple[int, int], dict[int, dict[str, LayerTarget]]] = {}
@@ -170,13 +174,14 @@ class Stylizer:
         return FeatureNetwork(weights, layers, getattr(torch, self.settings.precision), device)
 
     def _rasterizer(self, scene: Scene, name: str) -> Rasterizer:
-        return make_rasterizer(
-            name,
-            scene,
-            background=self.settings.background,
-            near=self.settings.near,
-            memory=int(self._memory * MEMORY_SHARES["rasterizer"]),
-        )
+        """The rasterizer of a name; "auto" is gsplat on a GPU that has it, else kept blend weights as memory allows."""
+        options: dict[str, Any] = {"background": self.settings.background, "near": self.settings.near}
+        if name == "auto":
+            gsplat = self.network.device.type == "cuda" and importlib.util.find_spec("gsplat") is not None
+            name = "cuda" if gsplat else "cached"
+        if name == "cached":
+            options |= {"device": self.network.device, "max_bytes": int(self.memory * MEMORY_SHARES["rasterizer"])}
+        return make_rasterizer(name, scene, **options)
 
     def _phase_1_steps(self) -> int:
         """Phase 1 is left out where the coarsest scale is the only one (it would be phase 2), but in `paper`."""
@@ -218,6 +223,8 @@ class Stylizer:
             self._update(gradient)
         self.step += 1
         self.seconds += time.perf_counter() - started
+        for name, seconds in self.timer.seconds.items():
+            self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
         record = StepRecord(self.step, stage, index, self.seconds, result.loss, result.terms)
         self.history.append(record)
         return record
@@ -260,10 +267,12 @@ class Stylizer:
             generator=self._generator.get_state().clone(),
             queue=list(self._queue),
             history=list(self.history),
+            seconds_by_part=dict(self.seconds_by_part),
+            memory=self.memory,
         )
 
     def load_state(self, state: StylizerState) -> None:
-        """Go on from a state of a stylizer that was made with the same arguments."""
+        """Go on from a state of a stylizer with the same arguments, and state.memory as its memory limit."""
         with torch.no_grad():
             self.sh_dc.copy_(state.sh_dc)
         if state.step:
@@ -277,6 +286,7 @@ class Stylizer:
         self._generator.set_state(state.generator)
         self._queue = list(state.queue)
         self.history = list(state.history)
+        self.seconds_by_part = dict(state.seconds_by_part)
 
 
 def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:

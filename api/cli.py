@@ -1,0 +1,349 @@
+"""The `sgsst` command."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+from api.interrupt import stop_on_signal
+from api.values import parse_background, parse_bytes
+from sgsst_core.constants import NEAR
+from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
+from sgsst_core.settings import PositionWeights, Precision, PresetName, Settings, make_settings
+
+if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
+    from api.jobs import Job, Result, StylizeRequest
+    from sgsst_core.stylizer import Progress
+
+#: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
+BAD_INPUT, FAILURE = 2, 1
+#: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
+MAX_RESOLUTION = 16384
+
+app = typer.Typer(
+    help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_help=True)
+app.add_typer(weights_app, name="weights")
+out_console = Console(highlight=False, markup=False, soft_wrap=True)
+error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)]
+CamerasOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="cameras.json (INRIA), a COLMAP sparse model's folder, or transforms.json (nerfstudio, Blender)."
+    ),
+]
+OrbitOption = Annotated[int | None, typer.Option(min=1, help="Instead of --cameras: N views around the scene.")]
+UpOption = Annotated[
+    Literal["x", "-x", "y", "-y", "z", "-z"], typer.Option(help="Axis that points up in the scene, for --orbit.")
+]
+ViewsOption = Annotated[int | None, typer.Option(min=1, help="Take N of the cameras, spread evenly.")]
+ResolutionOption = Annotated[
+    int | None, typer.Option(min=1, max=MAX_RESOLUTION, help="Pixels of every view's longer side. [the cameras' own]")
+]
+BackgroundOption = Annotated[
+    Any, typer.Option(parser=parse_background, metavar="COLOUR", help="black, white, or R,G,B from 0 to 255.")
+]
+NearOption = Annotated[float, typer.Option(min=1e-6, help="Near plane, in the scene's units.")]
+DropOption = Annotated[bool, typer.Option("--drop-invalid", help="Leave Gaussians with NaN or infinite values out.")]
+
+
+@app.callback(invoke_without_command=True)
+def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
+    if version:
+        from sgsst_core.report import program_version
+
+        out_console.print(f"sgsst {program_version()}")
+        raise typer.Exit()
+
+
+@app.command()
+def stylize(
+    scene: SceneArgument,
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Stylized PLY to write; report and pictures go beside it.")],
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    preset: Annotated[PresetName, typer.Option(help="Where the settings below start from.")] = "standard",
+    steps_coarse: Annotated[int | None, typer.Option(min=0, help="Steps on the coarsest scale.")] = None,
+    steps_sos: Annotated[int | None, typer.Option(min=0, help="Steps on all scales.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Adam's learning rate, then constant.")] = None,
+    content_weight: Annotated[float | None, typer.Option(min=0, help="Weight of the content term. [1]")] = None,
+    position_weights: Annotated[
+        PositionWeights | None,
+        typer.Option(help="Weigh positions by coverage, so that an empty surround does not count. [auto; paper: off]"),
+    ] = None,
+    background: BackgroundOption = "black",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order of views.")] = 0,
+    precision: Annotated[Precision, typer.Option(help="Of the feature network.")] = "float32",
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: Annotated[
+        Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
+    ] = None,
+    max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and write the result.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")] = False,
+) -> None:
+    """Give a scene the style of a picture."""
+    settings = make_settings(
+        preset,
+        steps_coarse=steps_coarse,
+        steps_sos=steps_sos,
+        learning_rate=learning_rate,
+        content_weight=content_weight,
+        position_weights=position_weights,
+        max_resolution=resolution,
+        background=background,
+        near=near,
+        seed=seed,
+        precision=precision,
+        memory_limit=memory_limit,
+        max_seconds=max_seconds,
+    )
+    from api.jobs import SceneRequest, StylizeRequest
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    _stylize(StylizeRequest(source, style, images, out, backbone, resume, settings), sys.argv[1:])
+
+
+def _stylize(request: StylizeRequest, arguments: Sequence[str]) -> None:
+    """Prepare, run, and tell what was decided and what came out; `arguments` are for the command to go on with."""
+    from api.jobs import execute, prepare
+
+    with _status("Reading the scene and preparing its views"):
+        job = prepare(request)
+    _announce(job)
+    with (
+        stop_on_signal(lambda: error_console.print("Stopping after this step; again Ctrl-C aborts at once.")) as stop,
+        _training_bar(job) as progress,
+    ):
+        result = execute(job, progress=progress, stop=stop, warn=error_console.print)
+    command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
+    if result.stopped == "interrupted":
+        error_console.print(
+            f"Stopped at step {job.stylizer.step} of {job.stylizer.total}; saved in {job.outputs.checkpoint}.\n"
+            f"To go on, run:\n{command}"
+        )
+        raise typer.Exit(stop.exit_code)
+    _conclude(job, result, command)
+
+
+def _announce(job: Job) -> None:
+    from api.jobs import describe
+
+    for heading, line in describe(job):
+        out_console.print(f"{heading + ':':<18}{line}")
+    if job.state is None and job.outputs.checkpoint.exists():
+        out_console.print(
+            f"{'note:':<18}{job.outputs.checkpoint} of an earlier run is there. This run starts anew and will "
+            "replace it; --resume would go on from it."
+        )
+
+
+def _conclude(job: Job, result: Result, command: str) -> None:
+    from sgsst_core.report import mean_loss
+
+    before, after = mean_loss(result.before), mean_loss(result.after)
+    out_console.print(f"{'loss:':<18}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    outputs = job.outputs
+    paths = [("stylized scene", outputs.ply)]
+    if result.report_error is None:
+        paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.report)]
+    for heading, path in paths:
+        out_console.print(f"{heading + ':':<18}{path}")
+    if result.stopped == "max-seconds":
+        out_console.print(
+            f"The time was up at step {job.stylizer.step} of {job.stylizer.total}. The checkpoint stays: to go on, "
+            f"give more time (--max-seconds counts from the beginning):\n{command}"
+        )
+    if result.report_error is not None:
+        error_console.print(f"The stylized scene is whole, but its report could not be written: {result.report_error}")
+        raise typer.Exit(FAILURE)
+
+
+@app.command()
+def render(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the pictures, PNG.", show_default=False)],
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    background: BackgroundOption = "black",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+) -> None:
+    """Render the views of a scene."""
+    from api.jobs import SceneRequest, render_views
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=error_console, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
+    out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the scene and the results.")] = Path("demo"),
+) -> None:
+    """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
+    from api.demo_scene import build_demo
+    from api.jobs import SceneRequest, StylizeRequest, check_folder
+    from sgsst_core.weights import load_weights
+
+    check_folder(out)
+    try:
+        load_weights("auto")
+    except WeightsError:
+        fetch("vgg16")
+    with _status("Building the scene"):
+        files = build_demo(out)
+    source = SceneRequest(files.ply, files.cameras, None, "-y", None, DEMO_RESOLUTION, NEAR, False)
+    request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, demo_settings())
+    options = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
+    arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
+    _stylize(request, arguments)
+
+
+#: Chosen so that the demo is worth looking at and takes less than five minutes on two cores with VGG16.
+DEMO_RESOLUTION = 640
+
+
+def demo_settings() -> Settings:
+    """Settings of `sgsst demo`."""
+    return make_settings(
+        "standard", steps_coarse=0, steps_sos=160, learning_rate=0.1, learning_rate_end=0.02, max_seconds=200
+    )
+
+
+@weights_app.command("list")
+def list_() -> None:
+    """Show which weights are installed, and where the others come from."""
+    from sgsst_core.weights import list_weights
+
+    for entry in list_weights():
+        state = f"installed   {entry.path}" if entry.path else f"to download from {entry.source}"
+        out_console.print(f"{entry.name:<12}{entry.size / 1e6:>6.0f} MB  {state}")
+
+
+@weights_app.command()
+def fetch(
+    name: Annotated[Literal["vgg19", "vgg16"], typer.Argument(help="Network to install.")],
+    from_: Annotated[
+        Path | None, typer.Option("--from", help="Convert this file (.pth of torchvision or of Gatys et al.) instead.")
+    ] = None,
+) -> None:
+    """Download weights, convert them, and keep them in the cache folder; does nothing where they are installed."""
+    from sgsst_core.weights import fetch_weights
+
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=error_console, transient=True) as bar:
+        task = bar.add_task(name, total=None)
+        path = fetch_weights(
+            name, source=from_, progress=lambda done, total: bar.update(task, completed=done, total=total or None)
+        )
+    out_console.print(f"{name}: {path}")
+
+
+@weights_app.command()
+def path() -> None:
+    """Print the folder in which weights are kept; SGSST_CACHE names another one."""
+    from sgsst_core.weights import cache_folder
+
+    out_console.print(str(cache_folder()))
+
+
+@contextmanager
+def _status(text: str) -> Iterator[None]:
+    """A spinner on a terminal, nothing elsewhere."""
+    with error_console.status(text) if error_console.is_terminal else _nothing():
+        yield
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield
+
+
+@contextmanager
+def _training_bar(job: Job) -> Iterator[Any]:
+    """A live bar; yields what to call with each step's `Progress`."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("loss {task.fields[loss]}"),
+        TextColumn("{task.fields[left]} left"),
+    )
+    start = job.state.step if job.state else 0
+    with Bar(*columns, console=error_console, transient=True) as bar:
+        task = bar.add_task("starting", total=job.stylizer.total, completed=start, loss="-", left="-")
+
+        def show(progress: Progress) -> None:
+            stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
+            left = _clock(progress.seconds_left)
+            bar.update(task, description=stage, completed=progress.step, loss=f"{progress.loss:.3g}", left=left)
+
+        yield show
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; every expected error becomes one message on stderr and an exit code, without traceback."""
+    try:
+        app(args=None if arguments is None else list(arguments), prog_name="sgsst")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except SgsstError as error:
+        error_console.print(f"error: {error}")
+        return BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
+    except KeyboardInterrupt:
+        error_console.print("Aborted.")
+        return 130
+    except BrokenPipeError:  # `sgsst weights list | head`
+        return FAILURE
+    except (MemoryError, RuntimeError) as error:
+        if not _out_of_memory(error):
+            raise
+        error_console.print("error: out of memory. Give a smaller --resolution or fewer --views, or --memory-limit.")
+        return FAILURE
+    return 0
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """PyTorch raises a plain RuntimeError on the CPU, a subclass of it on GPUs."""
+    text = str(error)
+    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
+
+
+if __name__ == "__main__":
+    sys.exit(main())

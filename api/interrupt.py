@@ -1,0 +1,52 @@
+"""Ctrl-C that lets the step in hand finish; a second one ends the program at once."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class StopFlag:
+    """Whether the user has asked to stop, and by which signal."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def __call__(self) -> bool:
+        return self.signal is not None
+
+    @property
+    def exit_code(self) -> int:
+        """What a program that a signal ended returns: 130 for Ctrl-C."""
+        return 128 + (self.signal or signal.SIGINT)
+
+
+@contextmanager
+def stop_on_signal(announce: Callable[[], None]) -> Iterator[StopFlag]:
+    """Turn the first SIGINT or SIGTERM into a flag; `announce` is called when it comes.
+
+    The second one does what it always does. Outside of the main thread, where Python allows no handlers, nothing
+    is changed.
+    """
+    flag = StopFlag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        flag.signal = number
+        for other, handler in before.items():
+            signal.signal(other, handler)
+        announce()
+
+    try:
+        for number in before:
+            signal.signal(number, handle)
+        yield flag
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,34 @@
+"""Values of command-line options that are more than a number or a word."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import typer
+
+_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
+_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+def parse_background(text: str) -> tuple[float, float, float]:
+    """RGB in 0..1 from "black", "white" or three numbers 0 to 255: "40,40,48"."""
+    if isinstance(text, tuple):  # the default value comes by here too
+        return text
+    if text.lower() in _COLOURS:
+        return _COLOURS[text.lower()]
+    try:
+        red, green, blue = (float(part) / 255 for part in text.split(","))
+    except ValueError:
+        red = math.nan
+    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
+        raise typer.BadParameter(f"{text!r} is neither black, white nor three numbers from 0 to 255 such as 40,40,48.")
+    return red, green, blue
+
+
+def parse_bytes(text: str) -> int:
+    """Bytes from "8GB", "512 MB", "6GiB" or a plain number."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?I?)B?", text.strip().upper())
+    if not match or match[2] not in _UNITS or not (size := int(float(match[1]) * _UNITS[match[2]])):
+        raise typer.BadParameter(f"{text!r} is not an amount of memory such as 8GB or 512MB.")
+    return size
