@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from sgsst_core.vgg import ALIGNMENT, layer_stride
 
 
@@ -59,16 +61,20 @@ class PartitionTile:
         return view, Rectangle(view.top - top, view.left - left, view.bottom - top, view.right - left)
 
 
-def partition(height: int, width: int, tile_size: int | None, halo: int) -> list[PartitionTile]:
-    """Cut a view of height x width into partition tiles, row by row.
+def partition(
+    height: int, width: int, tile_size: int | None, halo: int, region: Rectangle | None = None
+) -> list[PartitionTile]:
+    """Cut a view of height x width, or a region of it, into partition tiles, row by row.
 
     Args:
-        tile_size: side of the inner rectangles, a multiple of 16; None for one tile that is the whole view.
+        tile_size: side of the inner rectangles, a multiple of 16; None for one tile that is the whole region.
         halo: pixels around the inner rectangle, a multiple of 16 no smaller than the receptive field's radius.
+        region: from `covered_region`; None for the whole view.
     """
+    region = region or Rectangle(0, 0, height, width)
     if tile_size is None:
-        whole = Rectangle(0, 0, height, width)
-        return [PartitionTile(whole, whole)]
+        tile_size = max(height, width, 1) + ALIGNMENT
+        tile_size -= tile_size % ALIGNMENT
     if tile_size < ALIGNMENT or tile_size % ALIGNMENT or halo % ALIGNMENT:
         raise ValueError(f"tile_size {tile_size} and halo {halo} must be multiples of {ALIGNMENT}")
     return [
@@ -76,24 +82,43 @@ def partition(height: int, width: int, tile_size: int | None, halo: int) -> list
             Rectangle(top, left, bottom, right),
             Rectangle(max(top - halo, 0), max(left - halo, 0), min(bottom + halo, height), min(right + halo, width)),
         )
-        for top, bottom in _spans(height, tile_size)
-        for left, right in _spans(width, tile_size)
+        for top, bottom in _spans(region.top, region.bottom, tile_size)
+        for left, right in _spans(region.left, region.right, tile_size)
     ]
 
 
-def _spans(length: int, tile_size: int) -> list[tuple[int, int]]:
+def covered_region(coverage: Tensor) -> Rectangle:
+    """The smallest rectangle at multiples of 16 that holds every pixel with coverage [H, W] above 0; may be empty."""
+    height, width = coverage.shape
+    rows, columns = (coverage > 0).any(dim=1).nonzero(), (coverage > 0).any(dim=0).nonzero()
+    if not len(rows):
+        return Rectangle(0, 0, 0, 0)
+    top, bottom, left, right = (int(t) for t in (rows[0], rows[-1], columns[0], columns[-1]))
+    return Rectangle(
+        top // ALIGNMENT * ALIGNMENT,
+        left // ALIGNMENT * ALIGNMENT,
+        min((bottom // ALIGNMENT + 1) * ALIGNMENT, height),
+        min((right // ALIGNMENT + 1) * ALIGNMENT, width),
+    )
+
+
+def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
     """Equal spans of at most tile_size, at multiples of 16: equal ones balance better than a narrow last one."""
-    count = math.ceil(length / tile_size)
-    step = math.ceil(length / count / ALIGNMENT) * ALIGNMENT
-    return [(start, min(start + step, length)) for start in range(0, length, step)]
+    if first >= last:
+        return []
+    count = math.ceil((last - first) / tile_size)
+    step = math.ceil((last - first) / count / ALIGNMENT) * ALIGNMENT
+    return [(start, min(start + step, last)) for start in range(first, last, step)]
 
 
 #: Tile sizes that are weighed against each other; below 64, the halo costs more than any memory saved is worth.
 TILE_SIZES = (64, 128, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 
 
-def choose_tile_size(height: int, width: int, halo: int, *, held: float, working: float) -> int | None:
-    """The tile size with the least work for a view under a memory budget; None where the whole view fits.
+def choose_tile_size(
+    height: int, width: int, halo: int, *, held: float, working: float, region: Rectangle | None = None
+) -> int | None:
+    """The tile size with the least work for a view under a memory budget; None where it fits as one tile.
 
     Work is counted in pixels through the network: forward and backward over every outer rectangle, and a second
     forward over those whose activations do not stay in memory. Small tiles pay for their halo, large ones leave
@@ -102,16 +127,14 @@ def choose_tile_size(height: int, width: int, halo: int, *, held: float, working
     Args:
         held: pixels whose activations the budget holds.
         working: memory that a tile needs beside its activations while it is back-propagated, as a share of them.
+        region: as for `partition`.
     """
-    if height * width * (1 + working) <= held:
-        return None
 
-    def work(size: int) -> float:
-        tiles = partition(height, width, size, halo)
-        total = sum(tile.outer.pixels for tile in tiles)
-        largest = max(tile.outer.pixels for tile in tiles) * (1 + working)
-        if largest > held and size > TILE_SIZES[0]:
+    def work(size: int | None) -> float:
+        areas = [tile.outer.pixels for tile in partition(height, width, size, halo, region)] or [0]
+        largest = max(areas) * (1 + working)
+        if largest > held and size != TILE_SIZES[0]:
             return math.inf
-        return 2 * total + max(total - max(held - largest, 0), 0)
+        return 2 * sum(areas) + max(sum(areas) - max(held - largest * (len(areas) > 1), 0), 0)
 
-    return min(TILE_SIZES, key=work)
+    return min((None, *TILE_SIZES), key=work)

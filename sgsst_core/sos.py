@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
-from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, partition
+from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, covered_region, partition
 from sgsst_core.pyramid import add_upscaled_, coverage_pyramid, downscale, scale_count, style_size
 from sgsst_core.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.timing import Timer
@@ -85,20 +85,17 @@ class SosLoss:
         self.timer = timer or Timer()
         self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
 
-    def tiles(self, height: int, width: int) -> list[PartitionTile]:
-        """The partition of a scaled view."""
+    def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
+        """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
+        region = None if coverage is None else covered_region(coverage)
+        halo = self.network.halo
         size = self.tile_size
         if size is None:
-            size = choose_tile_size(
-                height,
-                width,
-                self.network.halo,
-                held=self.memory / self.network.held_bytes_per_pixel(),
-                working=self.network.working_bytes_per_pixel() / self.network.held_bytes_per_pixel(),
-            )
-        elif size >= max(height, width):
-            size = None
-        return partition(height, width, size, self.network.halo)
+            held = self.network.held_bytes_per_pixel()
+            working = self.network.working_bytes_per_pixel() / held
+            size = choose_tile_size(height, width, halo, held=self.memory / held, working=working, region=region)
+        tiles = partition(height, width, size, halo, region)
+        return tiles if coverage is None else [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
     def style_targets(self, style: Tensor, view_size: tuple[int, int]) -> dict[int, dict[str, LayerTarget]]:
         """Targets of every scale of views of view_size (height, width) from a style image [H, W, 3] in 0..1.
@@ -125,18 +122,18 @@ class SosLoss:
             )
         target = ViewTarget(content_image=content, coverage=weights)
         if self.content_weight and keep_content:
-            target.content = {scale: self.content_features(content, scale) for scale in range(scales)}
+            target.content = {scale: self.content_features(content, scale, weights) for scale in range(scales)}
             target.content_image = None
         return target
 
-    def content_features(self, content: Tensor, scale: int) -> Tensor:
-        """Features of the content layer [h/8, w/8, 512] of a content image [H, W, 3] at a scale."""
+    def content_features(self, content: Tensor, scale: int, coverage: list[Tensor] | None = None) -> Tensor:
+        """Features of the content layer [h/8, w/8, 512] of a content image [H, W, 3] at a scale; 0 without coverage."""
         image = downscale(content.to(self.network.device), scale)
         size = (image.shape[0], image.shape[1])
         stride = layer_stride(CONTENT_LAYER)
         shape = (size[0] // stride, size[1] // stride, self.network.channels(CONTENT_LAYER))
-        result = torch.empty(shape, dtype=self.network.dtype, device=self.network.device)
-        for tile in self.tiles(*size):
+        result = torch.zeros(shape, dtype=self.network.dtype, device=self.network.device)
+        for tile in self.tiles(*size, None if coverage is None else coverage[scale]):
             view, own = tile.owned_cells(CONTENT_LAYER, size)
             features = self._forward(image, tile, keep=False).features[CONTENT_LAYER]
             result[view.slices] = features[own.slices]
@@ -198,7 +195,7 @@ class SosLoss:
             return view.content[scale]
         if view.content_image is None:
             raise ValueError("the view was prepared without content, but content_weight is not 0")
-        return self.content_features(view.content_image, scale)
+        return self.content_features(view.content_image, scale, view.coverage)
 
     def _first_pass(
         self, image: Tensor, pass_: _ScalePass, *, keep: bool
@@ -209,10 +206,10 @@ class SosLoss:
         }
         content = 0.0
         kept: dict[PartitionTile, Activations | None] = {}
-        tiles = self.tiles(*pass_.size)
+        tiles = self.tiles(*pass_.size, pass_.coverage)
         held = self.network.held_bytes_per_pixel()
         # Whatever is kept, there must be room to back-propagate the largest tile.
-        budget = self.memory - max(tile.outer.pixels for tile in tiles) * (
+        budget = self.memory - max((tile.outer.pixels for tile in tiles), default=0) * (
             held + self.network.working_bytes_per_pixel()
         )
         for tile in tiles:
@@ -251,6 +248,11 @@ class _ScalePass:
             cells = Rectangle(0, 0, content.shape[0], content.shape[1])
             weights = self.weights(CONTENT_LAYER, cells)
             self._content_count = cells.pixels if weights is None else float(weights.sum(dtype=torch.float64))
+
+    @property
+    def coverage(self) -> Tensor | None:
+        """Coverage [h, w] of the scaled view's pixels; None for equal weights."""
+        return None if self._coverage is None else self._coverage[self._scale]
 
     def weights(self, layer: str, cells: Rectangle) -> Tensor | None:
         """Weights [h, w] of some cells of a layer: the coverage, box-averaged to the cells; None for equal weights."""

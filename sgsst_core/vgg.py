@@ -16,13 +16,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.weights import BackboneWeights
+from sgsst_core.weights_sources import BLOCKS
 
 #: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
 #: Layer whose features make up the content loss.
 CONTENT_LAYER = "relu4_2"
-#: Convolutions in each of the five blocks; a 2x2 max pool stands between blocks.
-CONVOLUTIONS = {"vgg16": (2, 2, 3, 3, 3), "vgg19": (2, 2, 4, 4, 4)}
 #: Receptive field of relu5_1 in pixels to either side (VGG19: 70, VGG16: 58), up to the next multiple of 16,
 #: the stride of its cells: with this margin, features owned by a partition tile are exact.
 HALO = {"vgg16": 64, "vgg19": 80}
@@ -101,7 +100,7 @@ class FeatureNetwork:
     def _build(self, weights: BackboneWeights) -> list[_Step]:
         steps: list[_Step] = []
         left = set(self.layers)
-        for block, count in enumerate(CONVOLUTIONS[weights.name], start=1):
+        for block, count in enumerate(BLOCKS[weights.name], start=1):
             if block > 1:
                 steps.append(_Pool())
             for index in range(1, count + 1):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sgsst_core.partition import choose_tile_size, partition
+from sgsst_core.partition import Rectangle, choose_tile_size, covered_region, partition
 from sgsst_core.vgg import STYLE_LAYERS, layer_stride
 
 
@@ -41,3 +41,22 @@ def test_whole_view_where_it_fits_and_a_tile_that_fits_where_not():
         size = choose_tile_size(3361, 5187, 64, held=held, working=0.5)
         assert max(tile.outer.pixels for tile in partition(3361, 5187, size, 64)) * 1.5 <= held
     assert choose_tile_size(3361, 5187, 64, held=1, working=0.5) == 64
+
+
+def test_region_holds_what_is_covered_and_no_more_than_it_must():
+    coverage = torch.zeros((100, 210))
+    assert covered_region(coverage).pixels == 0
+    assert partition(100, 210, None, 64, covered_region(coverage)) == []
+    coverage[33, 50] = 1e-6
+    coverage[60, 205] = 1
+    region = covered_region(coverage)
+    assert region == Rectangle(32, 48, 64, 208)
+    (tile,) = partition(100, 210, None, 16, region)
+    assert tile.inner == region
+    assert tile.outer == Rectangle(16, 32, 80, 210)
+    tiles = partition(100, 210, 64, 16, region)
+    assert sum(tile.inner.pixels for tile in tiles) == region.pixels
+
+
+def test_work_outside_the_region_does_not_count():
+    assert choose_tile_size(4000, 4000, 64, held=1e6, working=0.5, region=Rectangle(1600, 1600, 2000, 2000)) is None

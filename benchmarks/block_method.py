@@ -1,0 +1,79 @@
+"""The baseline: one SOS gradient by the published block method (SPST as released with SGSST), written anew.
+
+Blocks of 512 px go through the network with a margin of 256 px, twice: once for statistics, once to back-propagate.
+The loss pulls at every feature of the window, and what lies in the margin is cropped away afterwards. Content features
+are computed in every iteration. It runs on this project's network code, so that only the method differs.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sgsst_core.loss import content_loss, style_loss
+from sgsst_core.partition import PartitionTile, Rectangle
+from sgsst_core.pyramid import add_upscaled_, downscale, scale_count
+from sgsst_core.sos import ScaleTarget
+from sgsst_core.statistics import layer_statistics, merge_all
+from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+
+BLOCK = 512
+MARGIN = 256
+
+
+def blocks(height: int, width: int) -> list[PartitionTile]:
+    """Blocks with their margins, clipped to the view."""
+    return [
+        PartitionTile(
+            Rectangle(top, left, min(top + BLOCK, height), min(left + BLOCK, width)),
+            Rectangle(
+                max(top - MARGIN, 0),
+                max(left - MARGIN, 0),
+                min(top + BLOCK + MARGIN, height),
+                min(left + BLOCK + MARGIN, width),
+            ),
+        )
+        for top in range(0, height, BLOCK)
+        for left in range(0, width, BLOCK)
+    ]
+
+
+def block_gradient(network: FeatureNetwork, image: Tensor, style: dict[int, ScaleTarget], content: Tensor) -> Tensor:
+    """dE/dimage [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
+    scales = range(scale_count(image.shape[0], image.shape[1]))
+    total = torch.zeros(image.shape)
+    for scale in scales:
+        gradient = _scale(network, downscale(image, scale), style[scale], downscale(content, scale))
+        add_upscaled_(total, gradient, scale, 1 / len(scales))
+    return total
+
+
+def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: Tensor) -> Tensor:
+    size = (image.shape[0], image.shape[1])
+    tiles = blocks(*size)
+    parts: dict[str, list] = {layer: [] for layer in STYLE_LAYERS}
+    for tile in tiles:  # first forward: statistics
+        features = network.forward(image[tile.outer.slices], keep=False).features
+        for layer in STYLE_LAYERS:
+            parts[layer].append(layer_statistics(features[layer][tile.owned_cells(layer, size)[1].slices]))
+    maps = {layer: style_loss(merge_all(parts[layer]), style[layer])[1] for layer in STYLE_LAYERS}
+    cells = (size[0] // 8) * (size[1] // 8)
+    result = torch.zeros_like(image)
+    for tile in tiles:
+        wanted = network.forward(content[tile.outer.slices], keep=False).features[CONTENT_LAYER]  # content forward
+        activations = network.forward(image[tile.outer.slices])  # second forward
+
+        def pull(layer: str, features: Tensor, wanted: Tensor = wanted) -> Tensor:
+            if layer == CONTENT_LAYER:
+                return content_loss(features, wanted, cells, 1.0)[1]
+            return maps[layer].apply(features)
+
+        gradient = network.backward(activations, pull)
+        inner = Rectangle(
+            tile.inner.top - tile.outer.top,
+            tile.inner.left - tile.outer.left,
+            tile.inner.bottom - tile.outer.top,
+            tile.inner.right - tile.outer.left,
+        )
+        result[tile.inner.slices] = gradient[inner.slices]
+    return result

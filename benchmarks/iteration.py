@@ -1,0 +1,71 @@
+"""Where an iteration's time goes on a real scene at 1280x720: the share spent outside the feature network.
+
+python -m benchmarks.iteration SCENE.ply CAMERAS STYLE [--views 3] [--rounds 2]
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.machine import write_result
+from sgsst_core import Camera, Stylizer, make_settings
+from sgsst_core.camera import spread
+from sgsst_core.camera_files import read_cameras
+from sgsst_core.images import load_image
+from sgsst_core.ply import read_scene
+
+NETWORK = ("vgg_forward", "vgg_backward")
+
+
+def wide(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with another number of pixels: same horizontal field of view, principal point in the middle."""
+    factor = width / camera.width
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=width / 2,
+        cy=height / 2,
+    )
+
+
+def main() -> None:
+    """Measure, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("cameras", type=Path)
+    parser.add_argument("style", type=Path)
+    parser.add_argument("--views", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=2)
+    arguments = parser.parse_args()
+    scene = read_scene(arguments.scene).scene
+    cameras = [wide(camera, 1280, 720) for camera in spread(read_cameras(arguments.cameras), arguments.views)]
+    results = {}
+    for rasterizer in ("cpu", "cached"):
+        settings = make_settings("standard", steps_coarse=0, steps_sos=10_000)
+        stylizer = Stylizer(scene, cameras, load_image(arguments.style), settings, rasterizer=rasterizer)
+        for _ in cameras:  # the first round prepares views
+            stylizer.run_step()
+        seconds: dict[str, float] = {}
+        for _ in range(arguments.rounds * len(cameras)):
+            stylizer.run_step()
+            for name, value in stylizer.timer.seconds.items():
+                seconds[name] = seconds.get(name, 0.0) + value
+        total = sum(seconds.values())
+        steps = arguments.rounds * len(cameras)
+        outside = 1 - sum(seconds[name] for name in NETWORK) / total
+        results[rasterizer] = {
+            "seconds_per_step": {name: value / steps for name, value in seconds.items()},
+            "share_outside_network": outside,
+        }
+        split = ", ".join(f"{name} {value / steps:.3f}" for name, value in sorted(seconds.items()))
+        print(f"{rasterizer}: {total / steps:.2f} s a step, {outside:.1%} outside the network ({split})")
+    write_result("iteration", {"scene": arguments.scene.parent.name, "gaussians": len(scene), "rasterizers": results})
+
+
+if __name__ == "__main__":
+    main()

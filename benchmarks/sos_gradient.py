@@ -1,0 +1,79 @@
+"""One SOS gradient of a 2048x2048 view, all scales: seconds and relative error against the published block method.
+
+python -m benchmarks.sos_gradient [--size 2048] [--repeats 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.block_method import block_gradient
+from benchmarks.machine import write_result
+from benchmarks.pictures import picture
+from sgsst_core.sos import SosLoss
+from sgsst_core.vgg import FeatureNetwork
+from sgsst_core.weights import load_weights
+
+#: Activations of a 2048x2048 view stay in memory: 1.3 KB a pixel in float32.
+MEMORY = 12 << 30
+
+
+def main() -> None:
+    """Measure, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=2048)
+    parser.add_argument("--repeats", type=int, default=3)
+    arguments = parser.parse_args()
+    size = arguments.size
+    image, content = picture("astronaut", size, size), picture("coffee", size, size)
+    style_image = picture("immunohistochemistry", size, size)
+    weights = load_weights("auto")
+    methods: dict[str, Callable[[], Tensor]] = {}
+
+    exact = FeatureNetwork(weights)
+    targets = SosLoss(exact, memory=MEMORY).style_targets(style_image, (size, size))
+    methods["blocks, float32"] = lambda: block_gradient(exact, image, targets, content)
+    for precision in ("float32", "bfloat16"):
+        loss = SosLoss(FeatureNetwork(weights, dtype=getattr(torch, precision)), memory=MEMORY)
+        own_targets = loss.style_targets(style_image, (size, size))
+        view = loss.view_target(content)
+
+        def ours(loss=loss, own_targets=own_targets, view=view) -> Tensor:
+            gradient = loss.evaluate(image, own_targets, view).image_gradient
+            assert gradient is not None
+            return gradient
+
+        methods[f"ours, {precision}"] = ours
+
+    gradients: dict[str, Tensor] = {}
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    for _ in range(arguments.repeats):  # in turn, so that a machine that slows down slows all of them
+        for name, method in methods.items():
+            started = time.perf_counter()
+            gradients[name] = method()
+            seconds[name].append(time.perf_counter() - started)
+    reference = gradients["ours, float32"].double()
+    rows = {}
+    for name, times in seconds.items():
+        difference = gradients[name].double() - reference
+        ratios = [base / own for base, own in zip(seconds["blocks, float32"], times, strict=True)]
+        rows[name] = {
+            "seconds": times,
+            "times_faster_than_blocks": statistics.median(ratios),
+            "relative_error_to_ours_float32": float(difference.norm() / reference.norm()),
+        }
+        print(
+            f"{name:18s} {statistics.median(times):8.2f} s  {rows[name]['times_faster_than_blocks']:6.2f} x  "
+            f"relative error {rows[name]['relative_error_to_ours_float32']:.2e}"
+        )
+    write_result("sos_gradient", {"size": size, "backbone": weights.name, "methods": rows})
+
+
+if __name__ == "__main__":
+    main()
