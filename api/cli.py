@@ -75,6 +75,7 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 @app.command()
 def stylize(
+    context: typer.Context,
     scene: SceneArgument,
     style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Stylized PLY to write; report and pictures go beside it.")],
@@ -124,7 +125,7 @@ def stylize(
     from api.jobs import SceneRequest, StylizeRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
-    _stylize(StylizeRequest(source, style, images, out, backbone, resume, settings), sys.argv[1:])
+    _stylize(StylizeRequest(source, style, images, out, backbone, resume, settings), context.obj)
 
 
 def _stylize(request: StylizeRequest, arguments: Sequence[str]) -> None:
@@ -133,12 +134,10 @@ def _stylize(request: StylizeRequest, arguments: Sequence[str]) -> None:
 
     with _status("Reading the scene and preparing its views"):
         job = prepare(request)
-    _announce(job)
-    with (
-        stop_on_signal(lambda: error_console.print("Stopping after this step; again Ctrl-C aborts at once.")) as stop,
-        _training_bar(job) as progress,
-    ):
-        result = execute(job, progress=progress, stop=stop, warn=error_console.print)
+    with stop_on_signal(lambda: error_console.print("Stopping after this step; Ctrl-C again aborts at once.")) as stop:
+        _announce(job)
+        with _training_bar(job) as progress:
+            result = execute(job, progress=progress, stop=stop, warn=error_console.print)
     command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
     if result.stopped == "interrupted":
         error_console.print(
@@ -319,8 +318,9 @@ def _clock(seconds: float) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; every expected error becomes one message on stderr and an exit code, without traceback."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        app(args=None if arguments is None else list(arguments), prog_name="sgsst")
+        app(args=arguments, prog_name="sgsst", obj=arguments)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except SgsstError as error:

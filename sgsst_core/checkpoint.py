@@ -40,7 +40,7 @@ def fingerprint(
     digest = hashlib.sha256(repr((weights, photos)).encode())
     for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
         digest.update(repr(tuple(tensor.shape)).encode())
-        digest.update(tensor.contiguous().numpy())
+        digest.update(tensor.contiguous().numpy().data)
     for camera in cameras:
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)

@@ -323,6 +323,8 @@ def write_loss_curves(path: Path, history: Sequence[StepRecord], round_length: i
     axes.set_xlabel("seconds")
     axes.set_ylabel("loss")
     if history:
+        totals = [terms.total for record in history for terms in record.terms.values()]
+        axes.set_ylim(max(min(totals), 1e-300) / 1.3, max(max(totals), 1e-300) * 1.3)
         axes.set_yscale("log")
         axes.set_xlim(left=0)
         axes.legend(frameon=False)
@@ -348,7 +350,7 @@ def _draw(
 
 
 def running_mean(values: Sequence[float], window: int) -> NDArray[np.float64]:
-    """Geometric mean of the `window` values around each place; towards the ends of as many as there are on both sides."""
+    """Geometric mean of the `window` values around each place, of fewer towards the ends."""
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
     places = np.arange(len(logs))

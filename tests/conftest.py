@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from sgsst_core.errors import WeightsError
 from sgsst_core.weights import BackboneWeights, fetch_weights, load_weights
@@ -18,6 +20,15 @@ def shared_data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"no real scenes at {DATA}: see README, 'Real data'")
     return DATA
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """For views so small that waking a second thread takes longer than the work, above all on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import pytest
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.settings import make_settings
+
+
+def test_paper_is_the_published_schedule() -> None:
+    settings = make_settings("paper")
+    assert (settings.steps_coarse, settings.steps_sos) == (10_000, 10_000)
+    assert settings.learning_rate == settings.learning_rate_end == 2.5e-3
+    assert settings.content_weight == 1
+    assert settings.position_weights == "off"
+    assert settings.max_resolution is None
+
+
+def test_single_values_go_on_top_and_none_leaves_the_preset() -> None:
+    settings = make_settings("preview", steps_sos=7, seed=None, max_resolution=None)
+    assert settings.steps_sos == 7
+    assert settings.steps_coarse == make_settings("preview").steps_coarse
+    assert settings.max_resolution == 640
+
+
+def test_a_learning_rate_given_by_hand_is_constant_unless_its_end_is_given() -> None:
+    assert make_settings("standard", learning_rate=0.2).learning_rate_end == 0.2
+    assert make_settings("standard", learning_rate=0.2, learning_rate_end=0.1).learning_rate_end == 0.1
+
+
+def test_learning_rate_is_exponential_in_the_share_of_steps() -> None:
+    settings = make_settings(learning_rate=0.1, learning_rate_end=0.001)
+    assert [settings.learning_rate_at(share) for share in (0, 0.5, 1)] == pytest.approx([0.1, 0.01, 0.001])
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [
+        ({"steps_sos": -1}, "steps_sos"),
+        ({"learning_rate": 0}, "learning_rate"),
+        ({"learning_rate": float("nan")}, "learning_rate"),
+        ({"content_weight": -1}, "content_weight"),
+        ({"precision": "float16"}, "precision"),
+        ({"max_seconds": 0}, "max_seconds"),
+        ({"unheard_of": 1}, "unheard_of"),
+    ],
+)
+def test_values_out_of_range_are_refused_by_name(values: dict[str, object], name: str) -> None:
+    with pytest.raises(SettingsError, match=name):
+        make_settings(**values)  # type: ignore[arg-type]
+
+
+def test_an_unknown_preset_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(SettingsError, match="preview, standard, paper"):
+        make_settings("fast")  # type: ignore[arg-type]
+
+
+def test_settings_do_not_change() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        make_settings().seed = 3

@@ -1,0 +1,94 @@
+"""Scenes, cameras and files so small that a step of the optimiser takes a few hundredths of a second."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from sgsst_core.camera import Camera, look_at
+from sgsst_core.ply import write_scene
+from sgsst_core.scene import Scene
+from tests.sgsst_core.pictures import picture
+
+WIDTH, HEIGHT = 64, 48
+
+
+def wall(columns: int = 28, rows: int = 22, sh_degree: int = 0) -> Scene:
+    """A wall of flat Gaussians at z = 3 that fills every view of `cameras`."""
+    generator = torch.Generator().manual_seed(5)
+    x = torch.linspace(-2.4, 2.4, columns)
+    y = torch.linspace(-1.9, 1.9, rows)
+    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+    count = len(grid)
+    rest = (sh_degree + 1) ** 2 - 1
+    return Scene(
+        means=torch.cat([grid, torch.full((count, 1), 3.0)], dim=1),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        scales=torch.tensor([0.16, 0.16, 0.01]).log().repeat(count, 1),
+        opacities=torch.full((count,), 5.0),
+        sh_dc=torch.randn(count, 3, generator=generator),
+        sh_rest=0.1 * torch.randn(count, rest, 3, generator=generator),
+    )
+
+
+def ball(count: int = 300) -> Scene:
+    """A ball of radius 0.7 at z = 3 with nothing around it, as object scans are."""
+    generator = torch.Generator().manual_seed(6)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    return Scene(
+        means=0.7 * directions + torch.tensor([0.0, 0.0, 3.0]),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        scales=torch.full((count, 3), math.log(0.1)),
+        opacities=torch.full((count,), 4.0),
+        sh_dc=torch.randn(count, 3, generator=generator),
+        sh_rest=torch.zeros(count, 0, 3),
+    )
+
+
+def cameras(count: int = 3, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
+    """Cameras side by side at z = 0 that look at (0, 0, 3)."""
+    target, up = torch.tensor([0.0, 0.0, 3.0]), torch.tensor([0.0, -1.0, 0.0])
+    positions = torch.linspace(-0.3, 0.3, count) if count > 1 else torch.zeros(1)
+    return [
+        look_at(f"view_{i}", torch.tensor([float(x), 0.0, 0.0]), target, up, width=width, height=height, focal=width)
+        for i, x in enumerate(positions)
+    ]
+
+
+def blind_camera() -> Camera:
+    """A camera that looks the other way."""
+    there = torch.tensor([0.0, 0.0, -3.0])
+    up = torch.tensor([0.0, -1.0, 0.0])
+    return look_at("blind", torch.zeros(3), there, up, width=WIDTH, height=HEIGHT, focal=WIDTH)
+
+
+def style() -> Tensor:
+    """A style image [96, 80, 3] float32."""
+    return picture(96, 80, seed=1, dtype=torch.float32)
+
+
+def write_files(folder: Path, scene: Scene | None = None, views: list[Camera] | None = None) -> tuple[Path, Path, Path]:
+    """Write scene.ply, cameras.json (INRIA's form) and style.png, and return their paths."""
+    ply, file, image = folder / "scene.ply", folder / "cameras.json", folder / "style.png"
+    write_scene(ply, scene or wall())
+    entries = [
+        {
+            "id": index,
+            "img_name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.centre.tolist(),
+            "rotation": camera.world_to_camera[:3, :3].T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+        }
+        for index, camera in enumerate(views or cameras())
+    ]
+    file.write_text(json.dumps(entries))
+    Image.fromarray((style() * 255).to(torch.uint8).numpy()).save(image)
+    return ply, file, image
