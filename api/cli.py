@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as Bar
 
 from api.interrupt import stop_on_signal
 from api.values import parse_background, parse_bytes
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
-from sgsst_core.settings import PositionWeights, Precision, PresetName, Settings, make_settings
+from sgsst_core.settings import PositionWeights, Precision, PresetName, make_settings
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from api.jobs import Job, Result, StylizeRequest
@@ -28,6 +36,10 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command impo
 BAD_INPUT, FAILURE = 2, 1
 #: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
 MAX_RESOLUTION = 16384
+#: Where the progress bar cannot be drawn (a log file), a line is printed instead, this often.
+LOG_SECONDS = 60.0
+#: The demo's steps, and seconds after which it stops on slow machines: less than five minutes with all that is around.
+DEMO_STEPS, DEMO_SECONDS = 120, 210
 
 app = typer.Typer(
     help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
@@ -199,7 +211,7 @@ def render(
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=error_console, transient=True) as bar:
+    with _bar(*columns) as bar:
         task = bar.add_task("", total=None)
         paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
     out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
@@ -221,22 +233,14 @@ def demo(
         fetch("vgg16")
     with _status("Building the scene"):
         files = build_demo(out)
-    source = SceneRequest(files.ply, files.cameras, None, "-y", None, DEMO_RESOLUTION, NEAR, False)
-    request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, demo_settings())
-    options = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
+    source = SceneRequest(files.ply, files.cameras, None, "-y", None, None, NEAR, False)
+    settings = make_settings("preview", steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
+    request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, settings)
+    options: dict[str, object] = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
+    options |= {"--preset": "preview", "--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
+    out_console.print(f"{'command:':<18}{shlex.join(['sgsst', *arguments])}")
     _stylize(request, arguments)
-
-
-#: Chosen so that the demo is worth looking at and takes less than five minutes on two cores with VGG16.
-DEMO_RESOLUTION = 640
-
-
-def demo_settings() -> Settings:
-    """Settings of `sgsst demo`."""
-    return make_settings(
-        "standard", steps_coarse=0, steps_sos=160, learning_rate=0.1, learning_rate_end=0.02, max_seconds=200
-    )
 
 
 @weights_app.command("list")
@@ -260,7 +264,7 @@ def fetch(
     from sgsst_core.weights import fetch_weights
 
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=error_console, transient=True) as bar:
+    with _bar(*columns) as bar:
         task = bar.add_task(name, total=None)
         path = fetch_weights(
             name, source=from_, progress=lambda done, total: bar.update(task, completed=done, total=total or None)
@@ -288,9 +292,14 @@ def _nothing() -> Iterator[None]:
     yield
 
 
+def _bar(*columns: ProgressColumn) -> Bar:
+    """A live progress bar on a terminal; nothing elsewhere, where it could not be drawn over."""
+    return Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal)
+
+
 @contextmanager
-def _training_bar(job: Job) -> Iterator[Any]:
-    """A live bar; yields what to call with each step's `Progress`."""
+def _training_bar(job: Job) -> Iterator[Callable[[Progress], None]]:
+    """A live bar, or a line a minute where there is no terminal; yields what to call with each step's `Progress`."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -299,13 +308,19 @@ def _training_bar(job: Job) -> Iterator[Any]:
         TextColumn("{task.fields[left]} left"),
     )
     start = job.state.step if job.state else 0
-    with Bar(*columns, console=error_console, transient=True) as bar:
+    with _bar(*columns) as bar:
         task = bar.add_task("starting", total=job.stylizer.total, completed=start, loss="-", left="-")
 
+        last_line = time.monotonic()
+
         def show(progress: Progress) -> None:
+            nonlocal last_line
             stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
-            left = _clock(progress.seconds_left)
-            bar.update(task, description=stage, completed=progress.step, loss=f"{progress.loss:.3g}", left=left)
+            loss, left = f"{progress.loss:.3g}", _clock(progress.seconds_left)
+            bar.update(task, description=stage, completed=progress.step, loss=loss, left=left)
+            if bar.disable and time.monotonic() - last_line >= LOG_SECONDS:
+                last_line = time.monotonic()
+                error_console.print(f"{stage}: step {progress.step} of {progress.total}, loss {loss}, {left} left")
 
         yield show
 

@@ -242,7 +242,7 @@ def write_contact_sheet(path: Path, stylizer: Stylizer, style: Tensor) -> None:
             pairs.append((views.cameras[index], renders))
     sheet = _sheet(_picture(style), pairs)
     with atomic_path(path) as temporary:
-        sheet.save(temporary, format="JPEG", quality=90)
+        sheet.save(temporary, format="JPEG", quality=88)
 
 
 def _picture(image: Tensor) -> Image.Image:
