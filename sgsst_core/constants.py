@@ -47,8 +47,9 @@ ALPHA_MAX = 0.99
 #: Below one grey level of an 8-bit image a contribution is skipped. This also gives a Gaussian a finite support.
 ALPHA_MIN = 1.0 / 255.0
 
-#: A pixel is finished when its transmittance would fall to this: (1 - ALPHA_MAX)^2, two opaque Gaussians.
-TRANSMITTANCE_MIN = 1e-4
+#: A pixel is finished when its transmittance would fall to this, which is 1e-4: two opaque Gaussians. Written as they
+#: multiply, so that the second one finishes the pixel in float64 as it does in float32 (where 1e-4 itself would not).
+TRANSMITTANCE_MIN = (1.0 - ALPHA_MAX) ** 2
 
 #: Nearest depth that is drawn, in world units: what the original viewers use. gsplat trains with 0.01.
 NEAR = 0.2

@@ -11,6 +11,7 @@ what is left of rasterizing is reading W from memory. Two forms of the operator:
 from __future__ import annotations
 
 import threading
+import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,7 +38,8 @@ from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene import Scene
 
 Precision = Literal["float32", "half"]
-_ITEM_BYTES = 22  # a Gaussian's index, a slot, two row numbers, a gradient
+_ITEM_BYTES = 20  # a Gaussian's index, a slot, a gradient
+_PIECE_BYTES = 4  # an item
 
 
 @dataclass(frozen=True)
@@ -45,22 +47,22 @@ class _Counts:
     """What a band's weights will need, counted before they are kept."""
 
     items: NDArray[np.int64]  # [strips]
-    rows: NDArray[np.int64]  # [strips] of 8 weights
+    pieces: NDArray[np.int64]  # [4 strips], of 32 weights
     slot_items: NDArray[np.int64]  # [E], items of every (Gaussian, tile)
 
     def nbytes(self, pixels: int, weight_bytes: int) -> int:
         """Bytes of the operator on the CPU."""
-        index = self.items.nbytes + self.rows.nbytes + 4 * pixels
-        return index + int(self.items.sum()) * _ITEM_BYTES + int(self.rows.sum()) * kernels.STRIP * weight_bytes
+        index = self.items.nbytes + self.pieces.nbytes + 4 * pixels + _ITEM_BYTES * int(self.items.sum())
+        return index + int(self.pieces.sum()) * (_PIECE_BYTES + kernels.PIECE * weight_bytes)
 
 
 def _count(lists: RasterLists, width: int, band: Rows, alpha_max: float) -> _Counts:
     """Count what a band's weights will need: costs about one render."""
     strips = (len(lists.starts) - 1) * (RASTER_TILE // kernels.STRIP)
-    counts = _Counts(*(np.zeros(n, dtype=np.int64) for n in (strips, strips, len(lists.ranks))))
+    counts = _Counts(*(np.zeros(n, dtype=np.int64) for n in (strips, strips * kernels.BLOCKS, len(lists.ranks))))
     tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
     with kernel_threads():
-        kernels.count_weights(*tiles, band, width, alpha_max, counts.items, counts.rows, counts.slot_items)
+        kernels.count_weights(*tiles, band, width, alpha_max, counts.items, counts.pieces, counts.slot_items)
     return counts
 
 
@@ -82,18 +84,18 @@ class WeightStrips:
         self.gaussians = lists.projection.gaussians
         slot_starts = _offsets(counts.slot_items)
         self.first_slots = slot_starts[lists.first_slots]
-        items, rows = int(counts.items.sum()), int(counts.rows.sum())
+        items, pieces = int(counts.items.sum()), int(counts.pieces.sum())
         weights: NDArray[np.float32] | NDArray[np.uint16]
         if precision == "float32":
-            weights = np.empty(rows * kernels.STRIP, dtype=np.float32)
+            weights = np.empty(pieces * kernels.PIECE, dtype=np.float32)
         else:
-            weights = np.empty(rows * kernels.STRIP, dtype=np.uint16)
+            weights = np.empty(pieces * kernels.PIECE, dtype=np.uint16)
         self.strips = kernels.Strips(
             item_starts=_offsets(counts.items),
-            row_starts=_offsets(counts.rows),
+            piece_starts=_offsets(counts.pieces),
             gaussians=np.empty(items, dtype=np.int32),
             slots=np.empty(items, dtype=np.int32),
-            rows=np.empty((items, 2), dtype=np.uint8),
+            items=np.empty(pieces, dtype=np.int32),
             weights=weights,
         )
         self.transmittance = np.ones((band[1] - band[0], camera.width), dtype=np.float32)
@@ -155,7 +157,11 @@ def _compressed_rows(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple
     counts = torch.bincount(rows, minlength=shape[0])
     index_type = torch.int32 if len(values) < 2**31 else torch.int64
     starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(index_type)
-    return torch.sparse_csr_tensor(starts, columns[order].to(index_type), values[order], size=shape)
+    with warnings.catch_warnings():  # what is used of it, matrix times matrix, works
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(
+            starts, columns[order].to(index_type), values[order], size=shape, check_invariants=False
+        )
 
 
 @dataclass(frozen=True)
@@ -289,4 +295,4 @@ class CachedRasterizer:
         if self.device.type == "cpu":
             return counts.nbytes(pixels, 4 if self.precision == "float32" else 2)
         # Two CSR matrices of at most so many weights (padding is dropped), 4 bytes each for value and index.
-        return 2 * (int(counts.rows.sum()) * kernels.STRIP * 8 + 4 * (pixels + len(self.scene)))
+        return 2 * (int(counts.pieces.sum()) * kernels.PIECE * 8 + 4 * (pixels + len(self.scene)))

@@ -24,60 +24,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled
-from sgsst_core.constants import ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
-from sgsst_core.rasterizer.vectors import LANES, add_scaled, dot_pixels, keep_vector
+from sgsst_core.constants import ALPHA_MIN, RASTER_TILE
+from sgsst_core.rasterizer.vectors import (
+    BLOCK_ROWS,
+    LANES,
+    add_pieces,
+    add_scaled,
+    blend_row,
+    dot_pieces,
+    dot_pixels,
+    keep_vector,
+    sum_lanes,
+)
 
-#: 2^f on [-0.5, 0.5] by interpolation in Chebyshev points: relative error 3e-9, which float32 does not see.
-_EXP2 = np.polynomial.Chebyshev.interpolate(np.exp2, 6, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
-_E0, _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(c) for c in _EXP2)
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
-#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which then stands in the low bits.
-_ROUNDER = np.float32(12582912.0)
-_EXPONENT_BIAS = np.int32(127)
-_EXPONENT_SHIFT = np.int32(23)
-_LOG2_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
-#: Anything below the cut is skipped; the clamp only keeps the exponent in range.
-_LOG2_FLOOR = np.float32(-64.0)
 _SUPPORT = -math.log2(ALPHA_MIN)
-_T_MIN = np.float32(TRANSMITTANCE_MIN)
 _TILE = RASTER_TILE
 _LAST = RASTER_TILE - 1
 _PIXELS = RASTER_TILE**2
 
 
 @compiled()
-def _blend_row(block, row, u, u_scale, log2_alpha, alpha_max):
-    """Blend one Gaussian into one row of a tile: block[0] is transmittance, block[1] receives the weights.
-
-    A finished pixel's transmittance is stored negated: then no later weight can pass, and one comparison serves both
-    the cut and the memory of it. Returns how many pixels of the row go on.
-    """
-    going_on = 0
-    for i in range(_TILE):
-        offset = u + u_scale * np.float32(i)
-        power = max(log2_alpha - offset * offset, _LOG2_FLOOR)
-        rounded = np.float32(power + _ROUNDER)
-        f = power - (rounded - _ROUNDER)
-        series = _E0 + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
-        two_to = np.int32((rounded.view(np.int32) + _EXPONENT_BIAS) << _EXPONENT_SHIFT).view(np.float32)
-        alpha = min(series * two_to, alpha_max)
-        alpha = alpha if power >= _LOG2_ALPHA_MIN else _ZERO
-        before = block[0, row, i]
-        after = before * (_ONE - alpha)
-        passes = after > _T_MIN
-        block[1, row, i] = alpha * before if passes else _ZERO
-        block[0, row, i] = after if passes else -abs(before)
-        going_on += 1 if passes else 0
-    return going_on
-
-
-@compiled()
 def _blend(block, alive, value, x, y, low, high, alpha_max):
     """Blend one Gaussian into rows low..high of the tile at pixel (x, y); returns the rows (first, stop) it reached.
 
-    block[1, first:stop] then holds its weights. alive[row] counts the row's unfinished pixels, alive[16] the rows with
-    any.
+    block[1, first:stop] then holds its weights. alive[row] says whether the row has unfinished pixels, alive[16] how
+    many rows have.
     """
     dx = x + 0.5 - value[0]
     top = y + 0.5 - value[1]
@@ -102,9 +75,7 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
         for gap in range(stop, row):
             for i in range(_TILE):
                 block[1, gap, i] = _ZERO
-        going_on = _blend_row(
-            block, row, np.float32(u), np.float32(u_scale), np.float32(log2_opacity - w * w), np.float32(alpha_max)
-        )
+        going_on = blend_row(block, row, u, u_scale, log2_opacity - w * w, alpha_max)
         stop = row + 1
         if going_on == 0:
             alive[_TILE] -= 1
@@ -121,7 +92,7 @@ def _start_tile(block, alive, columns, low, high):
             inside = low <= row < high and i < columns
             block[0, row, i] = _ONE if inside else -_ONE
     for row in range(low, high):
-        alive[row] = columns
+        alive[row] = 1
     alive[_TILE] = max(high - low, 0)
 
 
@@ -220,45 +191,53 @@ def add_slots(slot_gradients, first_slots, gaussians, gradient):
         gradient[gaussian, 0], gradient[gaussian, 1], gradient[gaussian, 2] = red, green, blue
 
 
-# Kept weights. A strip is half a raster tile, 8 columns wide: as narrow as one 256-bit vector, so that little is stored
-# beside a small Gaussian's support. An item is one Gaussian's rows (first, stop) in one strip, its weights lying row by
-# row.
+# Kept weights. A strip is half a raster tile, 8 columns by 16 rows; it is cut into 4 blocks of 4 rows. An item is one
+# Gaussian in one strip, a piece is one item in one block: 32 weights, row by row. So little is stored beside a
+# Gaussian's support, every piece takes the same instructions, and what a block adds up (or is multiplied with) stays in
+# registers.
 
 STRIP = LANES
+PIECE = LANES * BLOCK_ROWS
+BLOCKS = RASTER_TILE // BLOCK_ROWS
 _STRIPS = RASTER_TILE // STRIP
 
 
 class Strips(NamedTuple):
-    """Kept weights of a band; I items, R rows of 8 weights. Strips run along the rows of raster tiles.
+    """Kept weights of a band; I items, P pieces. Strips run along the rows of raster tiles.
 
     Kernels unpack it before their parallel loop: Numba's loops take arrays, not fields of a tuple.
     """
 
     item_starts: NDArray[np.int64]  # [strips + 1]
-    row_starts: NDArray[np.int64]  # [strips + 1]
+    piece_starts: NDArray[np.int64]  # [4 strips + 1], blocks from top to bottom
     gaussians: NDArray[np.int32]  # [I], indices into the scene
     slots: NDArray[np.int32]  # [I]; the slots of one Gaussian lie side by side
-    rows: NDArray[np.uint8]  # [I, 2], (first, stop) within the strip
-    weights: NDArray[np.float32] | NDArray[np.uint16]  # [8 R], float32 or half-precision bits (see `vectors`)
+    items: NDArray[np.int32]  # [P], the piece's item, counted from the strip's first
+    weights: NDArray[np.float32] | NDArray[np.uint16]  # [32 P], float32 or half-precision bits (see `vectors`)
 
 
 @compiled()
-def _strip_rows(block, column, first, stop):
-    """The rows (first, stop) of a blended block that hold any weight in the strip's columns."""
-    low, high = stop, first
-    for row in range(first, stop):
-        largest = _ZERO
+def _fill_blocks(block, first, stop):
+    """Zero the weights of rows that share a block with rows first..stop but were not reached."""
+    for row in range(first // BLOCK_ROWS * BLOCK_ROWS, first):
+        block[1, row] = _ZERO
+    for row in range(stop, (stop + BLOCK_ROWS - 1) // BLOCK_ROWS * BLOCK_ROWS):
+        block[1, row] = _ZERO
+
+
+@compiled()
+def _has_weight(block, row, column):
+    """Whether the block of 4 rows and 8 columns at (row, column) holds any weight."""
+    largest = _ZERO
+    for down in range(BLOCK_ROWS):
         for i in range(STRIP):
-            largest = max(largest, block[1, row, column + i])
-        if largest > _ZERO:
-            low = min(low, row)
-            high = row + 1
-    return low, high
+            largest = max(largest, block[1, row + down, column + i])
+    return largest > _ZERO
 
 
 @compiled(parallel=True)
-def count_weights(entries, slots, starts, values, band, width, alpha_max, items, rows, slot_items):
-    """Items and rows of every strip, and items of every slot: what has to be known before weights are kept."""
+def count_weights(entries, slots, starts, values, band, width, alpha_max, items, pieces, slot_items):
+    """Items of every strip, pieces of every block, items of every slot: what is needed before weights are kept."""
     across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
         x, y = tile % across * _TILE, tile // across * _TILE
@@ -267,22 +246,25 @@ def count_weights(entries, slots, starts, values, band, width, alpha_max, items,
         alive = np.empty(_TILE + 1, dtype=np.int32)
         _start_tile(block, alive, columns, low, high)
         for position in range(starts[tile], starts[tile + 1]):
-            found = 0
-            if alive[_TILE] > 0:
-                first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
-                for side in range(_STRIPS):
-                    a, b = _strip_rows(block, side * STRIP, first, stop)
-                    if a < b:
-                        items[tile * _STRIPS + side] += 1
-                        rows[tile * _STRIPS + side] += b - a
-                        found += 1
-            slot_items[slots[position]] = found
+            slot_items[slots[position]] = 0
+            if alive[_TILE] == 0:
+                continue
+            first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
+            _fill_blocks(block, first, stop)
+            for side in range(_STRIPS):
+                strip, found = tile * _STRIPS + side, 0
+                for row in range(first // BLOCK_ROWS * BLOCK_ROWS, stop, BLOCK_ROWS):
+                    if _has_weight(block, row, side * STRIP):
+                        pieces[strip * BLOCKS + row // BLOCK_ROWS] += 1
+                        found = 1
+                items[strip] += found
+                slot_items[slots[position]] += found
 
 
 @compiled(parallel=True)
 def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slot_starts, strips, transmittance):
     """Fill the items and weights that `count_weights` counted, and the final transmittance [h, width] of the band."""
-    item_starts, row_starts, item_gaussians, item_slots, item_rows, weights = strips
+    item_starts, piece_starts, item_gaussians, item_slots, piece_items, weights = strips
     width = transmittance.shape[1]
     across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
@@ -292,25 +274,30 @@ def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slo
         alive = np.empty(_TILE + 1, dtype=np.int32)
         blended = block.reshape(2 * _PIXELS)
         items = item_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
-        kept = row_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
+        pieces = piece_starts[tile * _STRIPS * BLOCKS : (tile + 1) * _STRIPS * BLOCKS].copy()
         _start_tile(block, alive, columns, low, high)
         for position in range(starts[tile], starts[tile + 1]):
             if alive[_TILE] == 0:
                 break
             rank, slot = entries[position], slot_starts[slots[position]]
             first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
+            _fill_blocks(block, first, stop)
             for side in range(_STRIPS):
-                a, b = _strip_rows(block, side * STRIP, first, stop)
-                if a >= b:
-                    continue
-                for row in range(a, b):
-                    keep_vector(blended, _PIXELS + row * _TILE + side * STRIP, weights, kept[side] * STRIP)
-                    kept[side] += 1
-                item = items[side]
-                item_gaussians[item], item_slots[item] = gaussians[rank], slot
-                item_rows[item, 0], item_rows[item, 1] = a, b
-                items[side] += 1
-                slot += 1
+                item, found = items[side], 0
+                for row in range(first // BLOCK_ROWS * BLOCK_ROWS, stop, BLOCK_ROWS):
+                    if not _has_weight(block, row, side * STRIP):
+                        continue
+                    piece = pieces[side * BLOCKS + row // BLOCK_ROWS]
+                    pieces[side * BLOCKS + row // BLOCK_ROWS] += 1
+                    piece_items[piece] = item - item_starts[tile * _STRIPS + side]
+                    for down in range(BLOCK_ROWS):
+                        source = _PIXELS + (row + down) * _TILE + side * STRIP
+                        keep_vector(blended, source, weights, piece * PIECE + down * STRIP)
+                    found = 1
+                if found:
+                    item_gaussians[item], item_slots[item] = gaussians[rank], slot
+                    items[side] += 1
+                    slot += 1
         for row in range(low, high):
             for i in range(columns):
                 transmittance[y + row - band[0], x + i] = abs(block[0, row, i])
@@ -319,20 +306,22 @@ def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slo
 @compiled(parallel=True)
 def apply_weights(strips, colours, background, transmittance, first_row, image):
     """Image of kept weights: what `render` computes, without computing a weight."""
-    item_starts, row_starts, item_gaussians, _, item_rows, weights = strips
+    item_starts, piece_starts, item_gaussians, _, piece_items, weights = strips
     height, width = transmittance.shape
     across = (width + _LAST) // _TILE * _STRIPS
     for strip in numba.prange(item_starts.size - 1):
         x, y = strip % across * STRIP, strip // across * _TILE
+        begin, end = item_starts[strip], item_starts[strip + 1]
         pixels = np.zeros((_TILE, 3, LANES), dtype=np.float32)
-        begin = row_starts[strip] * STRIP
-        for item in range(item_starts[strip], item_starts[strip + 1]):
-            first = np.int64(item_rows[item, 0])
-            vectors = np.int64(item_rows[item, 1]) - first
+        strip_colours = np.empty((end - begin, 3), dtype=np.float32)
+        for item in range(begin, end):
             gaussian = item_gaussians[item]
-            red, green, blue = colours[gaussian, 0], colours[gaussian, 1], colours[gaussian, 2]
-            add_scaled(weights, begin, vectors, pixels, first, red, green, blue)
-            begin += vectors * STRIP
+            for channel in range(3):
+                strip_colours[item - begin, channel] = colours[gaussian, channel]
+        for part in range(BLOCKS):
+            piece = piece_starts[strip * BLOCKS + part]
+            count = piece_starts[strip * BLOCKS + part + 1] - piece
+            add_pieces(weights, piece_items, piece, count, strip_colours, pixels, part * BLOCK_ROWS)
         low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
         columns = min(width - x, STRIP)
         _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
@@ -341,35 +330,36 @@ def apply_weights(strips, colours, background, transmittance, first_row, image):
 @compiled(parallel=True)
 def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
     """dL/dcolour of every item in its slot: what `colour_gradient` computes, without computing a weight."""
-    item_starts, row_starts, _, item_slots, item_rows, weights = strips
+    item_starts, piece_starts, _, item_slots, piece_items, weights = strips
     height, width = image_gradient.shape[0], image_gradient.shape[1]
     across = (width + _LAST) // _TILE * _STRIPS
     for strip in numba.prange(item_starts.size - 1):
         x, y = strip % across * STRIP, strip // across * _TILE
+        begin, end = item_starts[strip], item_starts[strip + 1]
         pixels = np.empty((_TILE, 3, LANES), dtype=np.float32)
+        sums = np.zeros((end - begin, 3, LANES), dtype=np.float32)
         low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
         _load_pixels(image_gradient, y - first_row, x, low, high, min(width - x, STRIP), pixels)
-        begin = row_starts[strip] * STRIP
-        for item in range(item_starts[strip], item_starts[strip + 1]):
-            first = np.int64(item_rows[item, 0])
-            vectors = np.int64(item_rows[item, 1]) - first
-            total = dot_pixels(weights, begin, vectors, pixels, first)
+        for part in range(BLOCKS):
+            piece = piece_starts[strip * BLOCKS + part]
+            count = piece_starts[strip * BLOCKS + part + 1] - piece
+            dot_pieces(weights, piece_items, piece, count, pixels, part * BLOCK_ROWS, sums)
+        for item in range(begin, end):
             slot = item_slots[item]
-            slot_gradients[slot, 0], slot_gradients[slot, 1], slot_gradients[slot, 2] = total
-            begin += vectors * STRIP
+            for channel in range(3):
+                slot_gradients[slot, channel] = sum_lanes(sums, (item - begin) * 3 + channel)
 
 
 @compiled(parallel=True)
 def locate_weights(strips, width, first_row, pixels, gaussians):
-    """Which pixel of the band and which Gaussian each kept weight [8 R] belongs to; padding lies in no pixel."""
-    item_starts, row_starts, item_gaussians, _, item_rows, _ = strips
+    """Which pixel of the band and which Gaussian each kept weight [32 P] belongs to; padding lies in no pixel."""
+    item_starts, piece_starts, item_gaussians, _, piece_items, _ = strips
     across = (width + _LAST) // _TILE * _STRIPS
     for strip in numba.prange(item_starts.size - 1):
         x, y = strip % across * STRIP, strip // across * _TILE
-        place = row_starts[strip] * STRIP
-        for item in range(item_starts[strip], item_starts[strip + 1]):
-            for row in range(item_rows[item, 0], item_rows[item, 1]):
-                for i in range(STRIP):
-                    pixels[place] = (y + row - first_row) * width + x + i
-                    gaussians[place] = item_gaussians[item]
-                    place += 1
+        for part in range(BLOCKS):
+            for piece in range(piece_starts[strip * BLOCKS + part], piece_starts[strip * BLOCKS + part + 1]):
+                for i in range(PIECE):
+                    row = y + part * BLOCK_ROWS + i // STRIP - first_row
+                    pixels[piece * PIECE + i] = row * width + x + i % STRIP
+                    gaussians[piece * PIECE + i] = item_gaussians[item_starts[strip] + piece_items[piece]]

@@ -1,4 +1,4 @@
-"""The inner loops over weights in explicit vectors of 8 floats, for the compiled kernels.
+"""The inner loops over pixels in explicit vectors, for the compiled kernels.
 
 Written as plain loops they are compiled for long arrays: four vectors at a time, and what remains one number at a time.
 A Gaussian's weights in a strip are about ten vectors, so that most of the time went into remainders. LLVM lowers the
@@ -10,6 +10,8 @@ vector type to what the processor has (one 256-bit register, two of 128 bits, ..
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -19,10 +21,22 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from sgsst_core.constants import ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
+
 LANES = 8
+#: Rows of a block of kept weights: 4 rows and 3 channels are 12 vectors of sums, which fit the registers.
+BLOCK_ROWS = 4
 _FLOAT = ir.FloatType()
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _CHANNELS = 3
+_ROW = ir.VectorType(_FLOAT, RASTER_TILE)
+_ROW_BITS = ir.VectorType(ir.IntType(32), RASTER_TILE)
+#: 2^f on [-0.5, 0.5] by interpolation in Chebyshev points: relative error 3e-9, which float32 does not see.
+_EXP2_SERIES = (
+    np.polynomial.Chebyshev.interpolate(np.exp2, 6, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
+)
+#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which then stands in the low bits.
+_ROUNDER = 12582912.0
 #: The only liberty taken with the arithmetic: a product and a sum may be rounded once.
 _FUSED = ("contract",)
 
@@ -33,11 +47,11 @@ HALF_EXPONENT = 14
 HALF_SHIFT, HALF_BIAS = 13, 112
 
 
-def _splat(builder: Any, value: Any) -> Any:
+def _splat(builder: Any, value: Any, vector: Any = _VECTOR) -> Any:
     """A scalar in every lane."""
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), lanes)
+    one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    lanes = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
+    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), lanes)
 
 
 def _number(value: int) -> Any:
@@ -84,6 +98,63 @@ def as_float(kept: NDArray[Any]) -> NDArray[np.float32]:
     if kept.dtype == np.float32:
         return kept
     return (kept.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
+
+
+@intrinsic
+def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
+    """Blend one Gaussian into a row of 16 pixels: block [2, 16, 16] holds transmittances and receives weights.
+
+    Pixel i: alpha = min(2^(log2_alpha - (u + i u_scale)^2), alpha_max), nothing below ALPHA_MIN; weight = alpha T; T
+    becomes T (1 - alpha). Where T would fall to TRANSMITTANCE_MIN nothing is blended and the pixel is finished: its T
+    is stored negated, after which no weight passes, so that one comparison serves both the cut and the memory of it.
+    Returns 1 while a pixel of the row goes on, else 0.
+    """
+    scalars = (types.float32,) * 4
+    signature = types.int64(block, types.int64, *scalars)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        block_, row_, *numbers = args
+        start, scale, log2_alpha_, alpha_max_ = (_splat(builder, n, _ROW) for n in numbers)
+        held = _data(context, builder, sig.args[0], block_, builder.mul(row_, _number(RASTER_TILE)))
+        kept = builder.gep(held, [_number(RASTER_TILE**2)])
+
+        offset = builder.fadd(start, builder.fmul(scale, _row(range(RASTER_TILE)), flags=_FUSED), flags=_FUSED)
+        power = builder.fsub(log2_alpha_, builder.fmul(offset, offset, flags=_FUSED), flags=_FUSED)
+        alpha = _exp2(builder, power)
+        alpha = builder.select(builder.fcmp_ordered("<", alpha, alpha_max_), alpha, alpha_max_)
+        seen = builder.fcmp_ordered(">=", power, _row([math.log2(ALPHA_MIN)]))
+        alpha = builder.select(seen, alpha, _row([0.0]))  # whatever a power far below the cut gave
+
+        before = _load(builder, held, _ROW)
+        after = builder.fmul(before, builder.fsub(_row([1.0]), alpha))
+        passes = builder.fcmp_ordered(">", after, _row([TRANSMITTANCE_MIN]))
+        sign = ir.Constant(_ROW_BITS, [-(2**31)] * RASTER_TILE)
+        finished = builder.bitcast(builder.or_(builder.bitcast(before, _ROW_BITS), sign), _ROW)
+        weights = builder.select(passes, builder.fmul(alpha, before), _row([0.0]))
+        builder.store(weights, builder.bitcast(kept, _ROW.as_pointer()), align=4)
+        builder.store(builder.select(passes, after, finished), builder.bitcast(held, _ROW.as_pointer()), align=4)
+        some = builder.bitcast(passes, ir.IntType(RASTER_TILE))
+        return builder.zext(builder.icmp_unsigned("!=", some, some.type(0)), ir.IntType(64))
+
+    return signature, generate
+
+
+def _row(values: Iterable[float]) -> Any:
+    """A constant row of 16 floats; one value fills it."""
+    numbers = [float(np.float32(v)) for v in values]
+    return ir.Constant(_ROW, numbers * (RASTER_TILE // len(numbers)))
+
+
+def _exp2(builder: Any, power: Any) -> Any:
+    """2^power of a row, powers in float32's normal range: the whole part is the exponent, the rest a polynomial."""
+    rounded = builder.fadd(power, _row([_ROUNDER]))
+    rest = builder.fsub(power, builder.fsub(rounded, _row([_ROUNDER])))
+    series = _row([_EXP2_SERIES[-1]])
+    for coefficient in _EXP2_SERIES[-2::-1]:
+        series = builder.fadd(builder.fmul(series, rest, flags=_FUSED), _row([coefficient]), flags=_FUSED)
+    whole = builder.add(builder.bitcast(rounded, _ROW_BITS), ir.Constant(_ROW_BITS, [127] * RASTER_TILE))
+    exponent = builder.shl(whole, ir.Constant(_ROW_BITS, [23] * RASTER_TILE))
+    return builder.fmul(series, builder.bitcast(exponent, _ROW))
 
 
 @intrinsic
@@ -172,5 +243,89 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
                 product = builder.fmul(w, _load(builder, pointer), flags=_FUSED)
                 builder.store(builder.fadd(builder.load(total), product, flags=_FUSED), total)
         return context.make_tuple(builder, sig.return_type, [_lane_sum(builder, builder.load(s)) for s in sums])
+
+    return signature, generate
+
+
+@intrinsic
+def add_pieces(typingctx, weights, items, first, count, colours, pixels, offset):
+    """pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colours[items[piece], c] over the pieces.
+
+    Pieces first..first + count in order; 4 rows, three channels, 8 lanes. `weights` is flat, float32 or half-precision
+    bits (uint16); `items` int32; `colours` [I, 3] and `pixels` [P, 3, 8] float32. Nothing is checked.
+    """
+    if not _is_weights(weights):
+        return None
+    signature = types.void(weights, items, types.int64, types.int64, colours, pixels, types.int64)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        weights_, items_, first_, count_, colours_, pixels_, offset_ = args
+        target = _data(context, builder, sig.args[5], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
+        places = [(row, c) for row in range(BLOCK_ROWS) for c in range(_CHANNELS)]
+        pointers = {
+            place: builder.gep(target, [_number((place[0] * _CHANNELS + place[1]) * LANES)]) for place in places
+        }
+        sums = {place: cgutils.alloca_once(builder, _VECTOR) for place in places}
+        for place in places:
+            builder.store(_load(builder, pointers[place]), sums[place])
+        with cgutils.for_range(builder, count_) as loop:
+            piece = builder.add(first_, loop.index)
+            item = builder.zext(builder.load(_data(context, builder, sig.args[1], items_, piece)), ir.IntType(64))
+            colour = _data(context, builder, sig.args[4], colours_, builder.mul(item, _number(_CHANNELS)))
+            channels = [_splat(builder, builder.load(builder.gep(colour, [_number(c)]))) for c in range(_CHANNELS)]
+            source = _data(context, builder, sig.args[0], weights_, builder.mul(piece, _number(BLOCK_ROWS * LANES)))
+            for row in range(BLOCK_ROWS):
+                w = _load_weights(builder, sig.args[0], builder.gep(source, [_number(row * LANES)]))
+                for c in range(_CHANNELS):
+                    product = builder.fmul(w, channels[c], flags=_FUSED)
+                    builder.store(builder.fadd(builder.load(sums[row, c]), product, flags=_FUSED), sums[row, c])
+        for place in places:
+            builder.store(builder.load(sums[place]), builder.bitcast(pointers[place], _VECTOR.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
+    """sums[items[piece], c, i] += sum over 4 rows of weights[32 piece + 8 row + i] * pixels[offset + row, c, i].
+
+    Pieces first..first + count in order; `sums` [I, 3, 8] float32, the others as in `add_pieces`.
+    """
+    if not _is_weights(weights):
+        return None
+    signature = types.void(weights, items, types.int64, types.int64, pixels, types.int64, sums)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        weights_, items_, first_, count_, pixels_, offset_, sums_ = args
+        other = _data(context, builder, sig.args[4], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
+        factors = [_load(builder, builder.gep(other, [_number(i * LANES)])) for i in range(BLOCK_ROWS * _CHANNELS)]
+        with cgutils.for_range(builder, count_) as loop:
+            piece = builder.add(first_, loop.index)
+            item = builder.zext(builder.load(_data(context, builder, sig.args[1], items_, piece)), ir.IntType(64))
+            target = _data(context, builder, sig.args[6], sums_, builder.mul(item, _number(_CHANNELS * LANES)))
+            source = _data(context, builder, sig.args[0], weights_, builder.mul(piece, _number(BLOCK_ROWS * LANES)))
+            rows = [builder.gep(source, [_number(row * LANES)]) for row in range(BLOCK_ROWS)]
+            kept = [_load_weights(builder, sig.args[0], row) for row in rows]
+            for c in range(_CHANNELS):
+                pointer = builder.gep(target, [_number(c * LANES)])
+                total = _load(builder, pointer)
+                for row in range(BLOCK_ROWS):
+                    product = builder.fmul(kept[row], factors[row * _CHANNELS + c], flags=_FUSED)
+                    total = builder.fadd(total, product, flags=_FUSED)
+                builder.store(total, builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def sum_lanes(typingctx, sums, vector):
+    """Sum of the 8 lanes of a vector, counted from the first of an array, folded in halves."""
+    signature = types.float32(sums, types.int64)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = _data(context, builder, sig.args[0], args[0], builder.mul(args[1], _number(LANES)))
+        return _lane_sum(builder, _load(builder, pointer))
 
     return signature, generate

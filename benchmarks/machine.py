@@ -1,0 +1,56 @@
+"""What every benchmark writes beside its figures: the machine that they were measured on."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+
+from sgsst_core.files import atomic_path
+
+RESULTS = Path(__file__).parent / "results"
+_PACKAGES = ("torch", "numpy", "numba")
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, memory, GPU, versions, and how busy the machine was: a figure means nothing without them."""
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "processor": _processor(),
+        "cores": psutil.cpu_count(logical=False) or os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
+        "gpu": gpu,
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
+        "load_average": [round(load, 2) for load in psutil.getloadavg()],
+    }
+
+
+def write_result(name: str, figures: dict[str, Any]) -> Path:
+    """Write figures, machine and date to `benchmarks/results/<name>.json`; returns the path."""
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    content = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "machine": describe_machine(), **figures}
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return path
+
+
+def _processor() -> str:
+    """The processor's name; where the system does not say, its architecture."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

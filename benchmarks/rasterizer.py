@@ -1,0 +1,167 @@
+"""Forward plus colour backward at 1280x720: `reference` in float32, `cpu` and `cached`, as ratios within one run.
+
+    python -m benchmarks.rasterizer [--scene point_cloud.ply --cameras cameras.json] [--repeats 7]
+
+All do the same work: one image from colours, one colour gradient from an image gradient. What depends on the geometry
+alone (projection, depth order, tile lists; for `cached` the weights too) is prepared before and timed by itself,
+because a job does it once a view. The rasterizers take turns, so that a machine that slows down slows all of them; a
+figure is the median of its turns. Each runs on one thread and on all, and its faster figure counts: on a busy machine
+more threads are slower.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.machine import write_result
+from sgsst_core.camera import Camera, orbit
+from sgsst_core.camera_files import read_cameras
+from sgsst_core.ply import read_scene
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene import Scene
+from sgsst_core.spherical_harmonics import rest_colours, view_colours
+
+WIDTH, HEIGHT = 1280, 720
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
+
+
+def generated_scene(count: int = 100_000) -> Scene:
+    """Gaussians around a sphere, for where there is no real scene."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    means = torch.nn.functional.normalize(normal(count, 3)) + 0.05 * normal(count, 3)
+    return Scene(
+        means=means,
+        quats=normal(count, 4),
+        scales=-4.5 + 0.7 * normal(count, 3),
+        opacities=-0.5 + 2 * normal(count),
+        sh_dc=normal(count, 3),
+        sh_rest=torch.zeros(count, 0, 3),
+    )
+
+
+def resized(camera: Camera) -> Camera:
+    """The camera at 1280 x 720: same horizontal field of view, principal point in the middle."""
+    factor = WIDTH / camera.width
+    return replace(
+        camera,
+        width=WIDTH,
+        height=HEIGHT,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=WIDTH / 2,
+        cy=HEIGHT / 2,
+    )
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Seconds that one call takes."""
+    started = time.perf_counter()
+    action()
+    return time.perf_counter() - started
+
+
+def both(rasterizer: Rasterizer, colours: Tensor, image_gradient: Tensor, camera: Camera, threads: int) -> float:
+    """Seconds of forward plus backward on so many threads."""
+    torch.set_num_threads(threads)
+    render = timed(lambda: rasterizer.render(colours, camera))
+    return render + timed(lambda: rasterizer.colour_gradient(image_gradient, camera))
+
+
+def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
+    """Median seconds of each rasterizer and the ratios between them, in turn on one view."""
+    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+    image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
+    threads = sorted({1, torch.get_num_threads()})
+    cpu = CpuRasterizer(scene)
+    CpuRasterizer(scene).lists(camera)  # compile first
+    prepare = timed(lambda: cpu.lists(camera))
+    caches = {p: CachedRasterizer(scene, precision=p) for p in ("float32", "half")}
+    for cache in caches.values():
+        cache.render(colours, camera)
+    keep = timed(lambda: CachedRasterizer(scene).render(colours, camera)) - prepare
+    reference = ReferenceRasterizer(scene, dtype=torch.float32)
+    reference.render(colours, camera, (0, 1))  # projects and sorts
+    rasterizers: dict[str, Rasterizer] = {
+        "reference": reference,
+        "cpu": cpu,
+        "cached float32": caches["float32"],
+        "cached half": caches["half"],
+    }
+    seconds: dict[str, dict[int, list[float]]] = {name: {count: [] for count in threads} for name in rasterizers}
+    for turn in range(repeats):
+        for name, rasterizer in rasterizers.items():
+            for count in threads:
+                if turn == 0 or name != "reference":  # it takes seconds, which is repetition enough
+                    seconds[name][count].append(both(rasterizer, colours, image_gradient, camera, count))
+    torch.set_num_threads(threads[-1])
+    medians = {name: {n: statistics.median(v) for n, v in runs.items()} for name, runs in seconds.items()}
+    best = {name: min(runs.values()) for name, runs in medians.items()}
+    return {
+        "gaussians": len(scene),
+        "intersections": len(cpu.lists(camera).ranks),
+        "seconds": {name: round(value, 5) for name, value in best.items()},
+        "seconds_by_threads": {name: {n: round(v, 5) for n, v in runs.items()} for name, runs in medians.items()},
+        "seconds_prepare": round(prepare, 5),
+        "seconds_keep_weights": round(keep, 5),
+        "bytes_kept": {name: cache.kept_bytes for name, cache in caches.items()},
+        "ratio_reference_to_cpu": round(best["reference"] / best["cpu"], 1),
+        "ratio_cpu_to_cached_float32": round(best["cpu"] / best["cached float32"], 2),
+        "ratio_cpu_to_cached_half": round(best["cpu"] / best["cached half"], 2),
+    }
+
+
+def scenes(arguments: argparse.Namespace) -> dict[str, tuple[Scene, Camera]]:
+    """What to measure: the scene asked for, else the real ones where they are, else a generated one."""
+    if arguments.scene:
+        scene = read_scene(arguments.scene).scene
+        cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)
+        return {arguments.scene.stem: (scene, resized(cameras[0]))}
+    found: dict[str, tuple[Scene, Camera]] = {}
+    for name in ("snowmiku_plush", "biker"):
+        if (DATA / name / "point_cloud.ply").is_file():
+            scene = read_scene(DATA / name / "point_cloud.ply").scene
+            file = DATA / name / "cameras.json"
+            found[name] = (scene, resized((read_cameras(file) if file.is_file() else orbit(scene, 8))[0]))
+    scene = generated_scene()
+    return found or {"generated": (scene, resized(orbit(scene, 8)[0]))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--scene", type=Path, help="3DGS PLY; without it the real test scenes, or a generated one")
+    parser.add_argument("--cameras", type=Path, help="camera file of the scene; its first camera is used")
+    parser.add_argument("--repeats", type=int, default=7)
+    arguments = parser.parse_args()
+    figures: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "scenes": {}}
+    for name, (scene, camera) in scenes(arguments).items():
+        result = measure(scene, camera, arguments.repeats)
+        figures["scenes"][name] = result
+        print(f"{name}: {result['gaussians']:,} Gaussians, {result['intersections']:,} intersections")
+        for run, value in result["seconds"].items():
+            print(f"  {run:24} {value * 1e3:9.1f} ms")
+        print(f"  prepared once a view     {result['seconds_prepare'] * 1e3:9.1f} ms")
+        print(f"  weights kept once a view {result['seconds_keep_weights'] * 1e3:9.1f} ms")
+        print(f"  reference / cpu          {result['ratio_reference_to_cpu']:9.1f}")
+        print(f"  cpu / cached float32     {result['ratio_cpu_to_cached_float32']:9.2f}")
+        print(f"  cpu / cached half        {result['ratio_cpu_to_cached_half']:9.2f}")
+    print(write_result("rasterizer", figures))
+
+
+if __name__ == "__main__":
+    main()

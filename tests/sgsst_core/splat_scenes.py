@@ -1,0 +1,91 @@
+"""Small generated scenes and cameras for the rasterizer tests."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from sgsst_core.camera import Camera
+from sgsst_core.scene import Scene
+
+
+def camera(width: int = 70, height: int = 45, *, focal: float = 60.0, pose: Tensor | None = None) -> Camera:
+    """At the origin, looking along +z, unless there is a pose; principal point off the middle."""
+    pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
+    return Camera("test", width, height, focal, focal * 1.1, width / 2 + 1.3, height / 2 - 0.7, pose)
+
+
+def turned_pose(angle: float = 0.3) -> Tensor:
+    """A pose that turns about a slanted axis and moves."""
+    axis = torch.tensor([1.0, 2.0, -0.5], dtype=torch.float64)
+    x, y, z = (axis / axis.norm()).tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.matrix_exp(angle * cross)
+    pose[:3, 3] = torch.tensor([0.2, -0.1, 0.3])
+    return pose
+
+
+def cloud(count: int = 400, *, seed: int = 0, log_scale: float = -2.5, degree: int = 0, depth: float = 4.0) -> Scene:
+    """Gaussians of all shapes and opacities in front of `camera()`; a few behind it, at its sides and very close."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    means = normal(count, 3) * torch.tensor([1.5, 1.0, 1.5]) + torch.tensor([0.0, 0.0, depth])
+    means[: count // 20] = 3 * normal(count // 20, 3)
+    return Scene(
+        means=means,
+        quats=normal(count, 4),
+        scales=log_scale + normal(count, 3),
+        opacities=2.5 * normal(count),
+        sh_dc=normal(count, 3),
+        sh_rest=0.3 * normal(count, (degree + 1) ** 2 - 1, 3),
+    )
+
+
+def single(
+    mean: tuple[float, float, float],
+    *,
+    opacity: float = 0.8,
+    scales: tuple[float, float, float] = (0.1, 0.1, 0.1),
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+) -> Scene:
+    """One Gaussian; opacity and scales as they are, not as files store them."""
+    return together([(mean, opacity, scales, quat)])
+
+
+def together(
+    gaussians: list[tuple[tuple[float, ...], float, tuple[float, ...], tuple[float, ...]]],
+) -> Scene:
+    """A scene of (mean, opacity, scales, quat)."""
+    means, opacities, scales, quats = zip(*gaussians, strict=True)
+    count = len(means)
+    return Scene(
+        means=torch.tensor(means, dtype=torch.float32),
+        quats=torch.tensor(quats, dtype=torch.float32),
+        scales=torch.tensor(scales, dtype=torch.float64).log().float(),
+        opacities=torch.tensor([math.log(o / (1 - o)) for o in opacities], dtype=torch.float32),
+        sh_dc=torch.zeros(count, 3),
+        sh_rest=torch.zeros(count, 0, 3),
+    )
+
+
+def empty_scene() -> Scene:
+    """No Gaussian at all."""
+    return Scene(
+        torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 0, 3)
+    )
+
+
+def colours_of(scene: Scene, seed: int = 5) -> Tensor:
+    """Random colours in 0..2, float32."""
+    return 2 * torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(seed))
+
+
+def pixels_like(view: Camera, seed: int = 6) -> Tensor:
+    """A random image gradient [h, w, 3], float32."""
+    return torch.randn(view.height, view.width, 3, generator=torch.Generator().manual_seed(seed))
