@@ -38,8 +38,9 @@ BAD_INPUT, FAILURE = 2, 1
 MAX_RESOLUTION = 16384
 #: Where the progress bar cannot be drawn (a log file), a line is printed instead, this often.
 LOG_SECONDS = 60.0
-#: The demo's steps, and seconds after which it stops on slow machines: less than five minutes with all that is around.
-DEMO_STEPS, DEMO_SECONDS = 120, 210
+#: The demo's resolution and steps, and seconds after which it stops on a slow machine: less than five minutes with all
+#: that is around.
+DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
 
 app = typer.Typer(
     help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
@@ -233,11 +234,12 @@ def demo(
         fetch("vgg16")
     with _status("Building the scene"):
         files = build_demo(out)
-    source = SceneRequest(files.ply, files.cameras, None, "-y", None, None, NEAR, False)
-    settings = make_settings("preview", steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
+    source = SceneRequest(files.ply, files.cameras, None, "-y", None, DEMO_RESOLUTION, NEAR, False)
+    settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
     request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, settings)
     options: dict[str, object] = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
-    options |= {"--preset": "preview", "--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
+    options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
+    options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
     out_console.print(f"{'command:':<18}{shlex.join(['sgsst', *arguments])}")
     _stylize(request, arguments)

@@ -33,7 +33,7 @@ from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.stylizer import Callbacks, Progress, Stopped, Stylizer, StylizerState, fit_cameras, run
-from sgsst_core.views import SEEN_COVERAGE
+from sgsst_core.survey import SEEN_COVERAGE
 from sgsst_core.weights import load_weights
 
 Up = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -212,7 +212,7 @@ def execute(job: Job, *, progress: Callable[[Progress], None], stop: Callable[[]
         if unsaved:
             raise unsaved[0]
         return Result(stopped, before, {})
-    write_stylized(job.scene_file, outputs.ply, stylizer.sh_dc)
+    write_stylized(job.scene_file, outputs.ply, stylizer.stylized())
     if stopped == "finished":
         outputs.checkpoint.unlink(missing_ok=True)
     after = stylizer.evaluate(views)
@@ -236,7 +236,7 @@ def describe(job: Job) -> list[tuple[str, str]]:
     stylizer, settings = job.stylizer, job.stylizer.settings
     lines = [("scene", _describe_scene(job)), ("views", _describe_views(job))]
     if stylizer.views.weighted or settings.position_weights == "auto":
-        share = f"{stylizer.views.uncovered_share:.1%} of the views' pixels are uncovered"
+        share = f"{stylizer.plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
         lines.append(("position weights", f"{'on' if stylizer.views.weighted else 'off'}: {share}"))
     lines.append(("network", _describe_network(job)))
     rate = f"learning rate {settings.learning_rate:g}"

@@ -1,4 +1,4 @@
-"""`sgsst demo`, cut down to one step: the same files and the same path through the program."""
+"""`sgsst demo`, cut down to one step on small views: the same files and the same path through the program."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(cli, "DEMO_STEPS", 1)
+    monkeypatch.setattr(cli, "DEMO_RESOLUTION", 180)
     out = tmp_path / "demo"
     assert cli.main(["demo", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
