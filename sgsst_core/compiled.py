@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -15,16 +18,29 @@ import torch
 _TURN = threading.RLock()
 
 
+#: Sources of this package that are compiled into kernels of other modules.
+_COMPILED_IN = ("constants.py", "rasterizer/vectors.py")
+
+
+@functools.cache
+def _digest() -> str:
+    """Changes with the sources that are compiled into kernels of other modules."""
+    folder = Path(__file__).parent
+    content = b"".join((folder / name).read_bytes() for name in _COMPILED_IN)
+    return hashlib.sha256(content).hexdigest()[:12]
+
+
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` with the machine code kept on disk, or in memory only where no folder can be written.
 
     Numba checks a kept kernel against its own source file alone, so a kernel calls compiled functions of its own
-    module. Multiply-adds are contracted; nothing is reordered unless a kernel asks for it, so results do not depend on
-    threads.
+    module, and what else goes into the machine code is part of the name that it is kept under. Multiply-adds are
+    contracted; nothing is reordered, so results do not depend on threads.
     """
     settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, **options}
 
     def decorate(function: Callable[..., Any]) -> Any:
+        function.__qualname__ = f"{function.__qualname__}_{_digest()}"
         try:
             return numba.njit(cache=True, **settings)(function)
         except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache can be written

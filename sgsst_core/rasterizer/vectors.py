@@ -1,8 +1,8 @@
 """The inner loops over pixels in explicit vectors, for the compiled kernels.
 
 Written as plain loops they are compiled for long arrays: four vectors at a time, and what remains one number at a time.
-A Gaussian's weights in a strip are about ten vectors, so that most of the time went into remainders. LLVM lowers the
-vector type to what the processor has (one 256-bit register, two of 128 bits, ...).
+A Gaussian's weights in a raster tile are some twenty vectors, so that much of the time went into remainders. LLVM
+lowers the vector types to what the processor has (one 256-bit register, two of 128 bits, ...). No bounds are checked.
 """
 
 # The types of compiled functions are those of their arguments.
