@@ -116,7 +116,7 @@ def build_report(
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.views.weighted,
-            "uncovered_share": round(stylizer.views.uncovered_share, 6),
+            "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
         },
         "rasterizer": stylizer.views.rasterizer.name,
         "memory": {"limit_bytes": stylizer.memory, "peak_bytes": peak_memory()},

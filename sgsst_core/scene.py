@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -34,3 +35,18 @@ class Scene:
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return {0: 0, 3: 1, 8: 2, 15: 3}[int(self.sh_rest.shape[1])]
+
+    def subset(self, rows: Tensor) -> Scene:
+        """The Gaussians of some rows ([N] bool, or indices), without the SH bands that are zero in all of them."""
+        rest = self.sh_rest[rows]
+        used = rest.abs().amax(dim=(0, 2)) > 0 if rest.numel() else torch.zeros(rest.shape[1], dtype=torch.bool)
+        highest = int(used.nonzero()[-1]) + 1 if used.any() else 0
+        coefficients = next(count for count in (0, 3, 8, 15) if count >= highest)
+        return Scene(
+            self.means[rows],
+            self.quats[rows],
+            self.scales[rows],
+            self.opacities[rows],
+            self.sh_dc[rows],
+            rest[:, :coefficients].contiguous(),
+        )

@@ -32,6 +32,8 @@ class Settings(BaseModel):
         seed: of the order of views.
         max_seconds: wall-clock budget of the iterations; None for none.
         memory_limit: bytes to plan with; None for most of what is free.
+        unseen: colours of Gaussians that no view sees: their neighbours' change, or kept as they are.
+        keep_everything: leave nothing out that a scene does not need; for comparison, the results are the same.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -50,6 +52,8 @@ class Settings(BaseModel):
     seed: int = Field(0, ge=0, lt=2**63)
     max_seconds: float | None = Field(None, gt=0)
     memory_limit: int | None = Field(None, gt=0)
+    unseen: Literal["neighbours", "keep"] = "neighbours"
+    keep_everything: bool = False
 
     def learning_rate_at(self, share: float) -> float:
         """Adam's learning rate when `share` (0..1) of all steps is done."""
@@ -72,6 +76,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "learning_rate": 2.5e-3,
         "learning_rate_end": 2.5e-3,
         "position_weights": "off",
+        "unseen": "keep",
     },
 }
 

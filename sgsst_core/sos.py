@@ -66,6 +66,7 @@ class SosLoss:
         content_weight: lambda_c; 0 leaves the content branch out.
         memory: bytes that activations may take.
         tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
+        leave_out: pixels without weight do not go through the network; False for comparison.
         timer: receives the seconds of `vgg_forward`, `vgg_backward` and `statistics`.
     """
 
@@ -76,17 +77,21 @@ class SosLoss:
         content_weight: float = 1.0,
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
+        leave_out: bool = True,
         timer: Timer | None = None,
     ) -> None:
         self.network = network
         self.content_weight = content_weight
         self.memory = memory
         self.tile_size = tile_size
+        self.leave_out = leave_out
         self.timer = timer or Timer()
         self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
         """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
+        if not self.leave_out:
+            coverage = None
         region = None if coverage is None else covered_region(coverage)
         halo = self.network.halo
         size = self.tile_size

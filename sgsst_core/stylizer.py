@@ -18,12 +18,14 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.camera import Camera, resized
 from sgsst_core.errors import CameraError
 from sgsst_core.loss import LayerTarget, LossTerms
+from sgsst_core.planner import make_plan
 from sgsst_core.pyramid import scale_count
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.sos import SosLoss
 from sgsst_core.timing import Timer
+from sgsst_core.unseen import neighbours_change
 from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.views import PhotoLoader, Views
 from sgsst_core.weights import BackboneWeights, load_weights
@@ -148,24 +150,31 @@ class Stylizer:
             self.network,
             content_weight=settings.content_weight,
             memory=int(self.memory * MEMORY_SHARES["activations"]),
+            leave_out=not settings.keep_everything,
             timer=self.timer,
         )
+        cameras = fit_cameras(cameras, settings)
+        whole = self._rasterizer(scene, "cpu" if rasterizer in ("auto", "cached") else rasterizer)
+        self.plan = make_plan(scene, cameras, settings, self.loss, whole, self.memory)
+        self.scene = scene
+        seen = scene if settings.keep_everything else scene.subset(self.plan.seen)
         self.views = Views(
-            scene,
-            fit_cameras(cameras, settings),
-            self._rasterizer(scene, rasterizer),
+            seen,
+            cameras,
+            self._rasterizer(seen, "cpu" if settings.keep_everything and rasterizer == "auto" else rasterizer),
             self.loss,
+            covered=self.plan.survey.covered,
+            weighted=self.plan.weighted,
             photos=photos,
-            position_weights=settings.position_weights,
             memory=int(self.memory * MEMORY_SHARES["views"]),
         )
         self._style = style
         self._style_targets: dict[tuple[int, int], dict[int, dict[str, LayerTarget]]] = {}
-        self.sh_dc = scene.sh_dc.clone().to(self.views.rasterizer.device).requires_grad_()
+        self.sh_dc = seen.sh_dc.clone().to(self.views.rasterizer.device).requires_grad_()
         self._adam = torch.optim.Adam([self.sh_dc], lr=settings.learning_rate, eps=ADAM_EPS)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
-        self.steps_coarse = self._phase_1_steps()
+        self.steps_coarse = self.plan.steps_coarse
         self.total = self.steps_coarse + settings.steps_sos
 
     def _network(self, weights: BackboneWeights) -> FeatureNetwork:
@@ -182,11 +191,6 @@ class Stylizer:
         if name == "cached":
             options |= {"device": self.network.device, "max_bytes": int(self.memory * MEMORY_SHARES["rasterizer"])}
         return make_rasterizer(name, scene, **options)
-
-    def _phase_1_steps(self) -> int:
-        """Phase 1 is left out where the coarsest scale is the only one (it would be phase 2), but in `paper`."""
-        several = any(scale_count(camera.height, camera.width) > 1 for camera in self.views.cameras)
-        return self.settings.steps_coarse if several or self.settings.preset == "paper" else 0
 
     @property
     def stage(self) -> Stage:
@@ -253,6 +257,20 @@ class Stylizer:
             for scale, part in terms.items():
                 total[scale] = total.get(scale, LossTerms()) + part
         return {scale: terms.divided(len(indices)) for scale, terms in total.items()}
+
+    def stylized(self) -> Tensor:
+        """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians."""
+        result = self.scene.sh_dc.clone()
+        result[self.plan.seen] = self.sh_dc.detach().cpu()
+        if self.settings.unseen == "neighbours":
+            weights = self.plan.survey.total_weights
+            result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
+        return result
+
+    def set_colours(self, sh_dc: Tensor) -> None:
+        """Put the colours [N, 3] of the whole scene in place of the present ones, to evaluate them on these views."""
+        with torch.no_grad():
+            self.sh_dc.copy_(sh_dc[self.plan.seen])
 
     def state(self) -> StylizerState:
         """A copy of all that a resumed run needs."""
@@ -347,4 +365,4 @@ def stylize(
     """
     stylizer = Stylizer(scene, cameras, style, settings, weights=weights, photos=photos)
     run(stylizer, callbacks)
-    return stylizer.sh_dc.detach().cpu()
+    return stylizer.stylized()

@@ -9,17 +9,10 @@ from torch import Tensor
 
 from sgsst_core.budget import Shelf
 from sgsst_core.camera import Camera
-from sgsst_core.errors import CameraError
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene import Scene
-from sgsst_core.settings import PositionWeights
 from sgsst_core.sos import SosLoss, ViewTarget
 from sgsst_core.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
-
-#: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
-UNCOVERED_SHARE = 0.01
-#: Below this coverage nothing can be seen of a pixel's colour in 8 bits.
-SEEN_COVERAGE = 1 / 255
 
 PhotoLoader = Callable[[int], Tensor]
 
@@ -33,7 +26,8 @@ class Views:
         rasterizer: renders them.
         loss: prepares the targets.
         photos: content image [H, W, 3] of a view by its index; None for the unstylized render.
-        position_weights: see `Settings`.
+        covered: indices of the views that see anything.
+        weighted: weigh statistics by rendered coverage.
         memory: bytes that content features, coverage and colours of views may take.
     """
 
@@ -44,8 +38,9 @@ class Views:
         rasterizer: Rasterizer,
         loss: SosLoss,
         *,
+        covered: list[int],
+        weighted: bool,
         photos: PhotoLoader | None = None,
-        position_weights: PositionWeights = "auto",
         memory: int = 1 << 30,
     ) -> None:
         self.scene = scene
@@ -57,29 +52,11 @@ class Views:
         self._means = scene.means.to(rasterizer.device)
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
         self._targets: Shelf[int, ViewTarget] = Shelf(memory - memory // 4, _target_bytes)
-        self.covered, self.uncovered_share = self._look()
-        self.weighted = position_weights == "on" or (
-            position_weights == "auto" and self.uncovered_share > UNCOVERED_SHARE
-        )
+        self.covered = covered
+        self.weighted = weighted
 
     def __len__(self) -> int:
         return len(self.cameras)
-
-    def _look(self) -> tuple[list[int], float]:
-        """Indices of the views that see anything, and the share of uncovered pixels in those."""
-        covered, uncovered, pixels = [], 0.0, 0
-        for index, camera in enumerate(self.cameras):
-            coverage = self.rasterizer.coverage(camera)
-            if float(coverage.amax()) > SEEN_COVERAGE:
-                covered.append(index)
-                uncovered += float((1 - coverage).sum(dtype=torch.float64))
-                pixels += coverage.numel()
-        if not covered:
-            raise CameraError(
-                f"None of the {len(self.cameras)} cameras sees a Gaussian. Check that cameras and scene belong "
-                "together (same training run, same world), or let --orbit make cameras."
-            )
-        return covered, uncovered / pixels
 
     def colours(self, index: int, sh_dc: Tensor) -> Tensor:
         """Colours [N, 3] of a view."""

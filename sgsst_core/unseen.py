@@ -1,0 +1,38 @@
+"""Colours for Gaussians that no view sees: the colour change of their nearest seen neighbours."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+#: Seen neighbours that vote on an unseen Gaussian's colour change.
+NEIGHBOURS = 8
+
+
+def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
+    """Colour changes for the Gaussians that no view sees.
+
+    Each takes the mean change of its nearest seen neighbours, weighted by their total blend weights: what hardly any
+    pixel showed has a change that hardly any pixel asked for.
+
+    Args:
+        means: [N, 3].
+        change: [N, 3], what optimisation changed; rows of unseen Gaussians are not read.
+        weights: [N] float64, total blend weights; 0 for the U unseen ones, at least one positive.
+
+    Returns:
+        [U, 3] float32.
+    """
+    seen = weights > 0
+    if bool(seen.all()):
+        return torch.zeros((0, 3))
+    count = min(NEIGHBOURS, int(seen.sum()))
+    tree = cKDTree(means[seen].double().numpy())
+    _, nearest = tree.query(means[~seen].double().numpy(), k=count)
+    nearest = torch.as_tensor(nearest).reshape(-1, count)
+    own = weights[seen][nearest]
+    # Relative to the largest of the eight, so that eight tiny weights still have a mean.
+    share = own / own.amax(dim=1, keepdim=True)
+    votes = (change[seen].double()[nearest] * share[:, :, None]).sum(dim=1) / share.sum(dim=1, keepdim=True)
+    return votes.float()
