@@ -184,9 +184,9 @@ def _project_one(mean, quat, scale, logit, pose, intrinsics, near, value):
     u, v = fx * (x / z) + cx, fy * (y / z) + cy
     if not math.isfinite(u + v + q / r + u_scale + extent_x + extent_y + det):
         return _INVALID, z
-    if math.ceil(u - extent_x - 0.5) > min(math.floor(u + extent_x - 0.5), width - 1) or u + extent_x < 0.5:
+    if np.ceil(u - extent_x - 0.5) > min(np.floor(u + extent_x - 0.5), width - 1) or u + extent_x < 0.5:
         return _OUTSIDE, z
-    if math.ceil(v - extent_y - 0.5) > min(math.floor(v + extent_y - 0.5), height - 1) or v + extent_y < 0.5:
+    if np.ceil(v - extent_y - 0.5) > min(np.floor(v + extent_y - 0.5), height - 1) or v + extent_y < 0.5:
         return _OUTSIDE, z
     value[0], value[1], value[2], value[3] = u, v, q / r, u_scale
     value[4], value[5], value[6], value[7] = _TO_POWER_OF_TWO / math.sqrt(r), opacity, extent_x, extent_y

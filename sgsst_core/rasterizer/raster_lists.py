@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from sgsst_core.camera import Camera
@@ -21,6 +22,8 @@ from sgsst_core.scene import Scene
 
 #: Positions in the lists are 32-bit numbers.
 MAX_INTERSECTIONS = 2**31 - 1
+#: What a pair of Gaussian and raster tile takes: rank, slot, and the slot's gradient in the backward pass.
+_PAIR_BYTES = 4 + 4 + 12
 _TILE = RASTER_TILE
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
 
@@ -69,8 +72,8 @@ def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> R
     """Project, sort by depth, and list the Gaussians of every raster tile.
 
     Raises:
-        TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address; counted before
-            anything of that size is allocated.
+        TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address or the free memory
+            can hold; counted before anything of that size is allocated.
     """
     projection = project(scene, camera, near=near)
     counts = np.empty(len(projection.gaussians), dtype=np.int64)
@@ -79,6 +82,7 @@ def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> R
     first_slots = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
     total = int(first_slots[-1])
     check_intersections(total, len(counts), camera)
+    _check_memory(total, len(counts), camera)
     across, down = tile_grid(camera)
     starts = np.zeros(across * down + 1, dtype=np.int64)
     ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
@@ -89,18 +93,35 @@ def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> R
 def check_intersections(total: int, gaussians: int, camera: Camera) -> None:
     """Raise TooManyIntersectionsError when `total` pairs of Gaussian and raster tile cannot be addressed."""
     if total > MAX_INTERSECTIONS:
-        raise TooManyIntersectionsError(
-            f"view {camera.name!r} ({camera.width}x{camera.height}): its {gaussians:,} visible Gaussians touch raster "
-            f"tiles {total:,} times, more than the {MAX_INTERSECTIONS:,} that can be addressed. Render at a lower "
-            "resolution, or remove Gaussians so large that they cover much of the view."
+        raise _refusal(total, gaussians, camera, f"more than the {MAX_INTERSECTIONS:,} that can be addressed")
+
+
+def _check_memory(total: int, gaussians: int, camera: Camera) -> None:
+    """Raise TooManyIntersectionsError when `total` pairs do not fit the memory that is free.
+
+    Allocating them would succeed all the same, and the process be killed when it writes there.
+    """
+    needed, free = total * _PAIR_BYTES, psutil.virtual_memory().available
+    if needed > free:
+        raise _refusal(
+            total, gaussians, camera, f"which takes {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB are free"
         )
+
+
+def _refusal(total: int, gaussians: int, camera: Camera, reason: str) -> TooManyIntersectionsError:
+    return TooManyIntersectionsError(
+        f"view {camera.name!r} ({camera.width}x{camera.height}): its {gaussians:,} visible Gaussians touch raster "
+        f"tiles {total:,} times, {reason}. Render at a lower resolution, or remove Gaussians so large that they cover "
+        "much of the view."
+    )
 
 
 @compiled()
 def _tile_rows(value, height):
     """Pixel rows (first, last) of the image inside a Gaussian's extents; last < first where there are none."""
-    first = max(0.0, math.ceil(value[1] - value[7] - 0.5))
-    last = min(height - 1.0, math.floor(value[1] + value[7] - 0.5))
+    # np, not math: in compiled code math.ceil gives an int64, which overflows for extents beyond 9e18 pixels
+    first = max(0.0, np.ceil(value[1] - value[7] - 0.5))
+    last = min(height - 1.0, np.floor(value[1] + value[7] - 0.5))
     return int(first), int(max(last, -1.0))
 
 
@@ -118,8 +139,8 @@ def _tile_span(value, first, last, width):
     left = min(max(-widest, top), bottom)
     half_right = math.sqrt(max(support - (right * value[4]) ** 2, 0.0)) / value[3]
     half_left = math.sqrt(max(support - (left * value[4]) ** 2, 0.0)) / value[3]
-    begin = max(0.0, math.ceil(value[0] + value[2] * left - half_left - 0.5))
-    end = min(width - 1.0, math.floor(value[0] + value[2] * right + half_right - 0.5))
+    begin = max(0.0, np.ceil(value[0] + value[2] * left - half_left - 0.5))
+    end = min(width - 1.0, np.floor(value[0] + value[2] * right + half_right - 0.5))
     if end < begin:
         return 0, 0
     return int(begin) // _TILE, int(end) // _TILE + 1

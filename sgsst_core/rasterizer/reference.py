@@ -97,7 +97,9 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
             reach * r.sqrt(),
         ]
     )
-    keep = torch.nonzero(columns.isfinite().all(0) & (opacity >= ALPHA_MIN))[:, 0]
+    # a determinant that overflows would leave u_scale 0: finite, and a Gaussian where the fast projection has none
+    usable = columns.isfinite().all(0) & det.isfinite()
+    keep = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
     keep = keep[torch.sort(centres[keep, 2], stable=True).indices]
     return Splats(index[keep], *columns[:, keep])
 
