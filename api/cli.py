@@ -21,6 +21,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as Bar
+from rich.table import Table
 
 from api.interrupt import stop_on_signal
 from api.values import parse_background, parse_bytes
@@ -117,6 +118,13 @@ def stylize(
         Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
     ] = None,
     max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and write the result.")] = None,
+    unseen: Annotated[
+        Literal["neighbours", "keep"] | None,
+        typer.Option(help="Colours of Gaussians that no view sees: their neighbours' change, or kept. [paper: keep]"),
+    ] = None,
+    keep_everything: Annotated[
+        bool, typer.Option("--keep-everything", help="Leave nothing out; slower, with the same result.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")] = False,
 ) -> None:
     """Give a scene the style of a picture."""
@@ -134,6 +142,8 @@ def stylize(
         precision=precision,
         memory_limit=memory_limit,
         max_seconds=max_seconds,
+        unseen=unseen,
+        keep_everything=keep_everything,
     )
     from api.jobs import SceneRequest, StylizeRequest
 
@@ -192,6 +202,43 @@ def _conclude(job: Job, result: Result, command: str) -> None:
     if result.report_error is not None:
         error_console.print(f"The stylized scene is whole, but its report could not be written: {result.report_error}")
         raise typer.Exit(FAILURE)
+
+
+@app.command()
+def plan(
+    scene: SceneArgument,
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    preset: Annotated[PresetName, typer.Option(help="As for stylize.")] = "standard",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: Annotated[
+        Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
+    ] = None,
+) -> None:
+    """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
+    from api.jobs import SceneRequest, make_plan
+
+    settings = make_settings(preset, max_resolution=resolution, near=near, memory_limit=memory_limit)
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    with _status("Looking at every view"):
+        made = make_plan(source, style, backbone, settings, out)
+    table = Table("item", "decision", "because", "saves a step", "saves", "error")
+    for item in made.decisions:
+        saved_time = f"{item.seconds:.2g} s" if item.seconds is not None else ""
+        saved_memory = f"{item.bytes / 1e6:.1f} MB" if item.bytes is not None else ""
+        table.add_row(item.item, item.decision, item.reason, saved_time, saved_memory, item.error)
+    out_console.print(table)
+    if made.prediction:
+        seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9
+        out_console.print(f"Expected: {seconds:.2g} s an iteration on all scales, peak memory {peak:.1f} GB")
+    out_console.print(f"{'plan:':<18}{out}")
 
 
 @app.command()

@@ -17,6 +17,7 @@ from sgsst_core.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from sgsst_core.errors import CameraError, CheckpointError, OutputError, SettingsError
 from sgsst_core.files import ensure_writable_folder
 from sgsst_core.images import check_photos, load_image, load_photo, save_png
+from sgsst_core.planner import Plan
 from sgsst_core.ply import SceneFile, read_scene, write_stylized
 from sgsst_core.pyramid import scale_count
 from sgsst_core.rasterizer import make_rasterizer
@@ -234,19 +235,14 @@ def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evalua
 def describe(job: Job) -> list[tuple[str, str]]:
     """What was decided, as pairs of a heading and a line, for the user to read before the work starts."""
     stylizer, settings = job.stylizer, job.stylizer.settings
-    lines = [("scene", _describe_scene(job)), ("views", _describe_views(job))]
-    if stylizer.views.weighted or settings.position_weights == "auto":
-        share = f"{stylizer.plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
-        lines.append(("position weights", f"{'on' if stylizer.views.weighted else 'off'}: {share}"))
-    lines.append(("network", _describe_network(job)))
+    lines = [("scene", _describe_scene(job)), ("views", _describe_views(job)), ("network", _describe_network(job))]
+    lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.plan.decisions]
     rate = f"learning rate {settings.learning_rate:g}"
     if settings.learning_rate_end != settings.learning_rate:
         rate += f" to {settings.learning_rate_end:g}"
     steps = f"{stylizer.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
     if not stylizer.steps_coarse:
         steps = f"{settings.steps_sos} steps"
-        if settings.steps_coarse:
-            steps += " (the phase on the coarsest scale is left out: it is the only one)"
     lines.append(("schedule", f"{steps}; {rate} (preset {settings.preset})"))
     if job.state:
         lines.append(("resuming", f"at step {job.state.step} of {stylizer.total}"))
@@ -267,9 +263,6 @@ def _describe_views(job: Job) -> str:
         text = f"{len(views)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
     scales = max(scale_count(height, width) for width, height in sizes)
     text += f", {scales} scale{'s' if scales > 1 else ''}"
-    blind = len(views) - len(views.covered)
-    if blind:
-        text += f"; {blind} that see no Gaussian are left out"
     return text + f"; content from {'the photos' if job.request.images else 'unstylized renders'}"
 
 
@@ -349,6 +342,25 @@ def _resumed(outputs: Outputs, job_id: str, settings: Settings) -> StylizerState
             f"too. Give more than {state.seconds:.0f}, or leave --max-seconds out."
         )
     return state
+
+
+# --- plan ----------------------------------------------------------------------------------------------------------
+
+
+def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settings, out: Path) -> Plan:
+    """Plan a job as `sgsst stylize` would, and write the plan as JSON; no step is made.
+
+    Raises:
+        InvalidInputError: in one of its forms, for the first input that cannot be used.
+    """
+    _check_choice(source)
+    check_folder(out.parent)
+    scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
+    weights = load_weights(backbone)
+    stylizer = Stylizer(scene, _cameras(source, scene), load_image(style), settings, weights=weights)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_report(out, {"version": 1, **stylizer.plan.as_dict()})
+    return stylizer.plan
 
 
 # --- render --------------------------------------------------------------------------------------------------------

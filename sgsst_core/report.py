@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -108,8 +110,8 @@ def build_report(
         },
         "scene": {
             "path": str(sources.scene),
-            "gaussians": len(stylizer.views.scene),
-            "sh_degree": stylizer.views.scene.sh_degree,
+            "gaussians": len(stylizer.scene),
+            "sh_degree": stylizer.scene.sh_degree,
             "dropped": sources.dropped,
         },
         "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
@@ -118,6 +120,7 @@ def build_report(
             "used": stylizer.views.weighted,
             "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
         },
+        "plan": {**stylizer.plan.as_dict(), "measured": _measured(stylizer)},
         "rasterizer": stylizer.views.rasterizer.name,
         "memory": {"limit_bytes": stylizer.memory, "peak_bytes": peak_memory()},
         "machine": machine(stylizer.network.device),
@@ -133,6 +136,16 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _measured(stylizer: Stylizer) -> dict[str, float | None]:
+    """What happened, beside the plan's prediction: median seconds of an SOS step, peak memory in bytes."""
+    steps = [
+        later.seconds - earlier.seconds
+        for earlier, later in pairwise(stylizer.history)
+        if earlier.stage == later.stage == "sos"
+    ]
+    return {"seconds": median(steps) if steps else None, "peak_bytes": peak_memory()}
 
 
 def _cameras_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
