@@ -175,10 +175,10 @@ def _announce(job: Job) -> None:
     from api.jobs import describe
 
     for heading, line in describe(job):
-        out_console.print(f"{heading + ':':<18}{line}")
+        out_console.print(f"{heading + ':':<22}{line}")
     if job.state is None and job.outputs.checkpoint.exists():
         out_console.print(
-            f"{'note:':<18}{job.outputs.checkpoint} of an earlier run is there. This run starts anew and will "
+            f"{'note:':<22}{job.outputs.checkpoint} of an earlier run is there. This run starts anew and will "
             "replace it; --resume would go on from it."
         )
 
@@ -187,13 +187,13 @@ def _conclude(job: Job, result: Result, command: str) -> None:
     from sgsst_core.report import mean_loss
 
     before, after = mean_loss(result.before), mean_loss(result.after)
-    out_console.print(f"{'loss:':<18}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
     outputs = job.outputs
     paths = [("stylized scene", outputs.ply)]
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.report)]
     for heading, path in paths:
-        out_console.print(f"{heading + ':':<18}{path}")
+        out_console.print(f"{heading + ':':<22}{path}")
     if result.stopped == "max-seconds":
         out_console.print(
             f"The time was up at step {job.stylizer.step} of {job.stylizer.total}. The checkpoint stays: to go on, "
@@ -238,7 +238,7 @@ def plan(
     if made.prediction:
         seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9
         out_console.print(f"Expected: {seconds:.2g} s an iteration on all scales, peak memory {peak:.1f} GB")
-    out_console.print(f"{'plan:':<18}{out}")
+    out_console.print(f"{'plan:':<22}{out}")
 
 
 @app.command()
@@ -288,7 +288,7 @@ def demo(
     options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
     options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
-    out_console.print(f"{'command:':<18}{shlex.join(['sgsst', *arguments])}")
+    out_console.print(f"{'command:':<22}{shlex.join(['sgsst', *arguments])}")
     _stylize(request, arguments)
 
 
