@@ -21,7 +21,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as Bar
-from rich.table import Table
+from rich.table import Column, Table
 
 from api.interrupt import stop_on_signal
 from api.values import parse_background, parse_bytes
@@ -229,11 +229,12 @@ def plan(
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     with _status("Looking at every view"):
         made = make_plan(source, style, backbone, settings, out)
-    table = Table("item", "decision", "because", "saves a step", "saves", "error")
+    table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
-        saved_time = f"{item.seconds:.2g} s" if item.seconds is not None else ""
-        saved_memory = f"{item.bytes / 1e6:.1f} MB" if item.bytes is not None else ""
-        table.add_row(item.item, item.decision, item.reason, saved_time, saved_memory, item.error)
+        saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
+        saved += [f"{item.bytes / 1e6:.1f} MB"] if item.bytes is not None else []
+        error = "" if item.error == "none" else f" Costs: {item.error}."
+        table.add_row(item.item, f"{item.decision}: {item.reason}.{error}", "\n".join(saved))
     out_console.print(table)
     if made.prediction:
         seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9

@@ -246,7 +246,12 @@ def _view_decisions(
         )
     if plan.weighted:
         decisions.append(
-            Decision("position weights", "statistics are weighted by coverage", share, error="chosen loss")
+            Decision(
+                "position weights",
+                "statistics are weighted by coverage",
+                share,
+                error="it is another loss than the paper's",
+            )
         )
     if settings.steps_coarse and not plan.steps_coarse:
         decisions.append(
@@ -254,7 +259,7 @@ def _view_decisions(
                 "phase 1",
                 f"its {settings.steps_coarse} steps are left out",
                 "the coarsest scale is the only one, so that it would be the same as phase 2",
-                error="fewer steps",
+                error="the steps, which work on the same loss",
             )
         )
     return decisions

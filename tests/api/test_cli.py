@@ -101,6 +101,30 @@ def test_resolution_and_views_are_what_was_asked_for(files: Files) -> None:
     assert report["cameras"]["names"] == ["view_0", "view_2"]
 
 
+def test_plan_tells_what_would_be_left_out(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scene(files.ply, ball())
+    out = files.out.with_name("plan.json")
+    command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", "--out", str(out)]
+    assert main([*command, "--style", str(files.ply)]) == 2
+    assert not out.parent.exists()
+    assert main([*command, "--style", str(files.style)]) == 0
+    plan = json.loads(out.read_text())
+    items = {decision["item"] for decision in plan["decisions"]}
+    assert {"position weights", "phase 1", "second forward"} <= items
+    assert plan["prediction"]["seconds"] > 0
+    assert "position weights" in capsys.readouterr().out
+
+
+def test_keep_everything_gives_the_same_scene(files: Files) -> None:
+    results = []
+    for options in ([], ["--keep-everything"]):
+        assert main(files.stylize("--steps-sos", "2", *options)) == 0
+        report = json.loads(files.out.with_name("stylized.report.json").read_text())
+        assert report["plan"]["measured"]["seconds"] > 0
+        results.append(read_scene(files.out).scene.sh_dc)
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-3)
+
+
 def test_photos_are_used_as_content(files: Files, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
