@@ -66,3 +66,9 @@ class TooManyIntersectionsError(SgsstError):
     """A view has more Gaussian/raster-tile intersections than the rasterizer can address."""
 
     code = "too-many-intersections"
+
+
+class DivergedError(SgsstError):
+    """Colours or gradients have left the range in which the optimiser works."""
+
+    code = "diverged"

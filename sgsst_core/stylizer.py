@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.camera import Camera, resized
-from sgsst_core.errors import CameraError
+from sgsst_core.errors import CameraError, DivergedError
 from sgsst_core.loss import LayerTarget, LossTerms
 from sgsst_core.planner import make_plan
 from sgsst_core.pyramid import scale_count
@@ -32,6 +32,8 @@ from sgsst_core.weights import BackboneWeights, load_weights
 
 #: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
+#: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
+LARGEST_GRADIENT = 1e19
 #: Of the memory limit: activations of one iteration, view targets and colours, and the rasterizer's lists or weights.
 MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 
@@ -205,7 +207,11 @@ class Stylizer:
         return self._style_targets[size]
 
     def run_step(self) -> StepRecord:
-        """One iteration."""
+        """One iteration.
+
+        Raises:
+            DivergedError: the gradient has left the range of float32; the colours are those before the step.
+        """
         started = time.perf_counter()
         self.timer.seconds.clear()
         index = self._next_view()
@@ -234,6 +240,14 @@ class Stylizer:
         return record
 
     def _update(self, gradient: Tensor) -> None:
+        largest = float(gradient.abs().max())
+        if not largest <= LARGEST_GRADIENT:
+            raise DivergedError(
+                f"Step {self.step + 1}: the colour gradient has grown to {largest:.3g}, which cannot be optimised; the "
+                f"largest colour coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a smaller "
+                f"--learning-rate than {self.settings.learning_rate:g}, or look for extreme coefficients with `sgsst "
+                "check`."
+            )
         for group in self._adam.param_groups:
             group["lr"] = self.settings.learning_rate_at(self.step / max(self.total - 1, 1))
         self.sh_dc.grad = gradient.to(self.sh_dc.dtype)

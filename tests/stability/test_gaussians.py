@@ -1,0 +1,34 @@
+"""Hard cases of the Gaussians: values, shapes, opacities and places that overflow, cancel or divide by zero."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgsst_core.projection import Outcome, project
+from sgsst_core.rasterizer.reference import splat
+from sgsst_core.stability import Case, gaussians
+from sgsst_core.stability.case import camera
+from tests.stability.hard_cases import check
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.mark.parametrize("case", gaussians.cases(), ids=lambda case: case.name)
+def test_stays_within_its_bound(case: Case) -> None:
+    check(case)
+
+
+def test_the_cut_offs_are_met_to_the_ulp() -> None:
+    """One float32 ulp below 1/255 is skipped, one above is kept: by the fast projection and by the reference alike."""
+    scene = gaussians._opacities_at_the_cut()
+    for index, visible in ((0, 0), (2, 1), (3, 1)):
+        one = scene.subset(torch.tensor([index]))
+        assert len(project(one, camera()).gaussians) == visible
+        assert len(splat(one, camera()).gaussians) == visible
+
+
+def test_what_has_no_projection_is_counted() -> None:
+    outcomes = project(gaussians._scales(), camera()).outcomes
+    assert outcomes[Outcome.INVALID] == 3
+    assert outcomes[Outcome.VISIBLE] == 5

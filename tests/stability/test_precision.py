@@ -1,0 +1,30 @@
+"""Hard cases of precision: long sums, half precision, the order of summation."""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+import pytest
+
+from sgsst_core.stability import Case, CaseResult, Group, all_cases, precision
+from tests.stability.hard_cases import check
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+
+@pytest.mark.parametrize("case", precision.cases(), ids=lambda case: case.name)
+def test_stays_within_its_bound(case: Case) -> None:
+    check(case)
+
+
+def test_results_that_are_not_finite_do_not_pass() -> None:
+    assert CaseResult(1e-6, 1e-6).passed
+    for error in (math.nan, math.inf, 2e-6):
+        assert not CaseResult(error, 1e-6).passed
+
+
+def test_every_case_has_a_name_of_its_own() -> None:
+    names = [case.name for case in all_cases()]
+    assert len(names) == len(set(names))
+    assert {case.group for case in all_cases()} == set(get_args(Group))

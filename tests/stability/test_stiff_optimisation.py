@@ -1,0 +1,41 @@
+"""Hard cases of the optimiser: gradients of all sizes, steps too large or too many, resuming."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgsst_core.errors import DivergedError
+from sgsst_core.stability import Case, optimisation
+from tests.stability.hard_cases import check
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+
+@pytest.mark.parametrize("case", optimisation.cases(), ids=lambda case: case.name)
+def test_stays_within_its_bound(case: Case) -> None:
+    check(case)
+
+
+def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
+    """Why their colours run away: Adam's steps know no size."""
+    stylizer = optimisation._stylizer(
+        optimisation._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05
+    )
+    weights = stylizer.plan.survey.total_weights[stylizer.plan.seen]
+    before = stylizer.sh_dc.detach().clone()
+    stylizer.run_step()
+    change = (stylizer.sh_dc.detach() - before).abs().amax(1)
+    assert float(weights.min()) < 1e-2 < 1 < float(weights.max())
+    assert change[weights < 1e-2].tolist() == pytest.approx([0.05] * int((weights < 1e-2).sum()), rel=1e-3)
+
+
+def test_a_diverged_run_says_what_to_do_and_keeps_its_colours() -> None:
+    stylizer = optimisation._stylizer(optimisation._walls((2.0, 5)), 3)
+    with torch.no_grad():
+        stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)
+    before = stylizer.state()
+    with pytest.raises(DivergedError, match=r"Step 1: the colour gradient has grown to .* --learning-rate than 0.05"):
+        stylizer.run_step()
+    assert torch.equal(stylizer.sh_dc.detach(), before.sh_dc)
+    assert stylizer.step == 0

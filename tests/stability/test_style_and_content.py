@@ -1,0 +1,23 @@
+"""Hard cases of style and content: pictures without texture or with nothing else, channels without variance."""
+
+from __future__ import annotations
+
+import pytest
+
+from sgsst_core.stability import Case, pictures
+from tests.stability.hard_cases import check
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+
+@pytest.mark.parametrize("case", pictures.cases(), ids=lambda case: case.name)
+def test_stays_within_its_bound(case: Case) -> None:
+    check(case)
+
+
+def test_the_one_pass_variance_fails_where_ours_does_not() -> None:
+    """Beside every bound that holds, what the usual formula gives: the case would not be hard otherwise."""
+    result = pictures._ratio(4, False)
+    assert result.passed
+    lost = int(result.note.split("NaN in ")[1].split()[0])
+    assert lost > 0

@@ -1,0 +1,21 @@
+"""Hard cases of the views: sizes, fields of view, nothing to see, and more to see than fits."""
+
+from __future__ import annotations
+
+import pytest
+
+from sgsst_core.stability import Case, views
+from tests.stability.hard_cases import check
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+
+@pytest.mark.parametrize("case", views.cases(), ids=lambda case: case.name)
+def test_stays_within_its_bound(case: Case) -> None:
+    check(case)
+
+
+def test_a_refusal_names_the_view_and_what_to_do() -> None:
+    result = next(case for case in views.cases() if "2^31" in case.name).run(False)
+    for expected in ("'hard case' (16384x16384)", "2,202,009,600 times", "lower resolution"):
+        assert expected in result.note
