@@ -243,6 +243,32 @@ def plan(
 
 
 @app.command()
+def check(
+    scene: SceneArgument,
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    style: Annotated[Path | None, typer.Option(help="Style image.")] = None,
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    near: NearOption = NEAR,
+) -> None:
+    """Tell what is extreme in a scene, its views and its style, and what is done about it."""
+    from api.jobs import SceneRequest, check_inputs
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
+    with _status("Looking at the scene and every view"):
+        found = check_inputs(source, style)
+    if not found:
+        out_console.print("Nothing extreme was found.")
+        return
+    table = Table("what", Column("how many", justify="right"), "the worst", "what is done", show_lines=True)
+    for item in found:
+        table.add_row(f"{item.subject}: {item.what}", f"{item.count:,} of {item.total:,}", item.worst, item.done)
+    out_console.print(table)
+
+
+@app.command()
 def render(
     scene: SceneArgument,
     out: Annotated[Path, typer.Option(help="Folder for the pictures, PNG.", show_default=False)],

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sgsst_core.camera import Camera, orbit, resized, spread
 from sgsst_core.camera_files import read_cameras
+from sgsst_core.check import Finding, check_scene, check_style, check_views
 from sgsst_core.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from sgsst_core.errors import CameraError, CheckpointError, OutputError, SettingsError
 from sgsst_core.files import ensure_writable_folder
@@ -361,6 +362,24 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     out.parent.mkdir(parents=True, exist_ok=True)
     write_report(out, {"version": 1, **stylizer.plan.as_dict()})
     return stylizer.plan
+
+
+# --- check ---------------------------------------------------------------------------------------------------------
+
+
+def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
+    """What is extreme in a scene, its views and its style; nothing is written.
+
+    Raises:
+        InvalidInputError: scene, cameras or style cannot be used.
+    """
+    _check_choice(source)
+    image = load_image(style) if style else None
+    file = read_scene(source.scene, drop_invalid=True)
+    cameras = _cameras(source, file.scene)
+    rasterizer = make_rasterizer("cpu", file.scene, near=source.near)
+    found = [*check_scene(file), *check_views(file, cameras, rasterizer, near=source.near)]
+    return found if image is None else [*found, *check_style(image, cameras)]
 
 
 # --- render --------------------------------------------------------------------------------------------------------

@@ -596,3 +596,27 @@ def test_an_error_in_a_process_of_its_own_is_one_line_on_stderr(tmp_path: Path) 
     assert done.stderr.splitlines() == [f"error: {done.stderr.removeprefix('error: ').strip()}"]
     assert "missing.ply" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+# --- check ---------------------------------------------------------------------------------------------------------
+
+
+def test_check_tells_what_is_extreme_and_what_is_done_about_it(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = wall()
+    scene.means[3, 0] = float("nan")
+    scene.quats[5] = 0
+    write_scene(files.ply, scene)
+    Image.new("RGB", (40, 40), (90, 90, 90)).save(files.style)
+    options = ["--cameras", str(files.cameras), "--style", str(files.style)]
+    before = sorted(files.ply.parent.iterdir())
+    assert main(["check", str(files.ply), *options]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for expected in ("infinite values", "1 of 616", "Gaussian 5: 0", "never drawn", "one colour"):
+        assert expected in shown, shown
+    assert sorted(files.ply.parent.iterdir()) == before
+
+    files.ply.write_bytes(b"not a scene")
+    assert main(["check", str(files.ply), *options]) == 2
+    assert str(files.ply) in capsys.readouterr().err
