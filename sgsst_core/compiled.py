@@ -53,9 +53,13 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def kernel_threads() -> Iterator[None]:
     """Run parallel kernels inside: one Python thread at a time, on as many cores as PyTorch was told to use.
 
-    Following `torch.set_num_threads` lets several ranks of one machine share its cores with one setting.
+    Following `torch.set_num_threads` lets several ranks of one machine share its cores with one setting. Where both use
+    the same OpenMP library, Numba's first kernel would set PyTorch back to all cores; so the setting is put back.
     """
     with _TURN:
+        threads = torch.get_num_threads()
         available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        numba.set_num_threads(max(1, min(torch.get_num_threads(), available)))
+        numba.set_num_threads(max(1, min(threads, available)))
+        if torch.get_num_threads() != threads:
+            torch.set_num_threads(threads)
         yield

@@ -437,3 +437,17 @@ def test_a_real_scene_looks_like_its_photo(shared_data: Path) -> None:
     assert photo.shape == image.shape
     psnr = -10 * math.log10(float((photo - image).square().mean()))
     assert psnr > 25
+
+
+def test_kernels_leave_the_number_of_torch_threads_alone() -> None:
+    """In a fresh process: Numba's first kernel sets the OpenMP library that PyTorch may share to all cores."""
+    code = (
+        "import torch; torch.set_num_threads(1)\n"
+        "from tests.sgsst_core.splat_scenes import camera, cloud\n"
+        "from sgsst_core.rasterizer.cpu import CpuRasterizer\n"
+        "CpuRasterizer(cloud()).coverage(camera())\n"
+        "assert torch.get_num_threads() == 1, torch.get_num_threads()\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    finished = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
