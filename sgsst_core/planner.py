@@ -19,10 +19,12 @@ from sgsst_core.camera import Camera
 from sgsst_core.partition import Rectangle
 from sgsst_core.pyramid import downscale, scale_count
 from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.sos import SosLoss
 from sgsst_core.survey import Survey, survey
+from sgsst_core.vgg import CONTENT_LAYER
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
 UNCOVERED_SHARE = 0.01
@@ -116,7 +118,8 @@ def make_plan(
     plan.decisions.extend(_view_decisions(cameras, plan, settings, work, rate))
     plan.decisions.extend(_network_decisions(settings, work, rate, loss))
     seconds = work.pixels * rate.both + work.again * rate.forward
-    peak = psutil.Process().memory_info().rss + min(memory, work.peak_bytes(loss)) + _image_bytes(cameras)
+    kept = 0 if settings.keep_everything else _kept_bytes(scene, cameras, settings, loss, looked.covered)
+    peak = psutil.Process().memory_info().rss + min(memory, work.peak_bytes(loss) + kept) + _image_bytes(cameras)
     return Plan(looked, seen, weighted, plan.steps_coarse, plan.decisions, Prediction(seconds, int(peak)))
 
 
@@ -296,6 +299,21 @@ def _network_decisions(settings: Settings, work: _Work, rate: Rate, loss: SosLos
             )
         )
     return decisions
+
+
+def _kept_bytes(
+    scene: Scene, cameras: Sequence[Camera], settings: Settings, loss: SosLoss, covered: Sequence[int]
+) -> int:
+    """Blend weights and content features of all views, as far as there is no limit; the middle view stands for all."""
+    middle = cameras[covered[len(covered) // 2]]
+    weights = CachedRasterizer(scene, near=settings.near).operator_bytes(middle)
+    value = torch.finfo(loss.network.dtype).bits // 8
+    cells = sum(
+        (middle.height >> scale + 3) * (middle.width >> scale + 3)
+        for scale in range(scale_count(middle.height, middle.width))
+    )
+    content = cells * loss.network.channels(CONTENT_LAYER) * value if settings.content_weight else 0
+    return (weights + content) * len(covered)
 
 
 def _image_bytes(cameras: Sequence[Camera]) -> int:
