@@ -6,31 +6,17 @@ python -m benchmarks.iteration SCENE.ply CAMERAS STYLE [--views 3] [--rounds 2]
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.machine import write_result
-from sgsst_core import Camera, Stylizer, make_settings
+from benchmarks.rasterizer import resized
+from sgsst_core import Stylizer, make_settings
 from sgsst_core.camera import spread
 from sgsst_core.camera_files import read_cameras
 from sgsst_core.images import load_image
 from sgsst_core.ply import read_scene
 
 NETWORK = ("vgg_forward", "vgg_backward")
-
-
-def wide(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with another number of pixels: same horizontal field of view, principal point in the middle."""
-    factor = width / camera.width
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * factor,
-        fy=camera.fy * factor,
-        cx=width / 2,
-        cy=height / 2,
-    )
 
 
 def main() -> None:
@@ -43,7 +29,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     arguments = parser.parse_args()
     scene = read_scene(arguments.scene).scene
-    cameras = [wide(camera, 1280, 720) for camera in spread(read_cameras(arguments.cameras), arguments.views)]
+    cameras = [resized(camera) for camera in spread(read_cameras(arguments.cameras), arguments.views)]
     results = {}
     for rasterizer in ("cpu", "cached"):
         settings = make_settings("standard", steps_coarse=0, steps_sos=10_000)
