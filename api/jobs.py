@@ -355,6 +355,10 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
         InvalidInputError: in one of its forms, for the first input that cannot be used.
     """
     _check_choice(source)
+    if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
+        raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
+    if source.cameras and out.exists() and source.cameras.exists() and os.path.samefile(out, source.cameras):
+        raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
     check_folder(out.parent)
     scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
     weights = load_weights(backbone)

@@ -115,6 +115,15 @@ def test_plan_tells_what_would_be_left_out(files: Files, capsys: pytest.CaptureF
     assert "position weights" in capsys.readouterr().out
 
 
+def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    for out in (files.ply, files.cameras, files.ply.parent):
+        before = files.ply.read_bytes(), files.cameras.read_bytes()
+        assert main([*command, "--out", str(out)]) == 2
+        assert (files.ply.read_bytes(), files.cameras.read_bytes()) == before
+        assert str(out) in capsys.readouterr().err
+
+
 def test_keep_everything_gives_the_same_scene(files: Files) -> None:
     results = []
     for options in ([], ["--keep-everything"]):
