@@ -19,7 +19,7 @@ _TURN = threading.RLock()
 
 
 #: Sources of this package that are compiled into kernels of other modules.
-_COMPILED_IN = ("constants.py", "rasterizer/vectors.py")
+_COMPILED_IN = ("constants.py", "rasterizer/vectors.py", "rasterizer/kernels.py")
 
 
 @functools.cache
@@ -33,9 +33,9 @@ def _digest() -> str:
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` with the machine code kept on disk, or in memory only where no folder can be written.
 
-    Numba checks a kept kernel against its own source file alone, so a kernel calls compiled functions of its own
-    module, and what else goes into the machine code is part of the name that it is kept under. Multiply-adds are
-    contracted; nothing is reordered, so results do not depend on threads.
+    Numba checks a kept kernel against its own source file alone, so what else goes into the machine code is part of the
+    name that it is kept under: see `_COMPILED_IN`, the only modules from which a kernel may call compiled functions.
+    Multiply-adds are contracted; nothing is reordered, so results do not depend on threads.
     """
     settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, **options}
 

@@ -1,0 +1,104 @@
+"""One iteration's rasterizing in phase 1, at full size and with the kept coarse operator, as ratios within one run.
+
+    python -m benchmarks.coarse point_cloud.ply [--cameras cameras.json] [--side 1280] [--scales 1 2] [--repeats 9]
+
+All make the image at a scale and one colour gradient from there: `cpu` and `cached` with the box average and its
+adjoint around them, `coarse` without. They take turns on the same view, and a figure is the fastest of its turns, the
+one least disturbed by whatever else the machine was doing. What depends on the geometry alone is prepared before; what
+`coarse` prepares beyond tile lists, its operator, is timed with the first image from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.machine import write_result
+from benchmarks.rasterizer import timed
+from sgsst_core.camera import Camera, orbit, resized
+from sgsst_core.camera_files import read_cameras
+from sgsst_core.ply import read_scene
+from sgsst_core.pyramid import add_upscaled_, downscale
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.coarse import CoarseRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.scene import Scene
+from sgsst_core.spherical_harmonics import rest_colours, view_colours
+
+
+def at_full_size(rasterizer: Rasterizer, colours: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
+    """Image at a scale and the gradient from there, by way of the whole view."""
+    downscale(rasterizer.render(colours, camera), scale)
+    whole = torch.zeros((camera.height, camera.width, 3))
+    add_upscaled_(whole, gradient, scale)
+    rasterizer.colour_gradient(whole, camera)
+
+
+def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str, Any]:
+    """Fastest seconds of each way, what the operator costs, and the ratios, on one view."""
+    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+    gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
+    cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
+    coarse = CoarseRasterizer(cpu)
+
+    def with_operator(rasterizer: CoarseRasterizer = coarse) -> None:
+        rasterizer.render(colours, camera, scale)
+        rasterizer.colour_gradient(gradient, camera, scale)
+
+    ways: dict[str, Callable[[], None]] = {
+        "cpu": lambda: at_full_size(cpu, colours, gradient, camera, scale),
+        "cached": lambda: at_full_size(cached, colours, gradient, camera, scale),
+        "coarse": with_operator,
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    builds: list[float] = []
+    for way in ways.values():  # compiles, lists, kept weights
+        way()
+    for _ in range(repeats):
+        for name, way in ways.items():
+            seconds[name].append(timed(way))
+        fresh = CoarseRasterizer(cpu)
+        builds.append(timed(lambda fresh=fresh: fresh.render(colours, camera, scale)))  # type: ignore[misc]
+    fastest = {name: min(times) for name, times in seconds.items()}
+    return {
+        "gaussians": len(scene),
+        "view": f"{camera.width}x{camera.height}",
+        "scale": scale,
+        "seconds": {name: round(value, 5) for name, value in fastest.items()},
+        "seconds_build": round(min(builds), 5),
+        "bytes_kept": {"cached": cached.kept_bytes, "coarse": coarse.kept_bytes},
+        "ratio_cpu_to_coarse": round(fastest["cpu"] / fastest["coarse"], 2),
+        "ratio_cached_to_coarse": round(fastest["cached"] / fastest["coarse"], 2),
+        "ratio_build_to_cpu": round(min(builds) / fastest["cpu"], 2),
+        "ratio_bytes_cached_to_coarse": round(cached.kept_bytes / coarse.kept_bytes, 2),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("scene", type=Path, help="3DGS PLY")
+    parser.add_argument("--cameras", type=Path, help="camera file of the scene, else an orbit; its first is used")
+    parser.add_argument("--side", type=int, default=1280, help="longer side of the view in pixels")
+    parser.add_argument("--scales", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=9)
+    arguments = parser.parse_args()
+    scene = read_scene(arguments.scene).scene
+    cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)
+    results = [measure(scene, resized(cameras[0], arguments.side), s, arguments.repeats) for s in arguments.scales]
+    for result in results:
+        print(f"{arguments.scene}: {result['gaussians']:,} Gaussians, {result['view']}, scale {result['scale']}")
+        print(f"  cpu / coarse            {result['ratio_cpu_to_coarse']:8.2f}")
+        print(f"  cached / coarse         {result['ratio_cached_to_coarse']:8.2f}")
+        print(f"  build / cpu             {result['ratio_build_to_cpu']:8.2f}")
+        print(f"  cached / coarse, bytes  {result['ratio_bytes_cached_to_coarse']:8.2f}")
+    print(write_result("coarse", {"scene": arguments.scene.parent.name, "results": results}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""`coarse`: the box average of a view and its blend weights kept as one operator, for phase 1.
+
+At scale s the optimiser sees image_s = D (W c + T_final background), D the 2^s x 2^s box average
+(`sgsst_core.pyramid.downscale`). Geometry is frozen, so D W never changes either; and because the pixels of a square
+share one weight, it is far smaller than W, and faster to apply by as much.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.camera import Camera
+from sgsst_core.compiled import kernel_threads
+from sgsst_core.constants import RASTER_TILE
+from sgsst_core.pyramid import add_upscaled_, downscale
+from sgsst_core.rasterizer import coarse_kernels, kernels
+from sgsst_core.rasterizer.arguments import CameraKey, camera_key, check_colours
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
+
+_CPU = torch.device("cpu")
+#: At this scale a raster tile is one pixel. Coarser pixels are averages of these.
+_LARGEST_PIECE_SCALE = RASTER_TILE.bit_length() - 1
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Where a view's complete squares of 2^scale pixels lie."""
+
+    size: tuple[int, int]  # height and width in pixels of the part that fills squares
+    across: int  # raster tiles in a row of the whole view
+    piece_scale: int  # scale of the kept weights: `scale`, but one raster tile at most
+
+    @classmethod
+    def of(cls, camera: Camera, scale: int) -> _Grid:
+        """The grid of a view at a scale.
+
+        Raises:
+            ValueError: scale 0 or less, or a view that does not hold one square.
+        """
+        if scale < 1:
+            raise ValueError(f"scale {scale}: a coarse operator is for scale 1 or more; use `cached` for full size")
+        size = (camera.height >> scale << scale, camera.width >> scale << scale)
+        if 0 in size:
+            raise ValueError(
+                f"scale {scale} of view {camera.name!r}: {camera.width}x{camera.height} pixels hold no square of "
+                f"{1 << scale} pixels a side; use a smaller scale"
+            )
+        return cls(size, tile_grid(camera)[0], min(scale, _LARGEST_PIECE_SCALE))
+
+    def shape(self, scale: int) -> tuple[int, int]:
+        """Height and width of the view's image at a scale."""
+        return self.size[0] >> scale, self.size[1] >> scale
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """What a view's operator will need, counted before anything is kept."""
+
+    tile_pieces: NDArray[np.int64]  # [raster tiles]
+    slot_used: NDArray[np.bool_]  # [E], whether a (Gaussian, raster tile) has a piece
+
+    @property
+    def pieces(self) -> int:
+        return int(self.tile_pieces.sum())
+
+    def nbytes(self, lists: RasterLists, grid: _Grid) -> int:
+        """Bytes of all arrays of a `CoarseOperator`."""
+        height, width = grid.shape(grid.piece_scale)
+        offsets = 8 * (len(self.tile_pieces) + 1) + lists.first_slots.nbytes + lists.projection.gaussians.nbytes
+        return offsets + 4 * height * width + self.pieces * (8 + 4 * (RASTER_TILE >> grid.piece_scale) ** 2)
+
+
+def _count(lists: RasterLists, grid: _Grid, alpha_max: float) -> _Counts:
+    """Count what a view's operator will need: costs about one render."""
+    counts = _Counts(np.zeros(len(lists.starts) - 1, dtype=np.int64), np.zeros(len(lists.ranks), dtype=np.bool_))
+    tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
+    with kernel_threads():
+        coarse_kernels.count_pieces(*tiles, grid.size, grid.across, alpha_max, counts.tile_pieces, counts.slot_used)
+    return counts
+
+
+def _offsets(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
+
+
+class CoarseOperator:
+    """D W of one view, at most at the scale where a raster tile is a pixel. See `coarse_kernels` for the layout."""
+
+    def __init__(self, lists: RasterLists, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
+        self.scale, self.across = grid.piece_scale, grid.across
+        self.gaussians = lists.projection.gaussians
+        slot_starts = _offsets(counts.slot_used)
+        self.first_slots = slot_starts[lists.first_slots]
+        self.pieces = coarse_kernels.Pieces(
+            starts=_offsets(counts.tile_pieces),
+            gaussians=np.empty(counts.pieces, dtype=np.int32),
+            slots=np.empty(counts.pieces, dtype=np.int32),
+            weights=np.empty(counts.pieces * (RASTER_TILE >> self.scale) ** 2, dtype=np.float32),
+        )
+        self.transmittance = np.empty(grid.shape(self.scale), dtype=np.float32)
+        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values, self.gaussians)
+        place = (grid.size, grid.across, self.scale)
+        with kernel_threads():
+            coarse_kernels.keep_pieces(*tiles, *place, alpha_max, slot_starts, self.pieces, self.transmittance)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes kept in memory."""
+        return sum(a.nbytes for a in (*self.pieces, self.transmittance, self.gaussians, self.first_slots))
+
+    def render(self, colours: NDArray[np.float32], background: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Image [h, w, 3] of colours [N, 3]."""
+        image = np.empty((*self.transmittance.shape, 3), dtype=np.float32)
+        with kernel_threads():
+            coarse_kernels.apply_pieces(
+                self.pieces, colours, background, self.transmittance, self.across, self.scale, image
+            )
+        return image
+
+    def colour_gradient(self, image_gradient: NDArray[np.float32], gaussians: int) -> NDArray[np.float32]:
+        """W^T D^T dL/dimage_s, [gaussians, 3], of image_gradient [h, w, 3]."""
+        gradient = np.zeros((gaussians, 3), dtype=np.float32)
+        slot_gradients = np.empty((len(self.pieces.slots), 3), dtype=np.float32)
+        with kernel_threads():
+            coarse_kernels.apply_transposed_pieces(self.pieces, image_gradient, self.across, self.scale, slot_gradients)
+            kernels.add_slots(slot_gradients, self.first_slots, self.gaussians, gradient)
+        return gradient
+
+
+class CoarseRasterizer:
+    """Renders views at a coarse scale and takes gradients back from there, on the CPU.
+
+    Operators are kept in the order in which views first come, until the next one would exceed `max_bytes`; nothing is
+    ever evicted. Views without a kept operator are rendered at full size by `cpu` and averaged, with the same result up
+    to rounding. Results are the same bits for any number of threads.
+
+    A scale is 1 or more; rows and columns that fill no square of 2^scale pixels are left out, as by
+    `sgsst_core.pyramid.downscale`. Every method raises ValueError for scale 0 or less, and for a view that holds no
+    such square: its image would be empty.
+
+    Args:
+        cpu: whose scene, lists, background, near plane and clamp of alpha this object shares.
+        max_bytes: most bytes of operators to keep; None for no limit.
+    """
+
+    device = _CPU
+
+    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None = None) -> None:
+        self.scene = cpu.scene
+        self.max_bytes = max_bytes
+        self.kept_bytes = 0
+        self._cpu = cpu
+        self._kept: dict[tuple[CameraKey, int], CoarseOperator | None] = {}
+        self._lock = threading.Lock()
+
+    def operator_bytes(self, camera: Camera, scale: int) -> int:
+        """Bytes that a view's operator takes or would take. Costs about one render, and keeps nothing."""
+        grid = _Grid.of(camera, scale)
+        lists = self._cpu.lists(camera)
+        return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
+
+    def is_kept(self, camera: Camera, scale: int) -> bool:
+        """Whether a view is served from a kept operator by now."""
+        return self._kept.get((camera_key(camera), scale)) is not None
+
+    def render(self, colours: Tensor, camera: Camera, scale: int) -> Tensor:
+        """Image [H >> scale, W >> scale, 3] float32 of colours [N, 3], over the background."""
+        grid = _Grid.of(camera, scale)
+        values = check_colours(colours, len(self.scene), torch.float32, _CPU)
+        operator = self._operator(camera, scale, grid)
+        if operator is None:
+            return downscale(self._cpu.render(values, camera), scale)
+        image = torch.from_numpy(operator.render(values.numpy(), self._cpu.background))
+        return downscale(image, scale - operator.scale)
+
+    def colour_gradient(self, coarse_gradient: Tensor, camera: Camera, scale: int) -> Tensor:
+        """W^T D^T dL/dimage_s, [N, 3] float32, of coarse_gradient [H >> scale, W >> scale, 3]."""
+        grid = _Grid.of(camera, scale)
+        expected = (*grid.shape(scale), 3)
+        if tuple(coarse_gradient.shape) != expected:
+            raise ValueError(
+                f"gradient of shape {tuple(coarse_gradient.shape)}: scale {scale} of view {camera.name!r} needs "
+                f"{expected}"
+            )
+        pixels = coarse_gradient.detach().to(device=_CPU, dtype=torch.float32).contiguous()
+        operator = self._operator(camera, scale, grid)
+        if operator is None:
+            whole = torch.zeros((camera.height, camera.width, 3))
+            add_upscaled_(whole, pixels, scale)
+            return self._cpu.colour_gradient(whole, camera)
+        if scale > operator.scale:
+            of_squares = pixels
+            pixels = torch.zeros((*grid.shape(operator.scale), 3))
+            add_upscaled_(pixels, of_squares, scale - operator.scale)
+        return torch.from_numpy(operator.colour_gradient(pixels.numpy(), len(self.scene)))
+
+    def _operator(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
+        """The view's kept operator, built now if it is new and fits; None where it does not fit."""
+        key = (camera_key(camera), scale)
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = self._build(camera, grid)
+            return self._kept[key]
+
+    def _build(self, camera: Camera, grid: _Grid) -> CoarseOperator | None:
+        lists = self._cpu.lists(camera)
+        counts = _count(lists, grid, self._cpu.alpha_max)
+        size = counts.nbytes(lists, grid)
+        if self.max_bytes is not None and self.kept_bytes + size > self.max_bytes:
+            return None
+        operator = CoarseOperator(lists, counts, grid, self._cpu.alpha_max)
+        self.kept_bytes += size
+        return operator
