@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
@@ -91,6 +93,20 @@ def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
     if count >= total:
         return list(cameras)
     return [cameras[(2 * part + 1) * total // (2 * count)] for part in range(count)]
+
+
+def between(first: Camera, second: Camera) -> Camera:
+    """The camera halfway between two: its centre is their midpoint, its rotation the spherical mean of theirs.
+
+    Size and intrinsics are the first's. The mean turns by half of the shortest rotation from one to the other (slerp,
+    Shoemake 1985); of the two shortest ones at 180 degrees, either.
+    """
+    ends = np.stack([camera.world_to_camera[:3, :3].double().numpy() for camera in (first, second)])
+    rotation = torch.from_numpy(Slerp([0, 1], Rotation.from_matrix(ends))(0.5).as_matrix())
+    world_to_camera = torch.eye(4, dtype=torch.float64)
+    world_to_camera[:3, :3] = rotation
+    world_to_camera[:3, 3] = -rotation @ ((first.centre + second.centre) / 2)
+    return replace(first, name=f"{first.name}–{second.name}", world_to_camera=world_to_camera)
 
 
 def look_at(

@@ -131,10 +131,10 @@ def consistency(
     # Chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...): each pair shares a view with the one before it, so that
     # a view is rendered once and two are held, whatever the gap.
     for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
-        views = {k: views.get(k) or _look(k, images, cameras[k], rasterizer, scene) for k in (i, j)}
+        views = {k: views.get(k) or _look(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
         (image, depth), (other, other_depth) = views[i], views[j]
         warped, valid = warp(other, other_depth, cameras[j], depth, cameras[i])
-        results.append(_compare(i, j, image, warped, valid, lpips))
+        results.append(compare(i, j, image, warped, valid, lpips))
     return Consistency(gap, sorted(results, key=lambda pair: pair.first))
 
 
@@ -192,6 +192,73 @@ def project_pixels(
     return other.fx * x / divisor + other.cx, other.fy * y / divisor + other.cy, z
 
 
+@dataclass(frozen=True)
+class Warp:
+    """The pixels of a view that another view sees as well, and how they are interpolated there.
+
+    It follows from the geometry alone, and so is the same for all colours of a scene.
+
+    Attributes:
+        size: (H, W) of the view.
+        pixels: [P] int64, which of its H W pixels, row by row.
+        sources: [4, P] int32, the four pixels of the other view around each.
+        weights: [4, P] float32, sum 1.
+    """
+
+    size: tuple[int, int]
+    pixels: Tensor
+    sources: Tensor
+    weights: Tensor
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it takes."""
+        return sum(t.numel() * t.element_size() for t in (self.pixels, self.sources, self.weights))
+
+    def apply(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """The other view's picture [H', W', 3] as the view would see it: [H, W, 3], and where that is valid, [H, W]."""
+        flat = image.reshape(-1, 3)
+        colours = flat.new_zeros((len(self.pixels), 3))
+        for source, weight in zip(self.sources, self.weights, strict=True):
+            colours += weight[:, None].to(flat.dtype) * flat[source]
+        height, width = self.size
+        warped = flat.new_zeros((height * width, 3))
+        warped[self.pixels] = colours
+        valid = torch.zeros(height * width, dtype=torch.bool, device=flat.device)
+        valid[self.pixels] = True
+        return warped.view(height, width, 3), valid.view(height, width)
+
+
+def find_warp(
+    other_depth: DepthMap,
+    other: Camera,
+    depth: DepthMap,
+    camera: Camera,
+    *,
+    tolerance: float = DEPTH_TOLERANCE,
+) -> Warp:
+    """How another view's picture is brought into the view of `camera`.
+
+    A pixel's point, from its own depth, is projected into the other view and the four pixels around it are
+    interpolated. One of the four counts only if it lies within the view, has a known depth, and that depth agrees with
+    the point's within the relative tolerance; otherwise the other view sees something else there (occlusion), or an
+    edge runs between the four. Where more than a trace of the weight does not count, the pixel is left out.
+    """
+    pixels, sources, weights = [], [], []
+    step = max(1, _BAND_PIXELS // camera.width)
+    for top in range(0, camera.height, step):
+        band = slice(top, top + step)
+        x, y, z = project_pixels(depth.depth[band], top, camera, other)
+        found = depth.known[band] & (z > 0) & (x >= 0) & (x <= other.width) & (y >= 0) & (y <= other.height)
+        source, weight = _around(other_depth, x[found], y[found], z[found], tolerance)
+        share = weight.sum(dim=0)
+        agrees = share > 1 - _FOREIGN_SHARE
+        pixels.append(found.view(-1).nonzero()[agrees, 0] + top * camera.width)
+        sources.append(source[:, agrees])
+        weights.append(weight[:, agrees] / share[agrees])
+    return Warp((camera.height, camera.width), torch.cat(pixels), torch.cat(sources, dim=1), torch.cat(weights, dim=1))
+
+
 def warp(
     image: Tensor,  # [H', W', 3] of the other view
     other_depth: DepthMap,
@@ -203,40 +270,24 @@ def warp(
 ) -> tuple[Tensor, Tensor]:
     """Another view's picture as `camera` would see it: [H, W, 3] in its dtype, and where that is valid, [H, W] bool.
 
-    A pixel's point, from its own depth, is projected into the other view and the four pixels around it are
-    interpolated. One of the four counts only if it lies within the view, has a known depth, and that depth agrees with
-    the point's within the relative tolerance; otherwise the other view sees something else there (occlusion), or an
-    edge runs between the four. Where more than a trace of the weight does not count, the pixel is invalid, and 0.
+    See `find_warp`; invalid pixels are 0.
     """
-    warped = torch.zeros((camera.height, camera.width, 3), dtype=image.dtype, device=image.device)
-    valid = torch.zeros((camera.height, camera.width), dtype=torch.bool, device=image.device)
-    step = max(1, _BAND_PIXELS // camera.width)
-    for top in range(0, camera.height, step):
-        band = slice(top, top + step)
-        x, y, z = project_pixels(depth.depth[band], top, camera, other)
-        found = depth.known[band] & (z > 0) & (x >= 0) & (x <= other.width) & (y >= 0) & (y <= other.height)
-        colours, share = _interpolate(image, other_depth, x[found], y[found], z[found], tolerance)
-        agrees = share > 1 - _FOREIGN_SHARE
-        warped[band][found] = torch.where(agrees[:, None], colours, 0.0)
-        valid[band][found] = agrees
-    return warped, valid
+    return find_warp(other_depth, other, depth, camera, tolerance=tolerance).apply(image)
 
 
-def _interpolate(
-    image: Tensor,  # [H, W, 3]
+def _around(
     depth: DepthMap,
     x: Tensor,  # [P] float64, pixels, in 0..W
     y: Tensor,  # [P] float64, pixels, in 0..H
     z: Tensor,  # [P] float64
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
-    """Colours [P, 3] at positions from pixels whose depth agrees with z, and the share [P] of the weight on those."""
+    """The four pixels around each position [4, P] int32 and their weights [4, P] float32: 0 where depths disagree."""
     height, width = depth.depth.shape
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
-    across, down = ((x - 0.5) - left).to(image.dtype), ((y - 0.5) - top).to(image.dtype)
+    across, down = ((x - 0.5) - left).float(), ((y - 0.5) - top).float()
     nearest, farthest = z * (1 - tolerance), z * (1 + tolerance)
-    colours = torch.zeros((len(x), 3), dtype=image.dtype, device=x.device)
-    share = torch.zeros(len(x), dtype=image.dtype, device=x.device)
+    sources, weights = [], []
     for right in (0, 1):
         for below in (0, 1):
             column, row = left.long() + right, top.long() + below
@@ -245,30 +296,31 @@ def _interpolate(
             its_depth = depth.depth.view(-1)[index]
             counts = inside & depth.known.view(-1)[index] & (its_depth >= nearest) & (its_depth <= farthest)
             weight = (across if right else 1 - across) * (down if below else 1 - down)
-            weight = torch.where(counts, weight, 0.0)
-            colours += weight[:, None] * image.view(-1, 3)[index]
-            share += weight
-    return colours / torch.where(share > 0, share, 1.0)[:, None], share
+            sources.append(index.int())
+            weights.append(torch.where(counts, weight, 0.0))
+    return torch.stack(sources), torch.stack(weights)
 
 
-def _look(
-    index: int, images: ImageSource, camera: Camera, rasterizer: Rasterizer, scene: Scene
-) -> tuple[Tensor, DepthMap]:
-    """Picture and depth of a view."""
-    image = images(index).detach().to(rasterizer.device)
+def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
+    """A picture [H, W, 3] of a view as a screen shows it, clamped to 0..1, on a device.
+
+    Raises:
+        ValueError: it is not of the camera's size, or holds NaN or infinity.
+    """
+    image = image.detach().to(device)
     if tuple(image.shape) != (camera.height, camera.width, 3):
         raise ValueError(
             f"picture of view {camera.name!r}: shape {tuple(image.shape)}, not {(camera.height, camera.width, 3)}"
         )
     if not bool(image.isfinite().all()):
         raise ValueError(f"picture of view {camera.name!r}: holds NaN or infinity")
-    return image.clamp(0, 1).contiguous(), expected_depth(scene, camera, rasterizer)
+    return image.clamp(0, 1).contiguous()
 
 
-def _compare(
+def compare(
     first: int, second: int, image: Tensor, warped: Tensor, valid: Tensor, lpips: Lpips | None
 ) -> PairConsistency:
-    """Distances of a view and another one warped into it, where that is valid."""
+    """Distances of a view's picture [H, W, 3] and another one warped into it, where that is valid, [H, W]."""
     count = int(valid.sum())
     compared = count / valid.numel()
     if count == 0 or compared < MINIMUM_COMPARED:
@@ -281,6 +333,11 @@ def _compare(
         distances = lpips.distance(image, filled).map
         distance = float(distances[valid.to(distances.device)].mean(dtype=torch.float64))
     return PairConsistency(first, second, compared, rmse, distance)
+
+
+def _look(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
+    """Picture and depth of a view."""
+    return shown(image, camera, rasterizer.device), expected_depth(scene, camera, rasterizer)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

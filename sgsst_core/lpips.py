@@ -21,7 +21,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.vgg import FeatureNetwork, layer_stride
-from sgsst_core.weights import load_perceptual, load_weights
+from sgsst_core.weights import list_weights, load_perceptual, load_weights
 
 LpipsNetwork = Literal["alex", "vgg16"]
 
@@ -110,6 +110,16 @@ class Lpips:
 
     def _input(self, image: Tensor) -> Tensor:
         return image.to(self.device, self.dtype)
+
+
+def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Lpips | None:
+    """LPIPS with AlexNet in float32, or None where its weights (which come with VGG16's) are not installed.
+
+    Raises:
+        WeightsError: the weights are installed, but corrupt.
+    """
+    installed = any(entry.name == "lpips_alex" and entry.path for entry in list_weights(folder))
+    return Lpips(device=device, folder=folder) if installed else None
 
 
 def _unit(features: Tensor) -> Tensor:

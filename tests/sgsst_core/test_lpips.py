@@ -14,7 +14,7 @@ from skimage import data
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError, WeightsError
-from sgsst_core.lpips import Lpips
+from sgsst_core.lpips import Lpips, load_lpips_or_none
 from sgsst_core.weights import load_perceptual
 from tests.sgsst_core.pictures import picture
 
@@ -190,3 +190,13 @@ def test_wrong_arguments_are_named(alex: Lpips, tmp_path):
         Lpips("squeeze")  # type: ignore[arg-type]
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
         Lpips("alex", folder=tmp_path)
+
+
+def test_lpips_is_left_out_where_its_weights_are_not_installed(vgg16_weights, tmp_path):
+    assert load_lpips_or_none(folder=tmp_path) is None
+    installed = load_lpips_or_none()
+    assert installed is not None
+    assert installed.network == "alex"
+    (tmp_path / "lpips_alex.safetensors").write_bytes(b"no weights")
+    with pytest.raises(WeightsError, match="corrupt"):
+        load_lpips_or_none(folder=tmp_path)
