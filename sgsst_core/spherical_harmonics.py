@@ -108,8 +108,15 @@ def view_colours(
 
 
 def view_colours_gradient(
-    colour_gradient: Tensor,  # [N, 3] dL/dcolours
-    colours: Tensor,  # [N, 3] what view_colours returned
+    colour_gradient: Tensor,  # [N, 3]
+    colours: Tensor,  # [N, 3], of `view_colours`
+    *,
+    revive: bool = False,
 ) -> Tensor:
-    """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolours` where the clamp let the colour through, 0 where it did not."""
-    return torch.where(colours > 0, SH_C0 * colour_gradient, torch.zeros_like(colour_gradient))
+    """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolours` where the clamp let the colour through, 0 where it did not.
+
+    With `revive`, colours that the clamp holds at 0 also take a gradient that would raise them. It is not the
+    derivative: it lets colours that a large step has thrown below 0 come back, which otherwise never move again.
+    """
+    passes = (colours > 0) | (colour_gradient < 0) if revive else colours > 0
+    return torch.where(passes, SH_C0 * colour_gradient, torch.zeros_like(colour_gradient))

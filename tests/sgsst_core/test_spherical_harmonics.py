@@ -118,6 +118,27 @@ def test_colours_are_clamped_and_the_gradient_follows() -> None:
     assert torch.allclose(view_colours_gradient(gradient, colours.detach()), expected, atol=1e-15)
 
 
+def test_revived_colours_only_come_back() -> None:
+    """Where the clamp holds a colour at 0, a gradient that would raise it passes, one that would lower it does not."""
+    colours = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
+    gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
+    found = view_colours_gradient(gradient, colours, revive=True)
+    torch.testing.assert_close(found, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
+
+
+def test_dark_colours_come_back_when_revived() -> None:
+    """Descent on |c - 0.6|^2 from far below 0: stuck without, at its target with."""
+    ends = []
+    for revive in (False, True):
+        sh_dc = torch.full((1, 3), -4.0)
+        for _ in range(400):
+            colours = view_colours(sh_dc, torch.zeros(1, 3))
+            sh_dc -= view_colours_gradient(2 * (colours - 0.6), colours, revive=revive)
+        ends.append(view_colours(sh_dc, torch.zeros(1, 3)))
+    assert bool((ends[0] == 0).all())
+    torch.testing.assert_close(ends[1], torch.full((1, 3), 0.6), rtol=1e-4, atol=0)
+
+
 def test_impossible_coefficients_are_refused() -> None:
     scene, view = cloud(5, degree=1), camera()
     with pytest.raises(ValueError, match="4 coefficients"):

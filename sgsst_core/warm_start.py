@@ -1,0 +1,64 @@
+"""Warm start: colours whose mean and covariance are the style's, in closed form.
+
+The map is the linear one that moves colours least (optimal transport between Gaussian distributions; Pitié and
+Kokaram, "The Linear Monge-Kantorovitch Linear Colour Mapping for Example-Based Colour Transfer", 2007):
+
+    A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2,   c -> A (c - m) + m_style
+
+with S, m the scene's covariance and mean, weighted by what each Gaussian contributes to the views, and T the style's.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import SH_C0
+
+#: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
+#: could be stretched to the style's: it is left flat instead of blowing rounding up.
+_FLAT = 1e-9
+
+
+def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor) -> Tensor:
+    """DC coefficients with the style's colours, clamped to what a picture can show (0..1).
+
+    Args:
+        sh_dc: [N, 3] float32.
+        weights: [N] float64, total blend weights, at least one positive.
+        style: [H, W, 3] in 0..1.
+
+    Returns:
+        [N, 3] float32.
+    """
+    colours = 0.5 + SH_C0 * sh_dc.double()
+    mean, covariance = _moments(colours, weights.double() / weights.double().amax())
+    pixels = style.reshape(-1, 3).double()
+    wanted_mean, wanted = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
+    matched = (colours - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
+    return ((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype)
+
+
+def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean [3] and covariance [3, 3] of colours [n, 3]."""
+    total = weights.sum()
+    mean = (weights[:, None] * colours).sum(dim=0) / total
+    centred = colours - mean
+    return mean, (weights[:, None] * centred).T @ centred / total
+
+
+def _monge_map(source: Tensor, target: Tensor) -> Tensor:
+    """The symmetric A [3, 3] with A source A = target, on the directions in which the source varies."""
+    values, vectors = torch.linalg.eigh(source)
+    varies = values > _FLAT * values[-1].clamp_min(torch.finfo(values.dtype).tiny)
+    roots = torch.where(varies, values, 0.0).sqrt()
+    inverse = torch.where(varies, 1 / torch.where(varies, roots, 1.0), 0.0)
+    root = vectors * roots @ vectors.T
+    inverse_root = vectors * inverse @ vectors.T
+    return inverse_root @ _square_root(root @ target @ root) @ inverse_root
+
+
+def _square_root(matrix: Tensor) -> Tensor:
+    """Square root of a symmetric matrix that is positive semidefinite up to rounding."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return vectors * values.clamp_min(0).sqrt() @ vectors.T
