@@ -27,11 +27,11 @@ from api.interrupt import stop_on_signal
 from api.values import parse_background, parse_bytes
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
-from sgsst_core.settings import PositionWeights, Precision, PresetName, make_settings
+from sgsst_core.settings import EVERYTHING, KeptWeights, PositionWeights, Precision, PresetName, make_settings
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from api.jobs import Job, Result, StylizeRequest
-    from sgsst_core.stylizer import Progress
+    from sgsst_core.loop import Progress
 
 #: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
 BAD_INPUT, FAILURE = 2, 1
@@ -52,6 +52,8 @@ app = typer.Typer(
 )
 weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_help=True)
 app.add_typer(weights_app, name="weights")
+bench_app = typer.Typer(help="Measurements to repeat on your own scene and machine.", no_args_is_help=True)
+app.add_typer(bench_app, name="bench")
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
@@ -74,6 +76,21 @@ BackgroundOption = Annotated[
     Any, typer.Option(parser=parse_background, metavar="COLOUR", help="black, white, or R,G,B from 0 to 255.")
 ]
 NearOption = Annotated[float, typer.Option(min=1e-6, help="Near plane, in the scene's units.")]
+MemoryOption = Annotated[
+    Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
+]
+CoarsestOption = Annotated[
+    int | None,
+    typer.Option(min=16, help="Shorter side of the coarsest scale in pixels, at most. [511, the method's]"),
+]
+PruneOption = Annotated[
+    float | None,
+    typer.Option(min=0, metavar="W", help="Leave out Gaussians that all views together show in less than W pixels."),
+]
+SimilarOption = Annotated[
+    float | None,
+    typer.Option(min=0, metavar="S", help="Leave out views that another, shifted by less than S of its side, shows."),
+]
 DropOption = Annotated[bool, typer.Option("--drop-invalid", help="Leave Gaussians with NaN or infinite values out.")]
 
 
@@ -114,10 +131,30 @@ def stylize(
     seed: Annotated[int, typer.Option(min=0, help="Of the order of views.")] = 0,
     precision: Annotated[Precision, typer.Option(help="Of the feature network.")] = "float32",
     backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
-    memory_limit: Annotated[
-        Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
-    ] = None,
+    memory_limit: MemoryOption = None,
     max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and write the result.")] = None,
+    target_loss: Annotated[
+        float | None,
+        typer.Option(metavar="R", help="Stop when the loss has come down to this share of the start, such as 0.05."),
+    ] = None,
+    early_stop: Annotated[
+        bool | None,
+        typer.Option("--early-stop/--no-early-stop", help="Stop when the loss has stopped falling. [by preset]"),
+    ] = None,
+    warm_start: Annotated[
+        bool | None,
+        typer.Option("--warm-start/--cold-start", help="Begin with the style's mean colour and spread. [by preset]"),
+    ] = None,
+    revive: Annotated[
+        bool | None,
+        typer.Option("--revive/--no-revive", help="Let colours that fell below black come back. [by preset]"),
+    ] = None,
+    coarsest_side: CoarsestOption = None,
+    prune_weight: PruneOption = None,
+    similar_views: SimilarOption = None,
+    kept_weights: Annotated[
+        KeptWeights | None, typer.Option(help="How blend weights are kept between steps. [auto: as memory allows]")
+    ] = None,
     unseen: Annotated[
         Literal["neighbours", "keep"] | None,
         typer.Option(help="Colours of Gaussians that no view sees: their neighbours' change, or kept. [paper: keep]"),
@@ -143,7 +180,15 @@ def stylize(
         memory_limit=memory_limit,
         max_seconds=max_seconds,
         unseen=unseen,
-        keep_everything=keep_everything,
+        coarsest_side=coarsest_side,
+        warm_start=warm_start,
+        revive=revive,
+        early_stop=early_stop,
+        target_loss=target_loss,
+        prune_weight=prune_weight,
+        similar_views=similar_views,
+        kept_weights=kept_weights,
+        keep=EVERYTHING if keep_everything else None,
     )
     from api.jobs import SceneRequest, StylizeRequest
 
@@ -188,12 +233,17 @@ def _conclude(job: Job, result: Result, command: str) -> None:
 
     before, after = mean_loss(result.before), mean_loss(result.after)
     out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    for line in _time_bought(job, result):
+        out_console.print(f"{'time bought:':<22}{line}")
     outputs = job.outputs
     paths = [("stylized scene", outputs.ply)]
     if result.report_error is None:
-        paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.report)]
+        paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
+        paths += [("the same as JSON", outputs.report)]
     for heading, path in paths:
         out_console.print(f"{heading + ':':<22}{path}")
+    if result.stopped in _ENDED:
+        out_console.print(f"Stopped at step {job.stylizer.step} of {job.stylizer.total}: {_ENDED[result.stopped]}.")
     if result.stopped == "max-seconds":
         out_console.print(
             f"The time was up at step {job.stylizer.step} of {job.stylizer.total}. The checkpoint stays: to go on, "
@@ -202,6 +252,28 @@ def _conclude(job: Job, result: Result, command: str) -> None:
     if result.report_error is not None:
         error_console.print(f"The stylized scene is whole, but its report could not be written: {result.report_error}")
         raise typer.Exit(FAILURE)
+
+
+_ENDED = {
+    "target-loss": "the loss has come down to --target-loss",
+    "converged": "the loss has stopped falling (--no-early-stop makes all steps)",
+}
+
+
+def _time_bought(job: Job, result: Result) -> list[str]:
+    from sgsst_core.report import bought
+
+    found = bought(job.stylizer, result.before)
+    if found is None:
+        return []
+    lines = [
+        f"{entry['relative']:.0%} of the loss on all scales was left after {_clock(entry['seconds'])}"
+        for entry in found["reached"]
+    ]
+    last = found["last_tenth"]
+    if last:
+        lines.append(f"the last tenth of the time changed {last['from']:.2%} to {last['to']:.2%}")
+    return lines
 
 
 @app.command()
@@ -215,17 +287,26 @@ def plan(
     views: ViewsOption = None,
     resolution: ResolutionOption = None,
     preset: Annotated[PresetName, typer.Option(help="As for stylize.")] = "standard",
+    coarsest_side: CoarsestOption = None,
+    prune_weight: PruneOption = None,
+    similar_views: SimilarOption = None,
     near: NearOption = NEAR,
     drop_invalid: DropOption = False,
     backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
-    memory_limit: Annotated[
-        Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
-    ] = None,
+    memory_limit: MemoryOption = None,
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
     from api.jobs import SceneRequest, make_plan
 
-    settings = make_settings(preset, max_resolution=resolution, near=near, memory_limit=memory_limit)
+    settings = make_settings(
+        preset,
+        max_resolution=resolution,
+        coarsest_side=coarsest_side,
+        prune_weight=prune_weight,
+        similar_views=similar_views,
+        near=near,
+        memory_limit=memory_limit,
+    )
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     with _status("Looking at every view"):
         made = make_plan(source, style, backbone, settings, out)
@@ -238,7 +319,8 @@ def plan(
     out_console.print(table)
     if made.prediction:
         seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9
-        out_console.print(f"Expected: {seconds:.2g} s an iteration on all scales, peak memory {peak:.1f} GB")
+        coarse = f" ({made.prediction.seconds_coarse:.2g} s in phase 1)" if made.steps_coarse else ""
+        out_console.print(f"Expected: {seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB")
     out_console.print(f"{'plan:':<22}{out}")
 
 
@@ -317,6 +399,53 @@ def demo(
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
     out_console.print(f"{'command:':<22}{shlex.join(['sgsst', *arguments])}")
     _stylize(request, arguments)
+
+
+@bench_app.command("error-time")
+def bench_error_time(
+    scene: SceneArgument,
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for table, plot, JSON and scenes.")] = Path("error_time"),
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    variants: Annotated[str, typer.Option(help="Names with commas between. [all]")] = "",
+    seconds: Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")] = 300.0,
+    coarsest_side: CoarsestOption = None,
+    background: BackgroundOption = "black",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: MemoryOption = None,
+) -> None:
+    """Run variants of a job for the same time each, and plot the error that is left against seconds."""
+    from api.bench import ErrorTimeRequest, error_time_table, point_line, run_error_time
+    from api.jobs import SceneRequest
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    settings = {"coarsest_side": coarsest_side, "background": background, "near": near, "memory_limit": memory_limit}
+    names = [name.strip() for name in variants.split(",") if name.strip()]
+    request = ErrorTimeRequest(source, style, out, names, seconds, backbone, settings)
+    curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
+    out_console.print(error_time_table(curves))
+    out_console.print(f"{'results:':<22}{out}")
+
+
+@bench_app.command("stability")
+def bench_stability(
+    only: Annotated[str, typer.Option(metavar="TEXT", help="Cases whose name holds this, or one group.")] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes: minutes less.")] = False,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write.")] = None,
+) -> None:
+    """Measure hard cases against float64 references; exits with 1 where one misses its bound."""
+    from api.bench import run_stability, stability_table
+
+    found = run_stability(only, quick, out, lambda case: error_console.print(f"{case.group}: {case.name}"))
+    Console(width=180).print(stability_table(found))
+    if not all(measured.result.passed for _, measured in found):
+        raise typer.Exit(FAILURE)
 
 
 @weights_app.command("list")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sgsst_core.report_page import write_page
 from torch import Tensor
 
 from sgsst_core.camera import Camera, orbit, resized, spread
@@ -18,23 +19,23 @@ from sgsst_core.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from sgsst_core.errors import CameraError, CheckpointError, OutputError, SettingsError
 from sgsst_core.files import ensure_writable_folder
 from sgsst_core.images import check_photos, load_image, load_photo, save_png
+from sgsst_core.loop import Callbacks, Progress, Stopped, run
+from sgsst_core.measure import Measurements
 from sgsst_core.planner import Plan
 from sgsst_core.ply import SceneFile, read_scene, write_stylized
-from sgsst_core.pyramid import scale_count
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report import (
-    Evaluation,
     Sources,
     build_report,
-    evaluation_views,
+    plan_json,
     write_contact_sheet,
+    write_json,
     write_loss_curves,
-    write_report,
 )
 from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.spherical_harmonics import rest_colours, view_colours
-from sgsst_core.stylizer import Callbacks, Progress, Stopped, Stylizer, StylizerState, fit_cameras, run
+from sgsst_core.stylizer import Evaluation, Stylizer, StylizerState, fit_cameras
 from sgsst_core.survey import SEEN_COVERAGE
 from sgsst_core.weights import load_weights
 
@@ -105,6 +106,16 @@ class Outputs:
         return self._beside(".report.json")
 
     @property
+    def page(self) -> Path:
+        """The report for people."""
+        return self._beside(".report.html")
+
+    @property
+    def plan(self) -> Path:
+        """The plan."""
+        return self._beside(".plan.json")
+
+    @property
     def sheet(self) -> Path:
         """The contact sheet."""
         return self._beside(".before_after.jpg")
@@ -159,12 +170,12 @@ def prepare(request: StylizeRequest) -> Job:
     settings = request.settings
     if not settings.steps_coarse + settings.steps_sos:
         raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")
-    _check_choice(request.source, request.images)
+    check_choice(request.source, request.images)
     outputs = _check_output(request)
     weights = load_weights(request.backbone)
     style = load_image(request.style)
     scene_file = read_scene(request.source.scene, drop_invalid=request.source.drop_invalid)
-    cameras = fit_cameras(_cameras(request.source, scene_file.scene), settings)
+    cameras = fit_cameras(read_cameras_of(request.source, scene_file.scene), settings)
     photos = check_photos(request.images, cameras) if request.images else None
     photo_stamps = repr([_stamp(path) for path in photos]) if photos else ""
     job_id = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, photo_stamps)
@@ -194,8 +205,8 @@ def execute(job: Job, *, progress: Callable[[Progress], None], stop: Callable[[]
         OutputError: the PLY, or the checkpoint of an interrupted job, cannot be written.
     """
     stylizer, outputs = job.stylizer, job.outputs
-    views = evaluation_views(stylizer)
-    before = stylizer.evaluate(views)
+    measure = Measurements(stylizer)
+    before = measure.evaluate(unstylized=True)
     if job.state:
         stylizer.load_state(job.state)
     outputs.ply.parent.mkdir(parents=True, exist_ok=True)
@@ -209,15 +220,19 @@ def execute(job: Job, *, progress: Callable[[Progress], None], stop: Callable[[]
             unsaved.append(error)
             warn(f"No checkpoint could be written: {error}")
 
-    stopped = run(stylizer, Callbacks(progress=progress, stop=stop, checkpoint=checkpoint))
+    write_json(outputs.plan, plan_json(stylizer.plan))
+    callbacks = Callbacks(progress, stop, checkpoint, measure=measure, moments=measure.moments)
+    stopped = run(stylizer, callbacks)
     if stopped == "interrupted":
         if unsaved:
             raise unsaved[0]
         return Result(stopped, before, {})
     write_stylized(job.scene_file, outputs.ply, stylizer.stylized())
-    if stopped == "finished":
+    if stopped != "max-seconds":
         outputs.checkpoint.unlink(missing_ok=True)
-    after = stylizer.evaluate(views)
+    if stylizer.measured[-1]["step"] != stylizer.step:
+        measure(stylizer)
+    after = measure.evaluate()
     return Result(stopped, before, after, _write_reports(job, stopped, before, after))
 
 
@@ -225,12 +240,22 @@ def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evalua
     """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
-        write_report(outputs.report, build_report(stylizer, job.style, job.sources, stopped, before, after))
-        write_contact_sheet(outputs.sheet, stylizer, job.style)
-        write_loss_curves(outputs.curves, stylizer.history, len(stylizer.views.covered))
+        report = build_report(stylizer, job.sources, stopped, before, after, _findings(job))
+        write_json(outputs.report, report)
+        write_contact_sheet(outputs.sheet, stylizer)
+        write_loss_curves(outputs.curves, stylizer.history, stylizer.round_length)
+        write_page(outputs.page, report, outputs.sheet)
     except Exception as error:  # whatever it is, it must not look as if the job itself had failed
         return error
     return None
+
+
+def _findings(job: Job) -> list[Finding]:
+    stylizer = job.stylizer
+    cameras, near = stylizer.views.cameras, stylizer.settings.near
+    rasterizer = make_rasterizer("cpu", stylizer.scene, near=near)
+    found = [*check_scene(job.scene_file), *check_views(job.scene_file, cameras, rasterizer, near=near)]
+    return [*found, *check_style(stylizer.style, cameras)]
 
 
 def describe(job: Job) -> list[tuple[str, str]]:
@@ -241,8 +266,8 @@ def describe(job: Job) -> list[tuple[str, str]]:
     rate = f"learning rate {settings.learning_rate:g}"
     if settings.learning_rate_end != settings.learning_rate:
         rate += f" to {settings.learning_rate_end:g}"
-    steps = f"{stylizer.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
-    if not stylizer.steps_coarse:
+    steps = f"{stylizer.plan.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
+    if not stylizer.plan.steps_coarse:
         steps = f"{settings.steps_sos} steps"
     lines.append(("schedule", f"{steps}; {rate} (preset {settings.preset})"))
     if job.state:
@@ -262,7 +287,7 @@ def _describe_views(job: Job) -> str:
     text = f"{len(views)} of {sizes[0][0]}x{sizes[0][1]}"
     if len(sizes) > 1:
         text = f"{len(views)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
-    scales = max(scale_count(height, width) for width, height in sizes)
+    scales = max(job.stylizer.loss.scale_count(height, width) for width, height in sizes)
     text += f", {scales} scale{'s' if scales > 1 else ''}"
     return text + f"; content from {'the photos' if job.request.images else 'unstylized renders'}"
 
@@ -274,7 +299,12 @@ def _describe_network(job: Job) -> str:
     return name
 
 
-def _check_choice(source: SceneRequest, images: Path | None = None) -> None:
+def check_choice(source: SceneRequest, images: Path | None = None) -> None:
+    """Prove that there is one source of cameras, and photos only of known ones.
+
+    Raises:
+        CameraError: otherwise.
+    """
     if source.cameras is None and source.orbit is None:
         raise CameraError(
             "There are no cameras. Give a camera file with --cameras, or --orbit N for N views around the scene."
@@ -311,7 +341,7 @@ def check_folder(folder: Path) -> None:
     ensure_writable_folder(folder)
 
 
-def _cameras(source: SceneRequest, scene: Scene) -> list[Camera]:
+def read_cameras_of(source: SceneRequest, scene: Scene) -> list[Camera]:
     """The cameras that were asked for, at their resolution."""
     if source.cameras is not None:
         cameras = read_cameras(source.cameras)
@@ -354,7 +384,7 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     Raises:
         InvalidInputError: in one of its forms, for the first input that cannot be used.
     """
-    _check_choice(source)
+    check_choice(source)
     if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
         raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
     if source.cameras and out.exists() and source.cameras.exists() and os.path.samefile(out, source.cameras):
@@ -362,9 +392,9 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     check_folder(out.parent)
     scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
     weights = load_weights(backbone)
-    stylizer = Stylizer(scene, _cameras(source, scene), load_image(style), settings, weights=weights)
+    stylizer = Stylizer(scene, read_cameras_of(source, scene), load_image(style), settings, weights=weights)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_report(out, {"version": 1, **stylizer.plan.as_dict()})
+    write_json(out, plan_json(stylizer.plan))
     return stylizer.plan
 
 
@@ -377,10 +407,10 @@ def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
     Raises:
         InvalidInputError: scene, cameras or style cannot be used.
     """
-    _check_choice(source)
+    check_choice(source)
     image = load_image(style) if style else None
     file = read_scene(source.scene, drop_invalid=True)
-    cameras = _cameras(source, file.scene)
+    cameras = read_cameras_of(source, file.scene)
     rasterizer = make_rasterizer("cpu", file.scene, near=source.near)
     found = [*check_scene(file), *check_views(file, cameras, rasterizer, near=source.near)]
     return found if image is None else [*found, *check_style(image, cameras)]
@@ -400,10 +430,10 @@ def render_views(
     Raises:
         InvalidInputError: scene, cameras or folder cannot be used.
     """
-    _check_choice(source)
+    check_choice(source)
     check_folder(out)
     scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
-    cameras = _cameras(source, scene)
+    cameras = read_cameras_of(source, scene)
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
     if not any(float(rasterizer.coverage(camera).amax()) > SEEN_COVERAGE for camera in cameras):
         raise CameraError(

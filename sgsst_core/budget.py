@@ -14,6 +14,8 @@ V = TypeVar("V")
 #: other programs. The first rules as long as half of the memory is free, so that the same job on the same machine makes
 #: the same plan, and rounds the same, whatever else happens to run.
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
+#: Of the memory limit: activations of one iteration, view targets and colours, and the rasterizer's lists or weights.
+MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 
 
 def default_memory_limit() -> int:

@@ -22,10 +22,10 @@ from sgsst_core.settings import Settings
 from sgsst_core.stylizer import StepRecord, StylizerState
 
 #: Raised whenever the meaning of a stored value changes.
-FORMAT_VERSION = "1"
-#: Settings that may differ between a checkpoint and the run that goes on from it: they change no step, or (the memory
-#: limit, which decides the partition) no more than its rounding.
-_FREE_SETTINGS = {"max_seconds", "memory_limit"}
+FORMAT_VERSION = "2"
+#: Settings that may differ between a checkpoint and the run that goes on from it: they only end it, or (the memory
+#: limit, which decides the partition) change no more than its rounding.
+_FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit"}
 
 
 def fingerprint(
@@ -69,6 +69,7 @@ def save_checkpoint(path: Path, state: StylizerState, job: str) -> None:
         "history": json.dumps([asdict(record) for record in state.history]),
         "seconds_by_part": json.dumps(state.seconds_by_part),
         "memory": json.dumps(state.memory),
+        "measured": json.dumps(state.measured),
     }
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata)
@@ -104,6 +105,7 @@ def load_checkpoint(path: Path, job: str) -> StylizerState:
             history=[_record(entry) for entry in json.loads(metadata["history"])],
             seconds_by_part=json.loads(metadata["seconds_by_part"]),
             memory=json.loads(metadata["memory"]),
+            measured=json.loads(metadata["measured"]),
         )
     except (SafetensorError, KeyError, ValueError, OSError) as error:
         raise CheckpointError(

@@ -1,6 +1,6 @@
 """What a scene does not need is left out: decisions before the first iteration, each with its evidence.
 
-The plan looks at scene, views and machine (one survey of the views, one timed probe of the feature network), decides,
+The plan looks at scene, views and machine (one survey of the views, timed probes of network and rasterizer), decides,
 and predicts seconds an iteration and peak memory. `Stylizer` follows it; the report sets what happened beside it.
 """
 
@@ -8,28 +8,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import psutil
 import torch
 from torch import Tensor
 
+from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.camera import Camera
-from sgsst_core.partition import Rectangle
-from sgsst_core.pyramid import downscale, scale_count
+from sgsst_core.convergence import LEAST_FALL, window_length
+from sgsst_core.cost import RasterCost, Rate, Work, content_bytes, image_bytes, probe, raster_cost
+from sgsst_core.errors import SettingsError
+from sgsst_core.pruning import distinct_views, pruned_image_error
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.scene import Scene
-from sgsst_core.settings import Settings
+from sgsst_core.settings import KeptWeights, Settings
 from sgsst_core.sos import SosLoss
 from sgsst_core.survey import Survey, survey
-from sgsst_core.vgg import CONTENT_LAYER
+from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.weights import BackboneWeights
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
 UNCOVERED_SHARE = 0.01
 #: Largest side of the picture that the network is timed on: large enough that its rate is that of a partition tile.
 PROBE_SIDE = 384
+#: Building a view's kept weights costs about three renders with gradient, and each use of them saves two thirds of one:
+#: with fewer visits they do not pay.
+LEAST_VISITS = 5
 #: Bytes an optimised Gaussian costs beside the scene: colours, gradient and two moments, float32.
 OPTIMISER_BYTES = 4 * 3 * 4
 
@@ -57,9 +63,16 @@ class Decision:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the plan expects of an SOS iteration: seconds (mean over views), and the job's peak memory in bytes."""
+    """What the plan expects, mean over views.
+
+    Attributes:
+        seconds: of an SOS iteration.
+        seconds_coarse: of an iteration of phase 1.
+        peak_bytes: of physical memory, at any time.
+    """
 
     seconds: float
+    seconds_coarse: float
     peak_bytes: int
 
 
@@ -69,17 +82,25 @@ class Plan:
 
     Attributes:
         survey: what the views show.
-        seen: [N] bool, Gaussians that are rendered and optimised.
+        optimised: [N] bool, Gaussians whose colours the views decide.
+        seen: [N] bool, Gaussians that are rendered: the optimised ones, or all for comparison.
+        covered: indices of the views that are stylized.
         weighted: statistics are weighted by coverage.
         steps_coarse: of phase 1; 0 where it is left out.
+        kept_weights: in which form blend weights are kept between iterations.
+        coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         decisions: for people.
         prediction: for comparison with what happens.
     """
 
     survey: Survey
+    optimised: Tensor
     seen: Tensor
+    covered: list[int]
     weighted: bool
     steps_coarse: int
+    kept_weights: KeptWeights = "none"
+    coarse_weights: bool = False
     decisions: list[Decision] = field(default_factory=list)
     prediction: Prediction | None = None
 
@@ -94,7 +115,7 @@ class Plan:
 def make_plan(
     scene: Scene, cameras: Sequence[Camera], settings: Settings, loss: SosLoss, rasterizer: Rasterizer, memory: int
 ) -> Plan:
-    """Survey the views, time the feature network, decide.
+    """Survey the views, time network and rasterizer, decide.
 
     Args:
         cameras: at the size at which they are stylized.
@@ -104,108 +125,110 @@ def make_plan(
 
     Raises:
         CameraError: no camera sees a Gaussian.
+        SettingsError: pruning would leave no Gaussian.
     """
     looked = survey(scene, cameras, rasterizer)
-    seen = torch.ones(len(scene), dtype=torch.bool) if settings.keep_everything else looked.total_weights > 0
+    plan = _choose(scene, cameras, settings, loss, looked)
+    leave_out = plan.weighted and "uncovered" not in settings.keep
+    work = Work.of(cameras, loss, looked, plan.covered, leave_out=leave_out)
+    coarse = Work.of(cameras, loss, looked, plan.covered, leave_out=leave_out, coarsest=True)
+    rate = probe(loss, min(PROBE_SIDE, max(max(camera.width, camera.height) for camera in cameras)))
+    budget = int(memory * MEMORY_SHARES["rasterizer"])
+    raster = raster_cost(scene, cameras, plan.covered, rasterizer, settings.near, budget)
+    plan = _choose_kept_weights(plan, settings, raster, budget)
+    plan.decisions.extend(_scene_decisions(scene, plan, cameras, settings, rasterizer))
+    plan.decisions.extend(_view_decisions(cameras, plan, settings, work, rate, loss))
+    plan.decisions.extend(_network_decisions(settings, work, rate, loss))
+    plan.decisions.append(_weights_decision(plan, settings, raster, budget))
+    plan.decisions.extend(_schedule_decisions(plan, settings, loss, cameras))
+    seconds = raster.kept_seconds if plan.kept_weights != "none" and raster.kept_seconds else raster.seconds
+    kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[plan.kept_weights]
+    content = 0 if "content" in settings.keep else content_bytes(cameras, plan.covered, settings, loss)
+    peak = psutil.Process().memory_info().rss + work.peak_bytes(loss) + min(kept, budget) + image_bytes(cameras)
+    peak += min(content, int(memory * MEMORY_SHARES["views"]) // 2)
+    return replace(plan, prediction=Prediction(work.seconds(rate) + seconds, coarse.seconds(rate) + seconds, int(peak)))
+
+
+def choose_network(weights: BackboneWeights, settings: Settings) -> tuple[FeatureNetwork, list[Decision]]:
+    """The feature network: layers up to the deepest one used, in the precision that was asked for if that pays.
+
+    Processors without bfloat16 instructions compute it hundreds of times slower than float32, so both are timed.
+    """
+    layers = (*STYLE_LAYERS, CONTENT_LAYER) if settings.content_weight else STYLE_LAYERS
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    if settings.precision == "float32":
+        return FeatureNetwork(weights, layers, torch.float32, device), []
+    ratio = _convolution_seconds(torch.float32, device) / _convolution_seconds(torch.bfloat16, device)
+    if ratio > 1:
+        error = "about 20 % of the gradient's norm; measured during the run"
+        made = Decision("precision", "features in bfloat16", f"asked for, {ratio:.1f} times faster here", error=error)
+        return FeatureNetwork(weights, layers, torch.bfloat16, device), [made]
+    reason = f"bfloat16 was asked for, but this processor computes it {1 / ratio:.0f} times slower"
+    return FeatureNetwork(weights, layers, torch.float32, device), [
+        Decision("precision", "features in float32", reason)
+    ]
+
+
+def _convolution_seconds(dtype: torch.dtype, device: str) -> float:
+    """Of a 3x3 convolution with 128 channels on 24 x 24 cells, the second of two runs."""
+    image = torch.ones((1, 128, 24, 24), dtype=dtype, device=device)
+    kernel = torch.ones((128, 128, 3, 3), dtype=dtype, device=device)
+    seconds = 0.0
+    for _ in range(2):
+        started = time.perf_counter()
+        torch.nn.functional.conv2d(image, kernel, padding=1)
+        if device == "cuda":
+            torch.cuda.synchronize()
+        seconds = time.perf_counter() - started
+    return seconds
+
+
+def _choose(scene: Scene, cameras: Sequence[Camera], settings: Settings, loss: SosLoss, looked: Survey) -> Plan:
+    """What follows from the survey alone."""
+    optimised = looked.total_weights > settings.prune_weight
+    if not optimised.any():
+        raise SettingsError(
+            f"--prune-weight {settings.prune_weight:g} would leave out every Gaussian: the largest total blend weight "
+            f"is {float(looked.total_weights.max()):.3g}. Give a smaller one."
+        )
+    everything = "unseen" in settings.keep and not settings.prune_weight
     weighted = settings.position_weights == "on" or (
         settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
     )
-    several = any(scale_count(camera.height, camera.width) > 1 for camera in cameras)
-    plan = Plan(looked, seen, weighted, settings.steps_coarse if several or settings.preset == "paper" else 0)
-    work = _Work.of(cameras, loss, looked, weighted and not settings.keep_everything)
-    rate = probe(loss, min(PROBE_SIDE, max(max(camera.width, camera.height) for camera in cameras)))
-    plan.decisions.extend(_scene_decisions(scene, plan, settings))
-    plan.decisions.extend(_view_decisions(cameras, plan, settings, work, rate))
-    plan.decisions.extend(_network_decisions(settings, work, rate, loss))
-    seconds = work.pixels * rate.both + work.again * rate.forward
-    kept = 0 if settings.keep_everything else _kept_bytes(scene, cameras, settings, loss, looked.covered)
-    peak = psutil.Process().memory_info().rss + min(memory, work.peak_bytes(loss) + kept) + _image_bytes(cameras)
-    return Plan(looked, seen, weighted, plan.steps_coarse, plan.decisions, Prediction(seconds, int(peak)))
+    several = any(loss.scale_count(camera.height, camera.width) > 1 for camera in cameras)
+    return Plan(
+        survey=looked,
+        optimised=optimised,
+        seen=torch.ones_like(optimised) if everything else optimised,
+        covered=distinct_views(scene, cameras, looked.covered, looked.total_weights, settings.similar_views),
+        weighted=weighted,
+        steps_coarse=settings.steps_coarse if several or settings.preset == "paper" else 0,
+    )
 
 
-@dataclass(frozen=True)
-class Rate:
-    """Seconds a pixel: `forward` alone (with statistics), and `both` passes."""
-
-    forward: float
-    both: float
-
-
-def probe(loss: SosLoss, side: int) -> Rate:
-    """Time the feature network on a small picture of side x side pixels; the second of two runs counts."""
-    cells = torch.rand((1, 3, side // 16 + 1, side // 16 + 1), generator=torch.Generator().manual_seed(0))
-    picture = torch.nn.functional.interpolate(cells, size=(side, side), mode="bilinear")[0]
-    image = picture.permute(1, 2, 0).contiguous().to(loss.network.device)
-    style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
-    seconds = []
-    for gradient in (True, True, False):
-        started = time.perf_counter()
-        loss.evaluate(image, style, view, gradient=gradient)
-        if loss.network.device.type == "cuda":
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - started)
-    return Rate(forward=seconds[2] / side**2, both=seconds[1] / side**2)
+def _choose_kept_weights(plan: Plan, settings: Settings, raster: RasterCost, budget: int) -> Plan:
+    """How blend weights are kept: exactly where they fit, in half precision where only that fits, and where it pays."""
+    form = settings.kept_weights
+    visits = (plan.steps_coarse + settings.steps_sos) / len(plan.covered)
+    if "blend-weights" in settings.keep or (form == "auto" and visits < LEAST_VISITS):
+        form = "none"
+    elif form == "auto":
+        form = "float32" if raster.bytes <= budget or settings.preset == "paper" else "half"
+    fits = {"none": False, "float32": raster.bytes <= budget, "half": raster.half_bytes <= budget, "auto": False}[form]
+    phase_1 = plan.steps_coarse / len(plan.covered) >= LEAST_VISITS
+    coarse = phase_1 and not fits and "blend-weights" not in settings.keep and settings.kept_weights == "auto"
+    return replace(plan, kept_weights=form, coarse_weights=coarse)
 
 
-@dataclass(frozen=True)
-class _Work:
-    """Pixels through the network in one SOS iteration, mean over views.
-
-    Attributes:
-        pixels: forward and backward, halos included.
-        again: forward a second time, because activations do not fit.
-        without_region: what `pixels` would be if uncovered pixels were not left out.
-        tiles: of the full-size view with most tiles.
-        largest: most pixels that are held at a time.
-    """
-
-    pixels: float
-    again: float
-    without_region: float
-    tiles: int
-    largest: int
-
-    @staticmethod
-    def of(cameras: Sequence[Camera], loss: SosLoss, looked: Survey, leave_out: bool) -> _Work:
-        pixels = again = without = 0.0
-        tiles = largest = 0
-        held = loss.memory / loss.network.held_bytes_per_pixel()
-        for index in looked.covered:
-            camera = cameras[index]
-            for scale in range(scale_count(camera.height, camera.width)):
-                size = (camera.height >> scale, camera.width >> scale)
-                region = _scaled(looked.regions[index], scale, size) if leave_out else None
-                areas = [tile.outer.pixels for tile in loss.tiles(*size, region)]
-                whole = [tile.outer.pixels for tile in loss.tiles(*size)]
-                kept = sum(areas) if len(areas) == 1 else min(sum(areas), max(held - max(areas, default=0), 0))
-                pixels += sum(areas)
-                again += sum(areas) - kept
-                without += sum(whole)
-                tiles = max(tiles, len(areas))
-                largest = max(largest, int(kept) + (max(areas, default=0) if len(areas) > 1 else 0))
-        count = len(looked.covered)
-        return _Work(pixels / count, again / count, without / count, tiles, largest)
-
-    def peak_bytes(self, loss: SosLoss) -> int:
-        """Activations at their peak."""
-        network = loss.network
-        return int(self.largest * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel()))
-
-
-def _scaled(region: Rectangle, scale: int, size: tuple[int, int]) -> Tensor:
-    """Coverage [h, w] that is 1 in a region of the full-size view, at a scale."""
-    coverage = torch.zeros((size[0] << scale, size[1] << scale))
-    coverage[region.slices] = 1
-    return downscale(coverage, scale)
-
-
-def _scene_decisions(scene: Scene, plan: Plan, settings: Settings) -> list[Decision]:
+def _scene_decisions(
+    scene: Scene, plan: Plan, cameras: Sequence[Camera], settings: Settings, rasterizer: Rasterizer
+) -> list[Decision]:
     decisions = []
-    unseen = len(scene) - int(plan.seen.sum())
+    left_out = ~plan.seen
+    unseen = int((left_out & (plan.survey.total_weights <= 0)).sum())
+    pruned = int(left_out.sum()) - unseen
+    change = "keep their colours" if settings.unseen == "keep" else "take their neighbours' colour change at the end"
     if unseen:
-        change = (
-            "keep their colours" if settings.unseen == "keep" else "take their neighbours' colour change at the end"
-        )
         decisions.append(
             Decision(
                 "unseen Gaussians",
@@ -214,8 +237,20 @@ def _scene_decisions(scene: Scene, plan: Plan, settings: Settings) -> list[Decis
                 bytes=unseen * OPTIMISER_BYTES,
             )
         )
-    if scene.sh_degree and not settings.keep_everything:
-        degree = scene.subset(plan.seen).sh_degree
+    if pruned:
+        error = pruned_image_error(left_out, cameras, plan.covered, rasterizer)
+        decisions.append(
+            Decision(
+                "pruned Gaussians",
+                f"{pruned:,} of {len(scene):,} are not rendered and not optimised; they {change}",
+                f"their blend weights over all views add up to at most {settings.prune_weight:g} each",
+                bytes=pruned * OPTIMISER_BYTES,
+                error=f"of colours in 0..255, no pixel of a view changes by more than {255 * error.largest:.3g}, the "
+                f"mean pixel by no more than {255 * error.mean:.2g}",
+            )
+        )
+    if scene.sh_degree and "sh" not in settings.keep:
+        degree = scene.subset(plan.seen).without_zero_bands().sh_degree
         if degree < scene.sh_degree:
             decisions.append(
                 Decision(
@@ -231,12 +266,24 @@ def _scene_decisions(scene: Scene, plan: Plan, settings: Settings) -> list[Decis
 
 
 def _view_decisions(
-    cameras: Sequence[Camera], plan: Plan, settings: Settings, work: _Work, rate: Rate
+    cameras: Sequence[Camera], plan: Plan, settings: Settings, work: Work, rate: Rate, loss: SosLoss
 ) -> list[Decision]:
     decisions = []
     blind = len(cameras) - len(plan.survey.covered)
     if blind:
         decisions.append(Decision("views", f"{blind} of {len(cameras)} are left out", "they see no Gaussian"))
+    similar = len(plan.survey.covered) - len(plan.covered)
+    if similar:
+        decisions.append(
+            Decision(
+                "similar views",
+                f"{similar} of {len(cameras)} are left out",
+                f"their picture is that of another view, shifted by less than {settings.similar_views:.1%} of its side",
+                bytes=content_bytes(cameras, plan.survey.covered, settings, loss)
+                - content_bytes(cameras, plan.covered, settings, loss),
+                error="what only these views show gets fewer steps, or none",
+            )
+        )
     share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
     if plan.weighted and work.pixels < work.without_region:
         decisions.append(
@@ -256,20 +303,12 @@ def _view_decisions(
                 error="it is another loss than the paper's",
             )
         )
-    if settings.steps_coarse and not plan.steps_coarse:
-        decisions.append(
-            Decision(
-                "phase 1",
-                f"its {settings.steps_coarse} steps are left out",
-                "the coarsest scale is the only one, so that it would be the same as phase 2",
-                error="the steps, which work on the same loss",
-            )
-        )
     return decisions
 
 
-def _network_decisions(settings: Settings, work: _Work, rate: Rate, loss: SosLoss) -> list[Decision]:
-    decisions = []
+def _network_decisions(settings: Settings, work: Work, rate: Rate, loss: SosLoss) -> list[Decision]:
+    layers = "relu5_1, the deepest one used"
+    decisions = [Decision("network layers", f"none behind {layers}", "the loss reads no deeper one")]
     if not settings.content_weight:
         decisions.append(Decision("content", "no content features are computed or kept", "its weight is 0"))
     gigabytes = f"{loss.memory / 1e9:.1f} GB for activations"
@@ -289,33 +328,55 @@ def _network_decisions(settings: Settings, work: _Work, rate: Rate, loss: SosLos
                 seconds=work.pixels * rate.forward,
             )
         )
-    if settings.precision == "bfloat16":
-        decisions.append(
-            Decision(
-                "precision",
-                "features in bfloat16",
-                "asked for",
-                error="about 20 % of the gradient's norm (python -m benchmarks.sos_gradient)",
-            )
-        )
     return decisions
 
 
-def _kept_bytes(
-    scene: Scene, cameras: Sequence[Camera], settings: Settings, loss: SosLoss, covered: Sequence[int]
-) -> int:
-    """Blend weights and content features of all views, as far as there is no limit; the middle view stands for all."""
-    middle = cameras[covered[len(covered) // 2]]
-    weights = CachedRasterizer(scene, near=settings.near).operator_bytes(middle)
-    value = torch.finfo(loss.network.dtype).bits // 8
-    cells = sum(
-        (middle.height >> scale + 3) * (middle.width >> scale + 3)
-        for scale in range(scale_count(middle.height, middle.width))
+def _weights_decision(plan: Plan, settings: Settings, raster: RasterCost, budget: int) -> Decision:
+    room = f"{budget / 1e9:.1f} GB are there for blend weights"
+    saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
+    if plan.kept_weights == "none":
+        visits = (plan.steps_coarse + settings.steps_sos) / len(plan.covered)
+        reason = (
+            "asked for" if "none" in (settings.kept_weights, *settings.keep) else f"a view comes {visits:.1f} times"
+        )
+        return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
+    size, error = (raster.bytes, "none")
+    if plan.kept_weights == "half":
+        size, error = raster.half_bytes, "each weight is off by at most 1/4096 of itself: 0.06 of 255 levels in a pixel"
+    part = "all" if size <= budget else f"{budget / size:.0%} of the views'"
+    decision = f"{part} kept in {'half precision' if plan.kept_weights == 'half' else 'float32'}"
+    if plan.coarse_weights:
+        decision += "; in phase 1 only those of the coarsest scale"
+    share = min(1.0, budget / max(size, 1))
+    reason = f"they take {size / 1e9:.2f} GB of all views; {room}"
+    return Decision(
+        "blend weights", decision, reason, seconds=saved * share if saved is not None else None, error=error
     )
-    content = cells * loss.network.channels(CONTENT_LAYER) * value if settings.content_weight else 0
-    return (weights + content) * len(covered)
 
 
-def _image_bytes(cameras: Sequence[Camera]) -> int:
-    """Images of one iteration: the render, its gradient, and their float32 copies on the way."""
-    return max(camera.width * camera.height for camera in cameras) * 3 * 4 * 6
+def _schedule_decisions(plan: Plan, settings: Settings, loss: SosLoss, cameras: Sequence[Camera]) -> list[Decision]:
+    decisions = []
+    counts = [loss.scale_count(cameras[index].height, cameras[index].width) for index in plan.covered]
+    side = loss.coarsest
+    scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
+    decisions.append(Decision("scales", scales, f"the shorter side is halved until it is at most {side} pixels"))
+    if settings.steps_coarse and not plan.steps_coarse:
+        decisions.append(
+            Decision(
+                "phase 1",
+                f"its {settings.steps_coarse} steps are left out",
+                "the coarsest scale is the only one, so that it would be the same as phase 2",
+                error="the steps, which work on the same loss",
+            )
+        )
+    if settings.early_stop:
+        decisions.append(
+            Decision(
+                "early stop",
+                f"when the mean loss of {window_length(len(plan.covered))} steps is less than {LEAST_FALL:.1%} below "
+                "that of as many steps before",
+                "later steps would buy little",
+                error="what the loss would still have fallen",
+            )
+        )
+    return decisions

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from torch import Tensor
 
-#: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST).
+#: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST). Where full views are no
+#: larger than that, a smaller bound gives them several scales too.
 COARSEST_SHORTER_SIDE = 511
 #: A style image is downscaled only where it is larger than the view by more than this factor.
 STYLE_SIZE_TOLERANCE = 1.1
 
 
-def scale_count(height: int, width: int) -> int:
-    """n_s: halve the shorter side (integer division) until it is at most 511; a small view has one scale."""
+def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) -> int:
+    """n_s: halve the shorter side (integer division) until it is at most `coarsest`; a small view has one scale."""
     count, side = 1, min(height, width)
-    while side > COARSEST_SHORTER_SIDE:
+    while side > coarsest:
         side //= 2
         count += 1
     return count

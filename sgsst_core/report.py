@@ -1,4 +1,4 @@
-"""What is written beside a stylized scene: report.json, a before/after contact sheet, and the loss curves."""
+"""What is written beside a stylized scene: the report's values, a before/after contact sheet, and the loss curves."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import os
 import platform
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,17 +24,19 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sgsst_core.camera import Camera
+from sgsst_core.check import Finding
+from sgsst_core.convergence import smoothed
 from sgsst_core.files import atomic_path
+from sgsst_core.loop import Stopped
 from sgsst_core.loss import LossTerms
-from sgsst_core.stylizer import StepRecord, Stopped, Stylizer
+from sgsst_core.planner import Plan
+from sgsst_core.stylizer import Evaluation, StepRecord, Stylizer, mean_loss
 from sgsst_core.weights import BackboneWeights
 
 #: Of report.json: raised whenever a field changes its meaning or goes away.
-REPORT_VERSION = 1
-#: Views on which a job is evaluated before and after, and which the contact sheet shows.
-EVALUATION_VIEWS = 4
-
-Evaluation = dict[int, LossTerms]
+REPORT_VERSION = 2
+#: Of plan.json.
+PLAN_VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -59,28 +60,21 @@ class Sources:
     backbone: BackboneWeights
 
 
-def evaluation_views(stylizer: Stylizer) -> list[int]:
-    """Indices of at most four views, evenly spread over those that see anything."""
-    covered = stylizer.views.covered
-    count = min(EVALUATION_VIEWS, len(covered))
-    return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
-
-
-def mean_loss(evaluation: Evaluation) -> float:
-    """E_SOS: the mean of the scales' losses."""
-    return sum(terms.total for terms in evaluation.values()) / len(evaluation)
-
-
 def build_report(
-    stylizer: Stylizer, style: Tensor, sources: Sources, stopped: Stopped, before: Evaluation, after: Evaluation
+    stylizer: Stylizer,
+    sources: Sources,
+    stopped: Stopped,
+    before: Evaluation,
+    after: Evaluation,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """The report as values that JSON can hold; its fields are documented in the README.
 
     Args:
         stylizer: after its last step.
-        style: [H, W, 3].
         stopped: what `run` returned.
-        before, after: `Stylizer.evaluate` on the `evaluation_views`, of the unstylized and the stylized scene.
+        before, after: loss on the stylizer's `evaluation_views`, of the unstylized and the stylized scene.
+        findings: what is extreme in scene, views and style.
     """
     history = stylizer.history
     coarse = sum(record.stage == "coarse" for record in history)
@@ -90,18 +84,22 @@ def build_report(
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "stopped": stopped,
         "steps": {
-            "coarse": {"planned": stylizer.steps_coarse, "done": coarse},
+            "coarse": {"planned": stylizer.plan.steps_coarse, "done": coarse},
             "sos": {"planned": stylizer.settings.steps_sos, "done": len(history) - coarse},
         },
         "seconds": round(stylizer.seconds, 3),
         "seconds_by_part": {name: round(seconds, 3) for name, seconds in sorted(stylizer.seconds_by_part.items())},
         "loss": {
-            "views": [stylizer.views.cameras[index].name for index in evaluation_views(stylizer)],
+            "views": [stylizer.views.cameras[index].name for index in stylizer.evaluation_views],
             "before": _evaluation_json(before),
             "after": _evaluation_json(after),
             "relative": mean_loss(after) / mean_loss(before),
             "relative_by_scale": {str(scale): after[scale].total / before[scale].total for scale in before},
         },
+        "bought": bought(stylizer, before),
+        "held_out": held_out_json(stylizer.measured),
+        "approximations": approximations_json(stylizer.measured),
+        "findings": [asdict(finding) for finding in findings],
         "settings": stylizer.settings.model_dump(mode="json"),
         "backbone": {
             "name": sources.backbone.name,
@@ -114,7 +112,7 @@ def build_report(
             "sh_degree": stylizer.scene.sh_degree,
             "dropped": sources.dropped,
         },
-        "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
+        "style": {"path": str(sources.style), "width": stylizer.style.shape[1], "height": stylizer.style.shape[0]},
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.views.weighted,
@@ -128,24 +126,79 @@ def build_report(
     }
 
 
-def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Write a report as JSON; the file appears whole or not at all.
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write values as JSON; the file appears whole or not at all.
 
     Raises:
         OutputError: the file cannot be written.
     """
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        # A file name that is no valid Unicode holds lone surrogates: as escapes they are what JSON means by them.
+        text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def plan_json(plan: Plan) -> dict[str, Any]:
+    """A plan as values that JSON can hold."""
+    return {"version": PLAN_VERSION, **plan.as_dict()}
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
-    """What happened, beside the plan's prediction: median seconds of an SOS step, peak memory in bytes."""
-    steps = [
-        later.seconds - earlier.seconds
-        for earlier, later in pairwise(stylizer.history)
-        if earlier.stage == later.stage == "sos"
-    ]
-    return {"seconds": median(steps) if steps else None, "peak_bytes": peak_memory()}
+    """What happened, beside the plan's prediction: median seconds of a step of either phase, peak memory in bytes."""
+    values = {
+        stage: [
+            sum(seconds for name, seconds in record.parts.items() if name != "prepare")
+            for record in stylizer.history
+            if record.stage == stage
+        ]
+        for stage in ("sos", "coarse")
+    }
+    seconds = {stage: median(steps) if steps else None for stage, steps in values.items()}
+    return {"seconds": seconds["sos"], "seconds_coarse": seconds["coarse"], "peak_bytes": peak_memory()}
+
+
+#: Losses relative to the start, for which the report says when they were reached.
+_REACHED = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+
+
+def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
+    """What error the time bought: the mean loss over the last round of views, relative to the start.
+
+    Returns:
+        `relative` at the end; `reached`: seconds and step at which it came below 0.5, 0.2, 0.1 and so on; `last_tenth`:
+        what the last tenth of the time changed. None where no step was made on all scales.
+    """
+    records = [record for record in stylizer.history if record.stage == "sos"]
+    if not records:
+        return None
+    start, losses = mean_loss(before), [record.loss for record in records]
+    length = stylizer.round_length
+    relative = [smoothed(losses[max(0, end - length) : end], length) / start for end in range(1, len(losses) + 1)]
+    reached = []
+    for wanted in _REACHED:
+        first = next((i for i, value in enumerate(relative) if value <= wanted), None)
+        if first is not None:
+            entry = {"relative": wanted, "seconds": round(records[first].seconds, 3), "step": records[first].step}
+            reached.append(entry)
+    border = 0.9 * stylizer.seconds
+    earlier = [value for record, value in zip(records, relative, strict=True) if record.seconds <= border]
+    last = {"seconds": stylizer.seconds - border, "from": earlier[-1], "to": relative[-1]} if earlier else None
+    return {"relative": relative[-1], "reached": reached, "last_tenth": last}
+
+
+def held_out_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Quality on views that were not trained on, at each moment; None where there are none."""
+    moments = [entry["held_out"] for entry in measured if entry["held_out"]]
+    if not moments:
+        return None
+    first = measured[0]
+    return {"views": first["held_out_views"], "lpips": first["lpips"], "moments": moments}
+
+
+def approximations_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The gradient's error at each moment; None where nothing is approximated."""
+    moments = [entry["approximation"] for entry in measured if entry["approximation"]]
+    return {"what": measured[0]["approximated"], "moments": moments} if moments else None
 
 
 def _cameras_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
@@ -186,6 +239,8 @@ def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
         "loss": record.loss,
         "relative": record.loss / start,
         "scales": {str(scale): _terms_json(terms) for scale, terms in record.terms.items()},
+        "parts": {name: round(seconds, 4) for name, seconds in record.parts.items()},
+        "memory_bytes": record.memory,
     }
 
 
@@ -239,7 +294,7 @@ _LABEL = 18
 _PAPER, _INK = (255, 255, 255), (60, 60, 60)
 
 
-def write_contact_sheet(path: Path, stylizer: Stylizer, style: Tensor) -> None:
+def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     """Write a JPEG: the style image, then for each evaluation view the original above the stylized render.
 
     Raises:
@@ -249,11 +304,11 @@ def write_contact_sheet(path: Path, stylizer: Stylizer, style: Tensor) -> None:
     device = views.rasterizer.device
     pairs = []
     with torch.no_grad():
-        for index in evaluation_views(stylizer):
+        for index in stylizer.evaluation_views:
             dcs = (views.scene.sh_dc.to(device), stylizer.sh_dc.detach())
             renders = [_picture(views.render(index, views.colours(index, dc))) for dc in dcs]
             pairs.append((views.cameras[index], renders))
-    sheet = _sheet(_picture(style), pairs)
+    sheet = _sheet(_picture(stylizer.style), pairs)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 

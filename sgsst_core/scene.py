@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -37,16 +37,12 @@ class Scene:
         return {0: 0, 3: 1, 8: 2, 15: 3}[int(self.sh_rest.shape[1])]
 
     def subset(self, rows: Tensor) -> Scene:
-        """The Gaussians of some rows ([N] bool, or indices), without the SH bands that are zero in all of them."""
-        rest = self.sh_rest[rows]
-        used = rest.abs().amax(dim=(0, 2)) > 0 if rest.numel() else torch.zeros(rest.shape[1], dtype=torch.bool)
+        """The Gaussians of some rows ([N] bool, or indices)."""
+        return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def without_zero_bands(self) -> Scene:
+        """The same scene without the SH bands that are zero in all Gaussians; it looks the same from everywhere."""
+        used = self.sh_rest.abs().amax(dim=2).amax(dim=0) > 0 if len(self) else torch.zeros(self.sh_rest.shape[1])
         highest = int(used.nonzero()[-1]) + 1 if used.any() else 0
         coefficients = next(count for count in (0, 3, 8, 15) if count >= highest)
-        return Scene(
-            self.means[rows],
-            self.quats[rows],
-            self.scales[rows],
-            self.opacities[rows],
-            self.sh_dc[rows],
-            rest[:, :coefficients].contiguous(),
-        )
+        return replace(self, sh_rest=self.sh_rest[:, :coefficients].contiguous())

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
+from sgsst_core.pyramid import COARSEST_SHORTER_SIDE
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
+KeptWeights = Literal["auto", "float32", "half", "none"]
+#: What can be left out without changing the result, for `Settings.keep`.
+Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights"]
+EVERYTHING: tuple[Item, ...] = get_args(Item)
 
 
 class Settings(BaseModel):
@@ -33,7 +38,17 @@ class Settings(BaseModel):
         max_seconds: wall-clock budget of the iterations; None for none.
         memory_limit: bytes to plan with; None for most of what is free.
         unseen: colours of Gaussians that no view sees: their neighbours' change, or kept as they are.
-        keep_everything: leave nothing out that a scene does not need; for comparison, the results are the same.
+        coarsest_side: pixels of the coarsest scale's shorter side at most; the method's is 511.
+        warm_start: begin with colours whose mean and covariance are the style's.
+        revive: colours that the clamp holds at 0 take gradients that would raise them, instead of staying black.
+        early_stop: end when the smoothed loss of all scales has stopped falling (`convergence`).
+        target_loss: end when the smoothed loss of all scales, relative to the start, is at most this; None for never.
+        prune_weight: Gaussians whose blend weights, summed over all pixels of all views, are at most this are treated
+            as unseen; 0 takes out none that any pixel shows.
+        similar_views: leave out views whose picture differs from that of a kept view by a shift of less than this share
+            of the longer side; 0 leaves out none.
+        kept_weights: how blend weights are kept between iterations; "auto" lets the memory decide.
+        keep: items that are not left out although the scene does not need them; for comparison, the result is the same.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -53,23 +68,40 @@ class Settings(BaseModel):
     max_seconds: float | None = Field(None, gt=0)
     memory_limit: int | None = Field(None, gt=0)
     unseen: Literal["neighbours", "keep"] = "neighbours"
-    keep_everything: bool = False
+    coarsest_side: int = Field(COARSEST_SHORTER_SIDE, ge=16)
+    warm_start: bool = False
+    revive: bool = False
+    early_stop: bool = False
+    target_loss: float | None = Field(None, gt=0, lt=1)
+    prune_weight: float = Field(0.0, ge=0, allow_inf_nan=False)
+    similar_views: float = Field(0.0, ge=0, lt=1)
+    kept_weights: KeptWeights = "auto"
+    keep: tuple[Item, ...] = ()
 
     def learning_rate_at(self, share: float) -> float:
         """Adam's learning rate when `share` (0..1) of all steps is done."""
         return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** share)
 
 
-#: `paper` is the published schedule. The others reach a comparable loss sooner with larger, decaying steps.
+#: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
+#: colours below 0 on their way and therefore need `revive` (README, "The standard preset").
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
-        "steps_coarse": 30,
+        "steps_coarse": 50,
         "steps_sos": 60,
-        "learning_rate": 0.1,
-        "learning_rate_end": 0.03,
+        "learning_rate": 0.2,
+        "learning_rate_end": 0.05,
+        "revive": True,
         "max_resolution": 640,
     },
-    "standard": {"steps_coarse": 200, "steps_sos": 400, "learning_rate": 0.05, "learning_rate_end": 0.01},
+    "standard": {
+        "steps_coarse": 100,
+        "steps_sos": 200,
+        "learning_rate": 0.2,
+        "learning_rate_end": 0.02,
+        "revive": True,
+        "early_stop": True,
+    },
     "paper": {
         "steps_coarse": 10_000,
         "steps_sos": 10_000,

@@ -15,7 +15,14 @@ from torch import Tensor
 
 from sgsst_core.loss import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
 from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, covered_region, partition
-from sgsst_core.pyramid import add_upscaled_, coverage_pyramid, downscale, scale_count, style_size
+from sgsst_core.pyramid import (
+    COARSEST_SHORTER_SIDE,
+    add_upscaled_,
+    coverage_pyramid,
+    downscale,
+    scale_count,
+    style_size,
+)
 from sgsst_core.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.timing import Timer
 from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, Activations, FeatureGradient, FeatureNetwork, layer_stride
@@ -66,7 +73,9 @@ class SosLoss:
         content_weight: lambda_c; 0 leaves the content branch out.
         memory: bytes that activations may take.
         tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
+        coarsest: pixels of the coarsest scale's shorter side at most.
         leave_out: pixels without weight do not go through the network; False for comparison.
+        keep_activations: as many as fit between the two passes; False computes each tile twice, for comparison.
         timer: receives the seconds of `vgg_forward`, `vgg_backward` and `statistics`.
     """
 
@@ -77,16 +86,24 @@ class SosLoss:
         content_weight: float = 1.0,
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
+        coarsest: int = COARSEST_SHORTER_SIDE,
         leave_out: bool = True,
+        keep_activations: bool = True,
         timer: Timer | None = None,
     ) -> None:
         self.network = network
         self.content_weight = content_weight
         self.memory = memory
         self.tile_size = tile_size
+        self.coarsest = coarsest
         self.leave_out = leave_out
+        self.keep_activations = keep_activations
         self.timer = timer or Timer()
         self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
+
+    def scale_count(self, height: int, width: int) -> int:
+        """n_s of views of a size."""
+        return scale_count(height, width, self.coarsest)
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
         """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
@@ -109,7 +126,7 @@ class SosLoss:
         """
         image = resize_area(style, style_size((style.shape[0], style.shape[1]), view_size))
         targets: dict[int, dict[str, LayerTarget]] = {}
-        for scale in range(scale_count(*view_size)):
+        for scale in range(self.scale_count(*view_size)):
             scaled = downscale(image, scale).to(self.network.device)
             pass_ = _ScalePass(self, (scaled.shape[0], scaled.shape[1]), scale, ViewTarget(), None)
             statistics, _, _ = self._first_pass(scaled, pass_, keep=False)
@@ -118,18 +135,18 @@ class SosLoss:
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
         """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""
-        scales = scale_count(content.shape[0], content.shape[1])
-        weights = None
-        if coverage is not None:
-            weights = coverage_pyramid(
-                coverage.to(self.network.device, _gradient_dtype(self.network)),
-                scales + layer_stride("relu5_1").bit_length(),
-            )
+        scales = self.scale_count(content.shape[0], content.shape[1])
+        weights = None if coverage is None else self.position_weights(coverage)
         target = ViewTarget(content_image=content, coverage=weights)
         if self.content_weight and keep_content:
             target.content = {scale: self.content_features(content, scale, weights) for scale in range(scales)}
             target.content_image = None
         return target
+
+    def position_weights(self, coverage: Tensor) -> list[Tensor]:
+        """Coverage [H, W] in 0..1 at every power of two that a layer of a scale needs."""
+        levels = self.scale_count(coverage.shape[0], coverage.shape[1]) + layer_stride("relu5_1").bit_length()
+        return coverage_pyramid(coverage.to(self.network.device, _gradient_dtype(self.network)), levels)
 
     def content_features(self, content: Tensor, scale: int, coverage: list[Tensor] | None = None) -> Tensor:
         """Features of the content layer [h/8, w/8, 512] of a content image [H, W, 3] at a scale; 0 without coverage."""
@@ -161,7 +178,7 @@ class SosLoss:
             scales: which scales; None for all (SOS). Phase 1 passes the coarsest alone.
             gradient: False evaluates the loss only.
         """
-        scales = range(scale_count(image.shape[0], image.shape[1])) if scales is None else scales
+        scales = range(self.scale_count(image.shape[0], image.shape[1])) if scales is None else scales
         total = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=self.network.device)
         terms: dict[int, LossTerms] = {}
         for scale in scales:
@@ -170,6 +187,11 @@ class SosLoss:
             if pixel_gradient is not None:
                 add_upscaled_(total, pixel_gradient, scale, 1.0 / len(scales))
         return SosResult(terms, total if gradient else None)
+
+    def evaluate_scale(self, image: Tensor, style: ScaleTarget, view: ViewTarget, scale: int) -> SosResult:
+        """Loss of one scale from the image at that scale, [H >> scale, W >> scale, 3], and dE/dimage of that size."""
+        terms, gradient = self._scale(image.to(self.network.device), style, view, scale, gradient=True)
+        return SosResult({scale: terms}, gradient)
 
     def _scale(
         self, image: Tensor, style: ScaleTarget, view: ViewTarget, scale: int, gradient: bool
@@ -218,7 +240,7 @@ class SosLoss:
             held + self.network.working_bytes_per_pixel()
         )
         for tile in tiles:
-            keep_this = keep and (len(tiles) == 1 or tile.outer.pixels * held <= budget)
+            keep_this = keep and self.keep_activations and (len(tiles) == 1 or tile.outer.pixels * held <= budget)
             budget -= tile.outer.pixels * held if keep_this else 0
             activations = self._forward(image, tile, keep=keep_this)
             with self.timer("statistics"):

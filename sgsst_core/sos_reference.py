@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.loss import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
-from sgsst_core.pyramid import scale_count
+from sgsst_core.pyramid import COARSEST_SHORTER_SIDE, scale_count
 from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
 from sgsst_core.weights import BackboneWeights
 
@@ -53,6 +53,7 @@ def sos_reference(
     *,
     content_weight: float = 1.0,
     coverage: Tensor | None = None,
+    coarsest: int = COARSEST_SHORTER_SIDE,
 ) -> tuple[float, Tensor]:
     """E and dE/dimage [H, W, 3] in float64.
 
@@ -60,10 +61,11 @@ def sos_reference(
         image, content: [H, W, 3] in 0..1.
         style: [H', W', 3], already at the size at which it is used (`pyramid.style_size`).
         coverage: [H, W] position weights; None for equal weights.
+        coarsest: pixels of the coarsest scale's shorter side at most.
     """
     x = image.double().clone().requires_grad_()
     loss = torch.zeros((), dtype=torch.float64)
-    scales = scale_count(image.shape[0], image.shape[1])
+    scales = scale_count(image.shape[0], image.shape[1], coarsest)
     for scale in range(scales):
         side = 1 << scale
         features = features_reference(weights, box_average_reference(x, side))

@@ -1,6 +1,6 @@
 """The optimiser loop: Adam on the DC colours, coarse phase then SOS, one view a step.
 
-The loop prints nothing and writes nothing; what is to be shown or saved goes through `Callbacks`.
+One step at a time; `loop.run` makes them all.
 """
 
 from __future__ import annotations
@@ -9,36 +9,58 @@ import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
+import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import default_memory_limit
+from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
 from sgsst_core.camera import Camera, resized
 from sgsst_core.errors import CameraError, DivergedError
 from sgsst_core.loss import LayerTarget, LossTerms
-from sgsst_core.planner import make_plan
-from sgsst_core.pyramid import scale_count
+from sgsst_core.planner import choose_network, make_plan
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.coarse import CoarseRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.sos import SosLoss
+from sgsst_core.sos import SosLoss, SosResult, ViewTarget
+from sgsst_core.spherical_harmonics import view_colours_gradient
 from sgsst_core.timing import Timer
 from sgsst_core.unseen import neighbours_change
-from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.views import PhotoLoader, Views
+from sgsst_core.warm_start import warm_start
 from sgsst_core.weights import BackboneWeights, load_weights
 
 #: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
 #: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
 LARGEST_GRADIENT = 1e19
-#: Of the memory limit: activations of one iteration, view targets and colours, and the rasterizer's lists or weights.
-MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 
-Stage = Literal["coarse", "sos"]
-Stopped = Literal["finished", "max-seconds", "interrupted"]
+#: Views on which a job is evaluated before and after, and which the contact sheet shows.
+EVALUATION_VIEWS = 4
+
+Evaluation = dict[int, LossTerms]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of the schedule.
+
+    Attributes:
+        stage: its name: "coarse" (phase 1) and "sos" (phase 2) in every preset.
+        steps: how many.
+        scale: the one scale that is optimised, counted from the coarsest (0); None for all, the SOS loss.
+    """
+
+    stage: str
+    steps: int
+    scale: int | None = None
+
+    def scales(self, count: int) -> list[int]:
+        """The scales of a view that has `count`, 0 being full size."""
+        return list(range(count)) if self.scale is None else [max(count - 1 - self.scale, 0)]
 
 
 @dataclass(frozen=True)
@@ -47,50 +69,23 @@ class StepRecord:
 
     Attributes:
         step: counted from 1 over both phases.
-        stage: "coarse" or "sos".
+        stage: of the phase: "coarse", "sos".
         view: index of the camera.
         seconds: wall-clock seconds of iterations so far, of all sessions of a resumed job.
         loss: E of the view before the step.
         terms: split loss by scale.
+        parts: seconds of this step by what they went into.
+        memory: bytes of physical memory that the process held after the step.
     """
 
     step: int
-    stage: Stage
+    stage: str
     view: int
     seconds: float
     loss: float
     terms: dict[int, LossTerms]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress bar shows."""
-
-    stage: Stage
-    step: int
-    total: int
-    loss: float
-    seconds: float
-    seconds_left: float
-
-
-@dataclass
-class Callbacks:
-    """What the loop calls between iterations; each is optional.
-
-    Attributes:
-        progress: after every iteration.
-        stop: asked before every iteration; True ends the loop as "interrupted".
-        checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
-        preview: called with the stylizer about every `preview_seconds`.
-    """
-
-    progress: Callable[[Progress], None] | None = None
-    stop: Callable[[], bool] | None = None
-    checkpoint: Callable[[Stylizer], None] | None = None
-    checkpoint_seconds: float = 300.0
-    preview: Callable[[Stylizer], None] | None = None
-    preview_seconds: float = 60.0
+    parts: dict[str, float]
+    memory: int
 
 
 @dataclass
@@ -107,6 +102,7 @@ class StylizerState:
     history: list[StepRecord] = field(default_factory=list)
     seconds_by_part: dict[str, float] = field(default_factory=dict)
     memory: int | None = None  # bytes planned with: partition and kept weights follow from it, and so does rounding
+    measured: list[dict[str, Any]] = field(default_factory=list)  # see `Stylizer.measured`
 
 
 class Stylizer:
@@ -121,6 +117,7 @@ class Stylizer:
         weights: of the feature network; None loads VGG19, or VGG16 where only that is installed.
         photos: content image of a camera by its index, at its (brought down) size; None for unstylized renders.
         rasterizer: "auto", "cpu", "cached", "cuda" or "reference".
+        schedule: phases in their order; None for those of the settings, as planned.
 
     Raises:
         CameraError: no cameras, or none sees a Gaussian.
@@ -137,6 +134,7 @@ class Stylizer:
         weights: BackboneWeights | None = None,
         photos: PhotoLoader | None = None,
         rasterizer: str = "auto",
+        schedule: Sequence[Phase] | None = None,
     ) -> None:
         if not cameras:
             raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
@@ -146,64 +144,121 @@ class Stylizer:
         self.seconds_by_part: dict[str, float] = {}
         self.step = 0
         self.history: list[StepRecord] = []
+        #: What was measured between steps (`loop.Callbacks.measure`): values for JSON, kept through a resume.
+        self.measured: list[dict[str, Any]] = []
         self.memory = settings.memory_limit or default_memory_limit()
-        self.network = self._network(weights or load_weights("auto"))
+        self.weights = weights or load_weights("auto")
+        self.photos = photos
+        self.style = style
+        self.network, precision = choose_network(self.weights, settings)
         self.loss = SosLoss(
             self.network,
             content_weight=settings.content_weight,
             memory=int(self.memory * MEMORY_SHARES["activations"]),
-            leave_out=not settings.keep_everything,
+            coarsest=settings.coarsest_side,
+            leave_out="uncovered" not in settings.keep,
+            keep_activations="activations" not in settings.keep,
             timer=self.timer,
         )
         cameras = fit_cameras(cameras, settings)
         whole = self._rasterizer(scene, "cpu" if rasterizer in ("auto", "cached") else rasterizer)
         self.plan = make_plan(scene, cameras, settings, self.loss, whole, self.memory)
+        self.plan.decisions.extend(precision)
         self.scene = scene
-        seen = scene if settings.keep_everything else scene.subset(self.plan.seen)
+        seen = scene if self.plan.seen.all() else scene.subset(self.plan.seen)
+        seen = seen if "sh" in settings.keep else seen.without_zero_bands()
         self.views = Views(
             seen,
             cameras,
-            self._rasterizer(seen, "cpu" if settings.keep_everything and rasterizer == "auto" else rasterizer),
+            self._rasterizer(seen, rasterizer),
             self.loss,
-            covered=self.plan.survey.covered,
+            covered=self.plan.covered,
             weighted=self.plan.weighted,
             photos=photos,
             memory=int(self.memory * MEMORY_SHARES["views"]),
+            keep_content="content" not in settings.keep,
+            revive=settings.revive,
         )
-        self._style = style
+        self._coarse = self._coarse_rasterizer(seen)
         self._style_targets: dict[tuple[int, int], dict[int, dict[str, LayerTarget]]] = {}
-        self.sh_dc = seen.sh_dc.clone().to(self.views.rasterizer.device).requires_grad_()
+        start = seen.sh_dc
+        if settings.warm_start:
+            start = warm_start(start, self.plan.survey.total_weights[self.plan.seen], style)
+        self.sh_dc = start.clone().to(self.views.rasterizer.device).requires_grad_()
         self._adam = torch.optim.Adam([self.sh_dc], lr=settings.learning_rate, eps=ADAM_EPS)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
-        self.steps_coarse = self.plan.steps_coarse
-        self.total = self.steps_coarse + settings.steps_sos
-
-    def _network(self, weights: BackboneWeights) -> FeatureNetwork:
-        layers = (*STYLE_LAYERS, CONTENT_LAYER) if self.settings.content_weight else STYLE_LAYERS
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-        return FeatureNetwork(weights, layers, getattr(torch, self.settings.precision), device)
+        self.schedule = list(schedule or (Phase("coarse", self.plan.steps_coarse, 0), Phase("sos", settings.steps_sos)))
+        self.total = sum(phase.steps for phase in self.schedule)
+        self._process = psutil.Process()
+        self._start: Evaluation | None = None
 
     def _rasterizer(self, scene: Scene, name: str) -> Rasterizer:
-        """The rasterizer of a name; "auto" is gsplat on a GPU that has it, else kept blend weights as memory allows."""
+        """The rasterizer of a name; "auto" is gsplat on a GPU that has it, else what the plan says."""
         options: dict[str, Any] = {"background": self.settings.background, "near": self.settings.near}
         if name == "auto":
             gsplat = self.network.device.type == "cuda" and importlib.util.find_spec("gsplat") is not None
-            name = "cuda" if gsplat else "cached"
+            name = "cuda" if gsplat else "cpu" if self.plan.kept_weights == "none" else "cached"
         if name == "cached":
-            options |= {"device": self.network.device, "max_bytes": int(self.memory * MEMORY_SHARES["rasterizer"])}
+            options |= {"device": self.network.device, "max_bytes": self._weights_budget(coarse=False)}
+            options |= {"precision": "half" if self.plan.kept_weights == "half" else "float32"}
         return make_rasterizer(name, scene, **options)
 
+    def _coarse_rasterizer(self, scene: Scene) -> CoarseRasterizer | None:
+        """Keeps blend weights of the coarsest scale for phase 1, where the plan says so."""
+        if not self.plan.coarse_weights or self.views.rasterizer.name != "cached" or self.network.device.type != "cpu":
+            return None
+        cpu = CpuRasterizer(scene, background=self.settings.background, near=self.settings.near)
+        return CoarseRasterizer(cpu, self._weights_budget(coarse=True))
+
+    def _weights_budget(self, *, coarse: bool) -> int:
+        """Bytes for kept blend weights: of full views, or of their coarsest scale in phase 1."""
+        budget = int(self.memory * MEMORY_SHARES["rasterizer"])
+        share = budget // 4 if self.plan.coarse_weights else 0
+        return share if coarse else budget - share
+
     @property
-    def stage(self) -> Stage:
-        """The phase that the next step belongs to."""
-        return "coarse" if self.step < self.steps_coarse else "sos"
+    def phase(self) -> Phase:
+        """The phase that the next step belongs to; the last one when all steps are done."""
+        done = self.step
+        for phase in self.schedule:
+            if done < phase.steps:
+                return phase
+            done -= phase.steps
+        return self.schedule[-1]
+
+    def share_done(self) -> float:
+        """How much of the schedule is done, 0 to 1: what the learning rate follows."""
+        return self.step / max(self.total - 1, 1)
+
+    @property
+    def round_length(self) -> int:
+        """Steps in which every view comes once."""
+        return len(self.views.covered)
+
+    def scale_count(self, index: int) -> int:
+        """n_s of a view."""
+        camera = self.views.cameras[index]
+        return self.loss.scale_count(camera.height, camera.width)
+
+    @property
+    def evaluation_views(self) -> list[int]:
+        """Indices of at most four views, evenly spread over those that see anything."""
+        covered = self.views.covered
+        count = min(EVALUATION_VIEWS, len(covered))
+        return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
+
+    def start(self) -> Evaluation:
+        """Loss of the unstylized scene on the evaluation views."""
+        if self._start is None:
+            self._start = self.evaluate(self.evaluation_views, self.views.scene.sh_dc)
+        return self._start
 
     def style_targets(self, camera: Camera) -> dict[int, dict[str, LayerTarget]]:
         """The style's statistics for views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
-            self._style_targets[size] = self.loss.style_targets(self._style.to(self.network.device), size)
+            self._style_targets[size] = self.loss.style_targets(self.style.to(self.network.device), size)
         return self._style_targets[size]
 
     def run_step(self) -> StepRecord:
@@ -215,27 +270,30 @@ class Stylizer:
         started = time.perf_counter()
         self.timer.seconds.clear()
         index = self._next_view()
+        phase = self.phase
+        if phase.scale is None:
+            self._coarse = None  # phase 1 is over
+        scales = phase.scales(self.scale_count(index))
         with self.timer("prepare"):
-            target = self.views.target(index)
+            target = self.views.target(index, scales)
             style = self.style_targets(self.views.cameras[index])
-        stage = self.stage
-        camera = self.views.cameras[index]
-        scales = [scale_count(camera.height, camera.width) - 1] if stage == "coarse" else None
-        with self.timer("render"), torch.no_grad():
-            colours = self.views.colours(index, self.sh_dc.detach())
-            image = self.views.render(index, colours)
-        with self.timer("loss"):
-            result = self.loss.evaluate(image, style, target, scales)
-        with self.timer("raster_backward"):
-            assert result.image_gradient is not None
-            gradient = self.views.gradient(index, result.image_gradient.to(image.device), colours)
+        gradient, result = self._gradient(index, style, target, scales)
         with self.timer("optimiser"):
             self._update(gradient)
         self.step += 1
         self.seconds += time.perf_counter() - started
         for name, seconds in self.timer.seconds.items():
             self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
-        record = StepRecord(self.step, stage, index, self.seconds, result.loss, result.terms)
+        record = StepRecord(
+            self.step,
+            phase.stage,
+            index,
+            self.seconds,
+            result.loss,
+            result.terms,
+            dict(self.timer.seconds),
+            self._process.memory_info().rss,
+        )
         self.history.append(record)
         return record
 
@@ -249,7 +307,7 @@ class Stylizer:
                 "check`."
             )
         for group in self._adam.param_groups:
-            group["lr"] = self.settings.learning_rate_at(self.step / max(self.total - 1, 1))
+            group["lr"] = self.settings.learning_rate_at(self.share_done())
         self.sh_dc.grad = gradient.to(self.sh_dc.dtype)
         self._adam.step()
 
@@ -260,24 +318,66 @@ class Stylizer:
             self._queue = [covered[i] for i in torch.randperm(len(covered), generator=self._generator).tolist()]
         return self._queue.pop()
 
-    def evaluate(self, indices: Sequence[int]) -> dict[int, LossTerms]:
-        """Mean SOS loss over views, split by scale; changes nothing, its time does not count."""
-        total: dict[int, LossTerms] = {}
-        for index in indices:
-            with torch.no_grad():
-                image = self.views.render(index, self.views.colours(index, self.sh_dc.detach()))
-            style = self.style_targets(self.views.cameras[index])
-            terms = self.loss.evaluate(image, style, self.views.target(index), gradient=False).terms
-            for scale, part in terms.items():
-                total[scale] = total.get(scale, LossTerms()) + part
-        return {scale: terms.divided(len(indices)) for scale, terms in total.items()}
+    def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
+        """Mean SOS loss over views, split by scale; changes nothing, its time does not count.
+
+        Args:
+            sh_dc: [n, 3], colours to evaluate in place of the present ones of the n optimised Gaussians.
+        """
+        values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
+        return evaluate(self.views, self.style_targets, indices, values)
+
+    def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
+        """dE/dsh_dc [n, 3] of the n optimised Gaussians on the CPU, as a step computes it, and its seconds.
+
+        Targets are prepared before the clock starts. Changes nothing.
+        """
+        target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
+        started = time.perf_counter()
+        gradient = self._gradient(index, style, target, scales)[0]
+        return gradient.cpu(), time.perf_counter() - started
+
+    def _gradient(
+        self, index: int, style: dict[int, dict[str, LayerTarget]], target: ViewTarget, scales: Sequence[int]
+    ) -> tuple[Tensor, SosResult]:
+        """dE/dsh_dc [n, 3] of one view, and the loss."""
+        if self._coarse is not None and len(scales) == 1 and scales[0] > 0:
+            return self._coarse_gradient(self._coarse, index, style, target, scales[0])
+        with self.timer("render"), torch.no_grad():
+            colours = self.views.colours(index, self.sh_dc.detach())
+            image = self.views.render(index, colours)
+        with self.timer("loss"):
+            result = self.loss.evaluate(image, style, target, scales)
+        with self.timer("raster_backward"):
+            assert result.image_gradient is not None
+            return self.views.gradient(index, result.image_gradient.to(image.device), colours), result
+
+    def _coarse_gradient(
+        self,
+        rasterizer: CoarseRasterizer,
+        index: int,
+        style: dict[int, dict[str, LayerTarget]],
+        target: ViewTarget,
+        scale: int,
+    ) -> tuple[Tensor, SosResult]:
+        """The same of one scale alone, rendered at that scale."""
+        camera = self.views.cameras[index]
+        with self.timer("render"), torch.no_grad():
+            colours = self.views.colours(index, self.sh_dc.detach())
+            image = rasterizer.render(colours, camera, scale)
+        with self.timer("loss"):
+            result = self.loss.evaluate_scale(image, style[scale], target, scale)
+        with self.timer("raster_backward"):
+            assert result.image_gradient is not None
+            gradient = rasterizer.colour_gradient(result.image_gradient.to(image.device), camera, scale)
+            return view_colours_gradient(gradient, colours, revive=self.views.revive), result
 
     def stylized(self) -> Tensor:
         """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians."""
         result = self.scene.sh_dc.clone()
         result[self.plan.seen] = self.sh_dc.detach().cpu()
         if self.settings.unseen == "neighbours":
-            weights = self.plan.survey.total_weights
+            weights = torch.where(self.plan.optimised, self.plan.survey.total_weights, 0.0)
             result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
         return result
 
@@ -301,6 +401,7 @@ class Stylizer:
             history=list(self.history),
             seconds_by_part=dict(self.seconds_by_part),
             memory=self.memory,
+            measured=list(self.measured),
         )
 
     def load_state(self, state: StylizerState) -> None:
@@ -319,6 +420,7 @@ class Stylizer:
         self._queue = list(state.queue)
         self.history = list(state.history)
         self.seconds_by_part = dict(state.seconds_by_part)
+        self.measured = list(state.measured)
 
 
 def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
@@ -329,54 +431,24 @@ def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
     ]
 
 
-def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
-    """Iterate to the end of the schedule, to the time budget, or until `callbacks.stop` says so."""
-    callbacks = callbacks or Callbacks()
-    started, before = time.perf_counter(), stylizer.step
-    last_checkpoint = last_preview = started
-    while stylizer.step < stylizer.total:
-        if callbacks.stop and callbacks.stop():
-            return _end_early(stylizer, callbacks, "interrupted")
-        if stylizer.settings.max_seconds and stylizer.seconds >= stylizer.settings.max_seconds:
-            return _end_early(stylizer, callbacks, "max-seconds")
-        record = stylizer.run_step()
-        now = time.perf_counter()
-        if callbacks.progress:
-            per_step = (now - started) / (stylizer.step - before)
-            left = per_step * (stylizer.total - stylizer.step)
-            if stylizer.settings.max_seconds:
-                left = min(left, max(stylizer.settings.max_seconds - stylizer.seconds, 0.0))
-            callbacks.progress(Progress(record.stage, record.step, stylizer.total, record.loss, stylizer.seconds, left))
-        if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
-            callbacks.checkpoint(stylizer)
-            last_checkpoint = time.perf_counter()
-        if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
-            callbacks.preview(stylizer)
-            last_preview = time.perf_counter()
-    return "finished"
+def evaluate(
+    views: Views,
+    style_targets: Callable[[Camera], dict[int, dict[str, LayerTarget]]],
+    indices: Sequence[int],
+    sh_dc: Tensor,
+) -> Evaluation:
+    """Mean SOS loss of colours [n, 3] over views, split by scale."""
+    total: Evaluation = {}
+    for index in indices:
+        camera = views.cameras[index]
+        with torch.no_grad():
+            image = views.render(index, views.colours(index, sh_dc))
+        target = views.target(index, range(views.loss.scale_count(camera.height, camera.width)))
+        for scale, part in views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms.items():
+            total[scale] = total.get(scale, LossTerms()) + part
+    return {scale: terms.divided(len(indices)) for scale, terms in total.items()}
 
 
-def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:
-    if callbacks.checkpoint:
-        callbacks.checkpoint(stylizer)
-    return reason
-
-
-def stylize(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    style: Tensor,
-    settings: Settings,
-    *,
-    weights: BackboneWeights | None = None,
-    photos: PhotoLoader | None = None,
-    callbacks: Callbacks | None = None,
-) -> Tensor:
-    """Stylize a scene from beginning to end; the arguments are those of `Stylizer`.
-
-    Returns:
-        The new sh_dc [N, 3], float32 on the CPU. Everything else of the scene stays as it is.
-    """
-    stylizer = Stylizer(scene, cameras, style, settings, weights=weights, photos=photos)
-    run(stylizer, callbacks)
-    return stylizer.stylized()
+def mean_loss(evaluation: Evaluation) -> float:
+    """E_SOS: the mean of the scales' losses."""
+    return sum(terms.total for terms in evaluation.values()) / len(evaluation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -29,6 +30,8 @@ class Views:
         covered: indices of the views that see anything.
         weighted: weigh statistics by rendered coverage.
         memory: bytes that content features, coverage and colours of views may take.
+        revive: let colours that the clamp holds at 0 come back (`view_colours_gradient`).
+        keep_content: keep content features that fit; False computes them at each visit, for comparison.
     """
 
     def __init__(
@@ -42,6 +45,8 @@ class Views:
         weighted: bool,
         photos: PhotoLoader | None = None,
         memory: int = 1 << 30,
+        keep_content: bool = True,
+        revive: bool = False,
     ) -> None:
         self.scene = scene
         self.cameras = list(cameras)
@@ -51,9 +56,12 @@ class Views:
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
-        self._targets: Shelf[int, ViewTarget] = Shelf(memory - memory // 4, _target_bytes)
+        self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
+        kept = memory // 2 if keep_content else 0
+        self._content: Shelf[tuple[int, int], Tensor] = Shelf(kept, _tensor_bytes)
         self.covered = covered
         self.weighted = weighted
+        self.revive = revive
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -71,7 +79,8 @@ class Views:
 
     def gradient(self, index: int, image_gradient: Tensor, colours: Tensor) -> Tensor:
         """dL/dsh_dc [N, 3] from dL/dimage [H, W, 3] and the colours that were rendered."""
-        return view_colours_gradient(self.rasterizer.colour_gradient(image_gradient, self.cameras[index]), colours)
+        gradient = self.rasterizer.colour_gradient(image_gradient, self.cameras[index])
+        return view_colours_gradient(gradient, colours, revive=self.revive)
 
     def content(self, index: int) -> Tensor:
         """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
@@ -79,18 +88,31 @@ class Views:
             return self._photos(index)
         return self.render(index, self.colours(index, self.scene.sh_dc.to(self.rasterizer.device)))
 
-    def target(self, index: int) -> ViewTarget:
-        """What the view is compared with; kept where memory allows."""
-        return self._targets.get(index, lambda: self._make_target(index))
+    def target(self, index: int, scales: Sequence[int]) -> ViewTarget:
+        """What the view is compared with at some scales; kept where memory allows.
 
-    def _make_target(self, index: int) -> ViewTarget:
-        coverage = self.rasterizer.coverage(self.cameras[index]) if self.weighted else None
-        return self.loss.view_target(self.content(index), coverage)
+        Features are computed only of scales that are asked for: phase 1 needs those of one.
+        """
+        coverage = self._coverage.get(index, lambda: self._position_weights(index)) if self.weighted else None
+        target = ViewTarget(coverage=coverage)
+        if self.loss.content_weight:
+            image = functools.cache(lambda: self.content(index))
+            for scale in scales:
+                target.content[scale] = self._content.get(
+                    (index, scale), functools.partial(self._features, image, scale, coverage)
+                )
+        return target
+
+    def _position_weights(self, index: int) -> list[Tensor]:
+        return self.loss.position_weights(self.rasterizer.coverage(self.cameras[index]))
+
+    def _features(self, image: Callable[[], Tensor], scale: int, coverage: list[Tensor] | None) -> Tensor:
+        return self.loss.content_features(image(), scale, coverage)
 
 
 def _tensor_bytes(tensor: Tensor) -> int:
     return tensor.numel() * tensor.element_size()
 
 
-def _target_bytes(target: ViewTarget) -> int:
-    return sum(_tensor_bytes(t) for t in [*target.content.values(), *(target.coverage or [])])
+def _pyramid_bytes(pyramid: list[Tensor]) -> int:
+    return sum(_tensor_bytes(level) for level in pyramid)

@@ -16,10 +16,11 @@ from sgsst_core.camera import Camera
 from sgsst_core.checkpoint import load_checkpoint, save_checkpoint
 from sgsst_core.constants import ALPHA_MIN, COLOUR_OFFSET, SH_C0, TRANSMITTANCE_MIN
 from sgsst_core.errors import DivergedError
+from sgsst_core.loop import run
 from sgsst_core.scene import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stability.case import Case, CaseResult, compare_losses, texture, vgg16
-from sgsst_core.stylizer import ADAM_EPS, Stylizer, run
+from sgsst_core.stylizer import ADAM_EPS, Stylizer
 from sgsst_core.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.weights import BackboneWeights
 

@@ -70,7 +70,9 @@ def test_stylize_writes_a_scene_that_differs_in_f_dc_only(files: Files, capsys: 
     assert sorted(path.name for path in files.out.parent.iterdir()) == [
         "stylized.before_after.jpg",
         "stylized.loss.png",
+        "stylized.plan.json",
         "stylized.ply",
+        "stylized.report.html",
         "stylized.report.json",
     ]
     colours = {"f_dc_0", "f_dc_1", "f_dc_2"}
@@ -167,6 +169,79 @@ def test_invalid_gaussians_are_dropped_on_demand(files: Files, capsys: pytest.Ca
     assert report["scene"]["dropped"] == 1
 
 
+def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
+    shown = capsys.readouterr().out
+    assert "come down to --target-loss" in shown
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["stopped"] == "target-loss"
+    assert 3 <= len(report["history"]) < 60
+    assert report["bought"]["relative"] <= 0.8
+    assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
+
+
+def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    """With next to no learning rate nothing falls: two windows of 24 steps, and the run ends."""
+    options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9"]
+    assert main(files.stylize(*options)) == 0
+    assert "has stopped falling" in capsys.readouterr().out
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert (report["stopped"], len(report["history"])) == ("converged", 48)
+
+
+def test_held_out_views_approximations_and_findings_are_reported(files: Files) -> None:
+    assert main(files.stylize("--steps-sos", "16", "--kept-weights", "half")) == 0
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    moments = report["held_out"]["moments"]
+    assert [moment["step"] for moment in moments] == [0, 1, 2, 4, 8, 16]
+    assert moments[0]["gram_relative"] == 1
+    assert moments[-1]["gram_relative"] < 1
+    assert moments[0]["consistency"]["short"]["rmse"] >= 0
+    assert report["approximations"]["what"] == ["half-precision blend weights"]
+    assert all(0 < moment["relative_error"] < 0.1 for moment in report["approximations"]["moments"])
+    assert isinstance(report["findings"], list)
+    page = files.out.with_name("stylized.report.html").read_text()
+    assert "half-precision blend weights" in page
+    plan = json.loads(files.out.with_name("stylized.plan.json").read_text())
+    assert plan["decisions"] == report["plan"]["decisions"]
+
+
+def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = files.out.with_name("bench")
+    command = ["bench", "error-time", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24"]
+    assert main([*command, "--variants", "standard,faster"]) == 2
+    assert "no variant faster" in capsys.readouterr().err
+    assert not folder.exists()
+    assert main([*command, "--seconds", "2", "--variants", "standard, coarse-only"]) == 0
+    assert "coarse-only" in capsys.readouterr().out
+    assert {path.name for path in folder.iterdir()} == {
+        "error_time.json",
+        "error_time.png",
+        "standard.ply",
+        "coarse-only.ply",
+    }
+    values = json.loads((folder / "error_time.json").read_text())
+    assert len(values["variants"]["standard"]["points"]) == 6
+    assert len(read_scene(folder / "standard.ply").scene) == len(wall())
+
+
+def test_bench_stability_measures_the_cases_asked_for(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "found.json"
+    assert main(["bench", "stability", "--quick", "--only", "nan in", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    cases = json.loads(out.read_text())["cases"]
+    assert cases
+    assert all("nan in" in case["case"] and case["passed"] for case in cases)
+    assert "Numerical stability" in shown
+    assert main(["bench", "stability", "--only", "no such case"]) == 2
+    assert "no such case" in capsys.readouterr().err
+
+
 def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     files.out.with_name("stylized.report.json").mkdir(parents=True)
     assert main(files.stylize("--steps-sos", "1")) == 1
@@ -195,7 +270,8 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
     assert process.returncode == 130, error
     assert "Traceback" not in error
     checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
-    assert [path.name for path in files.out.parent.iterdir()] == [checkpoint.name]
+    plan = files.out.with_name("stylized.plan.json")
+    assert sorted(path.name for path in files.out.parent.iterdir()) == [checkpoint.name, plan.name]
     assert f"saved in {checkpoint}" in error
     go_on = shlex.split(error.strip().splitlines()[-1])
     assert go_on == ["sgsst", *options, "--resume"]

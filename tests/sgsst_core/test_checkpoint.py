@@ -28,9 +28,13 @@ def state() -> StylizerState:
         seconds=0.1 + 0.2,
         generator=generator.get_state(),
         queue=[4, 0, 2],
-        history=[StepRecord(1, "coarse", 1, 0.1, 3.0, {1: terms[1]}), StepRecord(2, "sos", 3, 0.3, 4.0, terms)],
+        history=[
+            StepRecord(1, "coarse", 1, 0.1, 3.0, {1: terms[1]}, {"render": 0.1}, 10**10),
+            StepRecord(2, "sos", 3, 0.3, 4.0, terms, {"render": 0.2, "loss": 1 / 3}, 10**9),
+        ],
         seconds_by_part={"render": 0.1},
         memory=12345,
+        measured=[{"step": 0, "held_out": None, "approximation": {"cosine": 1 / 3}}],
     )
 
 

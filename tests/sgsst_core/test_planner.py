@@ -8,11 +8,16 @@ from typing import Any
 import pytest
 import torch
 
+from sgsst_core import planner
 from sgsst_core.camera import Camera, resized
+from sgsst_core.errors import SettingsError
+from sgsst_core.loop import run
+from sgsst_core.planner import choose_network
+from sgsst_core.pruning import distinct_views, pruned_image_error
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import Scene
-from sgsst_core.settings import make_settings
-from sgsst_core.stylizer import Stylizer, run
+from sgsst_core.settings import EVERYTHING, Item, make_settings
+from sgsst_core.stylizer import Stylizer
 from sgsst_core.survey import survey
 from sgsst_core.unseen import neighbours_change
 from sgsst_core.weights import BackboneWeights
@@ -46,7 +51,7 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_what_is_left_out_changes_nothing(vgg16_weights: BackboneWeights, name: str) -> None:
     scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
-    lean, full = (make(scene, views, vgg16_weights, keep_everything=keep) for keep in (False, True))
+    lean, full = (make(scene, views, vgg16_weights, keep=keep) for keep in ((), EVERYTHING))
     first = [stylizer.run_step() for stylizer in (lean, full)]
     # The first step's loss comes from equal colours: nothing but rounding may differ.
     assert first[0].loss == pytest.approx(first[1].loss, rel=1e-5)
@@ -57,9 +62,92 @@ def test_what_is_left_out_changes_nothing(vgg16_weights: BackboneWeights, name: 
     assert relative_error(lean.stylized() - scene.sh_dc, full.stylized() - scene.sh_dc) < 0.02
 
 
+@pytest.mark.parametrize("item", EVERYTHING)
+def test_each_item_alone_changes_nothing(vgg16_weights: BackboneWeights, item: Item) -> None:
+    """Enough steps for blend weights to be kept, on a scene in which every item has something to leave out."""
+    scene, views = higher_bands_of_zeros(behind(ball())), cameras(1)
+    lean, other = (make(scene, views, vgg16_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
+    losses = [stylizer.run_step().loss for stylizer in (lean, other)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    gradients = [stylizer.gradient(0, [0])[0] for stylizer in (lean, other)]
+    if item == "unseen":
+        gradients[1] = gradients[1][lean.plan.seen]
+    assert relative_error(gradients[0], gradients[1]) < 1e-4
+    assert lean.plan.kept_weights == "float32"
+    assert (other.plan.kept_weights == "none") == (item == "blend-weights")
+
+
+def test_blend_weights_are_kept_as_memory_and_visits_allow(vgg16_weights: BackboneWeights) -> None:
+    scene, views = wall(), cameras(3)
+    assert make(scene, views, vgg16_weights, steps_sos=14).plan.kept_weights == "none"  # fewer than 5 visits a view
+    lean = make(scene, views, vgg16_weights, steps_sos=30)
+    assert lean.plan.kept_weights == "float32"
+    little = make(scene, views, vgg16_weights, steps_sos=30, memory_limit=400_000)
+    assert little.plan.kept_weights == "half"
+    assert make(scene, views, vgg16_weights, steps_sos=30, kept_weights="none").views.rasterizer.name == "cpu"
+    decision = next(d for d in little.plan.decisions if d.item == "blend weights")
+    assert "half precision" in decision.decision
+    assert "1/4096" in decision.error
+
+
+def test_pruning_stays_within_its_bound_and_is_made_up_for(vgg16_weights: BackboneWeights) -> None:
+    scene, views = behind(ball(600)), cameras(3)
+    whole = make(scene, views, vgg16_weights)
+    threshold = float(whole.plan.survey.total_weights.quantile(0.5))
+    pruned = make(scene, views, vgg16_weights, prune_weight=threshold)
+    left_out = ~pruned.plan.seen
+    assert 0.4 < float(left_out.double().mean()) < 0.6
+    bound = pruned_image_error(left_out, views, [0, 1, 2], make_rasterizer("cpu", scene))
+    for index in range(3):
+        images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (whole, pruned)]
+        reach = float(max(image.max() for image in images))
+        difference = (images[0] - images[1]).abs()
+        assert 0 < float(difference.max()) <= bound.largest * reach
+    run(pruned)
+    assert bool((pruned.stylized()[left_out] != scene.sh_dc[left_out]).any(dim=1).all())
+    assert any(decision.item == "pruned Gaussians" for decision in pruned.plan.decisions)
+
+
+def test_pruning_everything_is_refused(vgg16_weights: BackboneWeights) -> None:
+    with pytest.raises(SettingsError, match="largest total blend weight"):
+        make(wall(), cameras(1), vgg16_weights, prune_weight=1e9)
+
+
+def test_similar_views_are_left_out_only_when_asked(vgg16_weights: BackboneWeights) -> None:
+    scene = wall()
+    views = [camera for camera in cameras(3) for _ in range(2)]  # every view twice
+    assert make(scene, views, vgg16_weights).plan.covered == [0, 1, 2, 3, 4, 5]
+    plan = make(scene, views, vgg16_weights, similar_views=1e-4).plan
+    assert plan.covered == [0, 2, 4]
+    assert any(decision.item == "similar views" for decision in plan.decisions)
+
+
+def test_distinct_views_by_their_shift() -> None:
+    """Views 0.3 apart of a wall at distance 3, focal length of one width: shifted by 0.1 of the width."""
+    scene, views = wall(), cameras(3)
+    turned = [replace(camera, world_to_camera=camera.world_to_camera.clone()) for camera in views]
+    for camera, x in zip(turned, (-0.3, 0.0, 0.3), strict=True):
+        camera.world_to_camera[:] = torch.eye(4)
+        camera.world_to_camera[0, 3] = -x
+    weights = torch.ones(len(scene), dtype=torch.float64)
+    assert distinct_views(scene, turned, [0, 1, 2], weights, 0.09) == [0, 1, 2]
+    assert distinct_views(scene, turned, [0, 1, 2], weights, 0.11) == [0, 2]
+
+
+def test_bfloat16_is_left_out_where_it_is_slower(
+    vgg16_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The two timings are all that is replaced: which of them is shorter depends on the processor."""
+    for slower, dtype in ((torch.bfloat16, torch.float32), (torch.float32, torch.bfloat16)):
+        monkeypatch.setattr(planner, "_convolution_seconds", lambda d, device, s=slower: 2.0 if d == s else 1.0)
+        network, decisions = choose_network(vgg16_weights, make_settings(precision="bfloat16"))
+        assert network.dtype == dtype
+        assert [decision.item for decision in decisions] == ["precision"]
+
+
 def test_rendering_without_unseen_gaussians_is_bitwise_the_same(vgg16_weights: BackboneWeights) -> None:
     scene, views = behind(wall(sh_degree=2), 100), cameras(3)
-    lean, full = (make(scene, views, vgg16_weights, keep_everything=keep) for keep in (False, True))
+    lean, full = (make(scene, views, vgg16_weights, keep=keep) for keep in ((), EVERYTHING))
     assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
     for index in range(3):
         images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (lean, full)]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sgsst_core import Stylizer, make_settings, pyramid, run
+from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.camera import orbit, resized, spread
 from sgsst_core.camera_files import read_cameras
 from sgsst_core.images import load_image
@@ -18,13 +18,14 @@ def cameras_of(folder, scene, count):
 
 
 @pytest.mark.parametrize("name", ["biker", "snowmiku_plush"])
-def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data, vgg16_weights, monkeypatch, name):
-    monkeypatch.setattr(pyramid, "COARSEST_SHORTER_SIDE", 100)  # two scales of small views
+def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data, vgg16_weights, name):
     folder = shared_data / "scenes" / name
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = cameras_of(folder, scene, 12)
     style = load_image(shared_data / "styles" / "starry_night.jpg")
-    settings = make_settings(steps_coarse=10, steps_sos=50, learning_rate=0.2, learning_rate_end=0.05)
+    settings = make_settings(
+        steps_coarse=10, steps_sos=50, learning_rate=0.2, learning_rate_end=0.05, coarsest_side=100
+    )
     chosen = [camera for index, camera in enumerate(cameras) if index % 3 != 1]
     training = Stylizer(scene, chosen, style, settings, weights=vgg16_weights)
     held_out = Stylizer(scene, cameras[1::3], style, settings, weights=vgg16_weights)

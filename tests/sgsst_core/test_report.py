@@ -10,21 +10,22 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import OutputError
+from sgsst_core.loop import run
 from sgsst_core.loss import LossTerms
 from sgsst_core.report import (
     REPORT_VERSION,
     Evaluation,
     Sources,
+    bought,
     build_report,
-    evaluation_views,
     mean_loss,
     running_mean,
     write_contact_sheet,
+    write_json,
     write_loss_curves,
-    write_report,
 )
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizer import StepRecord, Stylizer, run
+from sgsst_core.stylizer import StepRecord, Stylizer
 from sgsst_core.weights import BackboneWeights
 from tests.small_scenes import ball, blind_camera, cameras, style
 
@@ -37,9 +38,9 @@ def finished(vgg16_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Eval
     views = [*cameras(3), blind_camera(), *cameras(2)]
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3)
     stylizer = Stylizer(ball(), views, style(), settings, weights=vgg16_weights)
-    before = stylizer.evaluate(evaluation_views(stylizer))
+    before = stylizer.evaluate(stylizer.evaluation_views)
     run(stylizer)
-    return stylizer, before, stylizer.evaluate(evaluation_views(stylizer))
+    return stylizer, before, stylizer.evaluate(stylizer.evaluation_views)
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +51,12 @@ def sources(vgg16_weights: BackboneWeights) -> Sources:
 def test_evaluation_views_are_spread_over_those_that_see_anything(
     finished: tuple[Stylizer, Evaluation, Evaluation],
 ) -> None:
-    assert evaluation_views(finished[0]) == [0, 1, 4, 5]
+    assert finished[0].evaluation_views == [0, 1, 4, 5]
 
 
 def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
     stylizer, before, after = finished
-    report = build_report(stylizer, style(), sources, "finished", before, after)
+    report = build_report(stylizer, sources, "finished", before, after)
     assert report["version"] == REPORT_VERSION
     assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
     assert report["scene"] == {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2}
@@ -76,7 +77,7 @@ def test_losses_in_the_report_are_those_of_the_steps(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
 ) -> None:
     stylizer, before, after = finished
-    report = build_report(stylizer, style(), sources, "max-seconds", before, after)
+    report = build_report(stylizer, sources, "max-seconds", before, after)
     assert report["stopped"] == "max-seconds"
     assert [entry["step"] for entry in report["history"]] == list(range(1, 8))
     for entry, record in zip(report["history"], stylizer.history, strict=True):
@@ -84,17 +85,53 @@ def test_losses_in_the_report_are_those_of_the_steps(
         assert entry["loss"] == record.loss
         assert terms["total"] == pytest.approx(terms["gram"] + terms["mean"] + terms["std"] + terms["content"])
         assert entry["relative"] == pytest.approx(record.loss / mean_loss(before))
+        assert sum(entry["parts"].values()) == pytest.approx(sum(record.parts.values()), abs=1e-3)
+        assert entry["memory_bytes"] > 50_000_000
     assert report["loss"]["relative"] == pytest.approx(mean_loss(after) / mean_loss(before))
     assert report["loss"]["relative"] < 1
     assert report["loss"]["views"] == ["view_0", "view_1", "view_0", "view_1"]
+
+
+def test_what_the_time_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
+    """Two views a round: the mean of the last two losses counts."""
+    stylizer = finished[0]
+    kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.views.covered
+    losses = [8.0, 8.0, 4.0, 4.0, 0.48, 0.48, 0.48]
+    stylizer.history = [
+        StepRecord(i + 1, "sos", i % 2, 10.0 * (i + 1), loss, {0: LossTerms(gram=loss)}, {}, 0)
+        for i, loss in enumerate(losses)
+    ]
+    stylizer.seconds, stylizer.views.covered = 70.0, [0, 1]
+    try:
+        found = bought(stylizer, {0: LossTerms(gram=8.0)})
+    finally:
+        stylizer.history, stylizer.seconds, stylizer.views.covered = kept, seconds, covered
+    assert found is not None
+    assert found["relative"] == pytest.approx(0.06)
+    assert [(entry["relative"], entry["step"]) for entry in found["reached"]] == [(0.5, 4), (0.2, 5), (0.1, 6)]
+    assert found["last_tenth"] == {"seconds": pytest.approx(7.0), "from": pytest.approx(0.06), "to": found["relative"]}
+
+
+def test_what_no_step_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
+    stylizer = finished[0]
+    kept, stylizer.history = stylizer.history, []
+    try:
+        assert bought(stylizer, {0: LossTerms(gram=8.0)}) is None
+    finally:
+        stylizer.history = kept
+
+
+def test_a_name_that_is_not_unicode_is_json_all_the_same(tmp_path: Path) -> None:
+    write_json(tmp_path / "r.json", {"path": "caf\udce9.ply"})
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8")) == {"path": "caf\udce9.ply"}
 
 
 def test_report_is_plain_json(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, tmp_path: Path
 ) -> None:
     stylizer, before, after = finished
-    report = build_report(stylizer, style(), sources, "finished", before, after)
-    write_report(tmp_path / "r.json", report)
+    report = build_report(stylizer, sources, "finished", before, after)
+    write_json(tmp_path / "r.json", report)
 
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
@@ -109,11 +146,11 @@ def test_coarse_steps_are_relative_to_their_own_scale(
     before = {0: LossTerms(gram=6.0), 1: LossTerms(gram=2.0)}
     kept = stylizer.history
     stylizer.history = [
-        StepRecord(1, "coarse", 0, 0.1, 1.0, {1: LossTerms(gram=1.0)}),
-        StepRecord(2, "sos", 0, 0.2, 1.0, {0: LossTerms(gram=1.0), 1: LossTerms(gram=1.0)}),
+        StepRecord(1, "coarse", 0, 0.1, 1.0, {1: LossTerms(gram=1.0)}, {}, 0),
+        StepRecord(2, "sos", 0, 0.2, 1.0, {0: LossTerms(gram=1.0), 1: LossTerms(gram=1.0)}, {}, 0),
     ]
     try:
-        report = build_report(stylizer, style(), sources, "finished", before, before)
+        report = build_report(stylizer, sources, "finished", before, before)
     finally:
         stylizer.history = kept
     assert [entry["relative"] for entry in report["history"]] == [0.5, 0.25]
@@ -124,7 +161,7 @@ def test_contact_sheet_shows_style_original_and_stylized(
     finished: tuple[Stylizer, Evaluation, Evaluation], tmp_path: Path
 ) -> None:
     stylizer = finished[0]
-    write_contact_sheet(tmp_path / "s.jpg", stylizer, style())
+    write_contact_sheet(tmp_path / "s.jpg", stylizer)
     with Image.open(tmp_path / "s.jpg") as image:
         assert image.format == "JPEG"
         sheet = np.asarray(image, dtype=np.float64) / 255
@@ -159,6 +196,8 @@ def test_curves_of_any_history_are_a_picture(stages: list[str], tmp_path: Path) 
             0.5 * (i + 1),
             10.0 / (i + 1),
             {scale: LossTerms(gram=10.0 / (i + 1)) for scale in ((1,) if stage == "coarse" else (0, 1))},
+            {},
+            0,
         )
         for i, stage in enumerate(stages)
     ]
@@ -170,7 +209,7 @@ def test_curves_of_any_history_are_a_picture(stages: list[str], tmp_path: Path) 
 
 def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
-        write_report(tmp_path / "missing" / "r.json", {})
+        write_json(tmp_path / "missing" / "r.json", {})
     with pytest.raises(OutputError):
         write_loss_curves(tmp_path / "missing" / "c.png", [], 1)
     assert list(tmp_path.iterdir()) == []

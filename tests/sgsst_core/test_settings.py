@@ -13,6 +13,11 @@ def test_paper_is_the_published_schedule() -> None:
     assert settings.content_weight == 1
     assert settings.position_weights == "off"
     assert settings.max_resolution is None
+    assert settings.unseen == "keep"
+    assert not (settings.revive)
+    assert not (settings.early_stop)
+    assert not (settings.warm_start)
+    assert not (settings.prune_weight)
 
 
 def test_single_values_go_on_top_and_none_leaves_the_preset() -> None:

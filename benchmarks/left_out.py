@@ -1,0 +1,112 @@
+"""What leaving out saves, item by item: seconds of an iteration on all scales, and peak memory; and whether the plan
+had foreseen both.
+
+python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 684] [--views 3] [--rounds 3]
+
+CAMERAS is a camera file, or orbit:N. Each configuration runs in a process of its own, so that peaks do not mix: first
+with everything left out that the scene does not need, then with one item kept at a time, then with all of them kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.cameras import read_views
+from benchmarks.machine import write_result
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.images import load_image
+from sgsst_core.ply import read_scene
+from sgsst_core.report import peak_memory
+from sgsst_core.settings import EVERYTHING
+
+
+def main() -> None:
+    """Measure, print and store; or, with --keep, measure one configuration and print it as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE.ply:CAMERAS")
+    parser.add_argument("--style", type=Path, required=True)
+    parser.add_argument("--resolution", type=int, default=684)
+    parser.add_argument("--views", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=3, help="the first one prepares the views and does not count")
+    parser.add_argument("--keep", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.keep is not None:
+        print(json.dumps(_measure(arguments)))
+        return
+    results = {}
+    for text in arguments.scenes:
+        name = text.partition("=")[0]
+        found = {label: _in_a_process(text, kept) for label, kept in _configurations()}
+        results[name] = _savings(found)
+        _print(name, results[name])
+    write_result("left_out", {"style": arguments.style.name, "resolution": arguments.resolution, "scenes": results})
+
+
+def _configurations() -> list[tuple[str, Sequence[str]]]:
+    return [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
+
+
+def _in_a_process(scene: str, kept: Sequence[str]) -> dict[str, Any]:
+    options = [argument for argument in sys.argv[1:] if "=" not in argument or argument.startswith("--")]
+    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", ",".join(kept)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Seconds of an iteration and peak memory with some items kept."""
+    ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
+    scene = read_scene(Path(ply)).scene
+    views = read_views(cameras, scene, arguments.views, arguments.resolution)
+    kept = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
+    settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False, keep=kept)
+    stylizer = Stylizer(scene, views, load_image(arguments.style), settings)
+    for _ in range(arguments.rounds * len(stylizer.views.covered)):
+        stylizer.run_step()
+    steps = [sum(record.parts.values()) for record in stylizer.history[len(stylizer.views.covered) :]]
+    prediction = stylizer.plan.prediction
+    assert prediction is not None
+    return {
+        "seconds": median(steps),
+        "peak_bytes": peak_memory(),
+        "predicted_seconds": prediction.seconds,
+        "predicted_peak_bytes": prediction.peak_bytes,
+        "loss": stylizer.history[0].loss,
+    }
+
+
+def _savings(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    lean = found["lean"]
+    rows = {
+        label: {
+            **values,
+            "seconds_saved": values["seconds"] - lean["seconds"],
+            "bytes_saved": values["peak_bytes"] - lean["peak_bytes"],
+            "loss_change": values["loss"] / lean["loss"] - 1,
+        }
+        for label, values in found.items()
+    }
+    predicted = {
+        "seconds": lean["predicted_seconds"] / lean["seconds"],
+        "peak_bytes": lean["predicted_peak_bytes"] / lean["peak_bytes"],
+    }
+    return {"configurations": rows, "predicted_over_measured": predicted}
+
+
+def _print(name: str, result: dict[str, Any]) -> None:
+    print(f"{name}: predicted / measured {result['predicted_over_measured']}")
+    for label, row in result["configurations"].items():
+        seconds = f"{row['seconds']:.2f} s ({row['seconds_saved']:+.2f})"
+        memory = f"{row['peak_bytes'] / 1e9:.2f} GB ({row['bytes_saved'] / 1e9:+.2f})"
+        print(f"  {label:<16}{seconds:<20}{memory:<20} first loss {row['loss_change']:+.1e}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

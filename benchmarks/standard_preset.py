@@ -1,0 +1,106 @@
+"""The standard preset against the paper's schedule: loss on all views, and processor seconds, of both.
+
+python -m benchmarks.standard_preset SCENE.ply CAMERAS|orbit:N STYLE NAME [--only paper|standard]
+
+The paper's schedule is scaled to `--steps-coarse` and `--steps-sos` steps, at the paper's learning rate. Seconds are
+those of the process on its cores, so that other work on the machine does not count; run it with one thread. With
+`--only`, the other run's figures are taken from the result file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cameras import read_views
+from benchmarks.machine import RESULTS, write_result
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.images import load_image
+from sgsst_core.ply import read_scene, write_stylized
+from sgsst_core.stylizer import mean_loss
+
+#: Shares of each phase after which all views are evaluated.
+MARKS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+PAPER_RATE = 2.5e-3
+
+
+def main() -> None:
+    """Run, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("cameras", help="camera file, or orbit:N")
+    parser.add_argument("style", type=Path)
+    parser.add_argument("name", help="of the result: benchmarks/results/standard_NAME.json")
+    parser.add_argument("--steps-coarse", type=int, default=1000)
+    parser.add_argument("--steps-sos", type=int, default=1000)
+    parser.add_argument("--views", type=int, default=12)
+    parser.add_argument("--resolution", type=int, default=340)
+    parser.add_argument("--coarsest-side", type=int, default=128)
+    parser.add_argument("--only", choices=("paper", "standard"))
+    parser.add_argument("--out", type=Path, help="folder for the stylized scenes")
+    arguments = parser.parse_args()
+    file = read_scene(arguments.scene)
+    cameras = read_views(arguments.cameras, file.scene, arguments.views, arguments.resolution)
+    paper = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "learning_rate": PAPER_RATE}
+    paper |= {"revive": False, "early_stop": False}
+    results: dict[str, Any] = _stored(f"standard_{arguments.name}")
+    for name, values in (("paper", paper), ("standard", {})):
+        if arguments.only in (None, name):
+            settings = make_settings("standard", coarsest_side=arguments.coarsest_side, **values)
+            stylizer = Stylizer(file.scene, cameras, load_image(arguments.style), settings)
+            results[name] = {"settings": settings.model_dump(mode="json"), "points": _run(stylizer)}
+            if arguments.out:
+                arguments.out.mkdir(parents=True, exist_ok=True)
+                write_stylized(file, arguments.out / f"{arguments.name}_{name}.ply", stylizer.stylized())
+    if "paper" in results and "standard" in results:
+        results["verdict"] = _verdict(results)
+        print(results["verdict"])
+    scene = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": len(cameras)}
+    size = {"size": [cameras[0].width, cameras[0].height], "gaussians": len(file.scene)}
+    write_result(f"standard_{arguments.name}", {**scene, **size, **results})
+
+
+def _stored(name: str) -> dict[str, Any]:
+    path = RESULTS / f"{name}.json"
+    values = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return {key: values[key] for key in ("paper", "standard") if key in values}
+
+
+def _run(stylizer: Stylizer) -> list[dict[str, Any]]:
+    """Loss on all views, relative to the start, at the marks of the schedule."""
+    views = stylizer.views.covered
+    start = stylizer.evaluate(views)
+    coarse, sos = stylizer.plan.steps_coarse, stylizer.settings.steps_sos
+    marks = {int(coarse * mark) for mark in MARKS} | {coarse + int(sos * mark) for mark in MARKS}
+    points, seconds = [], 0.0
+    while stylizer.step < stylizer.total:
+        before = time.process_time()
+        stylizer.run_step()
+        seconds += time.process_time() - before
+        if stylizer.step in marks:
+            loss = stylizer.evaluate(views)
+            scales = {str(scale): loss[scale].total / start[scale].total for scale in loss}
+            relative = mean_loss(loss) / mean_loss(start)
+            points.append({"step": stylizer.step, "cpu_seconds": seconds, "relative": relative, "scales": scales})
+            print(points[-1], flush=True)
+    return points
+
+
+def _verdict(results: dict[str, Any]) -> dict[str, Any]:
+    """When the standard preset was as good as the paper's schedule in the end, and what it reached itself."""
+    last = results["paper"]["points"][-1]
+    standard = results["standard"]["points"]
+    reached = next((point for point in standard if point["relative"] <= last["relative"]), None)
+    return {
+        "paper": last["relative"],
+        "standard": standard[-1]["relative"],
+        "seconds_to_the_paper's_loss": reached["cpu_seconds"] / last["cpu_seconds"] if reached else None,
+        "all_seconds": standard[-1]["cpu_seconds"] / last["cpu_seconds"],
+    }
+
+
+if __name__ == "__main__":
+    main()
