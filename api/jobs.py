@@ -20,7 +20,7 @@ from sgsst_core.errors import CameraError, CheckpointError, OutputError, Setting
 from sgsst_core.files import ensure_writable_folder
 from sgsst_core.images import check_photos, load_image, load_photo, save_png
 from sgsst_core.loop import Callbacks, Progress, Stopped, run
-from sgsst_core.measure import Measurements
+from sgsst_core.measure import Measurements, with_measuring
 from sgsst_core.planner import Plan
 from sgsst_core.ply import SceneFile, read_scene, write_stylized
 from sgsst_core.rasterizer import make_rasterizer
@@ -190,6 +190,7 @@ def prepare(request: StylizeRequest) -> Job:
         weights=weights,
         photos=(lambda index: load_photo(photos[index], cameras[index])) if photos else None,
     )
+    stylizer.plan = with_measuring(stylizer.plan)
     source = request.source
     sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, request.images, weights)
     return Job(request, outputs, scene_file, style, sources, stylizer, job_id, state)
@@ -394,8 +395,9 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     weights = load_weights(backbone)
     stylizer = Stylizer(scene, read_cameras_of(source, scene), load_image(style), settings, weights=weights)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(out, plan_json(stylizer.plan))
-    return stylizer.plan
+    plan = with_measuring(stylizer.plan)
+    write_json(out, plan_json(plan))
+    return plan
 
 
 # --- check ---------------------------------------------------------------------------------------------------------
