@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sgsst_core.report_page import write_page
 from torch import Tensor
 
 from sgsst_core.camera import Camera, orbit, resized, spread
@@ -32,6 +31,7 @@ from sgsst_core.report import (
     write_json,
     write_loss_curves,
 )
+from sgsst_core.report_page import write_page
 from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.spherical_harmonics import rest_colours, view_colours

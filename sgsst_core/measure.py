@@ -14,7 +14,6 @@ from sgsst_core.planner import Plan
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.stylizer import Evaluation, Stylizer
 
-
 #: What measuring and the report take beside the iterations: libraries, LPIPS, another set of raster lists (measured on
 #: jobs of 10 to 100 small views).
 MEASURING_BYTES = 400 << 20
