@@ -75,7 +75,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
         if callbacks.progress:
             callbacks.progress(_progress(stylizer, (now - started) / (stylizer.step - before)))
         if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
-            callbacks.checkpoint(stylizer)
+            _checkpoint(stylizer, callbacks.checkpoint)
             last_checkpoint = time.perf_counter()
         if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
             callbacks.preview(stylizer)
@@ -115,8 +115,16 @@ def _progress(stylizer: Stylizer, seconds_per_step: float) -> Progress:
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:
     if callbacks.checkpoint:
-        callbacks.checkpoint(stylizer)
+        _checkpoint(stylizer, callbacks.checkpoint)
     return reason
+
+
+def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
+    """Save, and count the seconds beside those of the steps."""
+    started = time.perf_counter()
+    save(stylizer)
+    parts = stylizer.seconds_by_part
+    parts["checkpoint"] = parts.get("checkpoint", 0.0) + time.perf_counter() - started
 
 
 def stylize(

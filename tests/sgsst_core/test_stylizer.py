@@ -172,8 +172,10 @@ def test_previews_and_checkpoints_come_as_often_as_asked(vgg16_weights: Backbone
         preview=lambda s: shown.append(s.step),
         preview_seconds=1e6,
     )
-    run(make(vgg16_weights, scene, steps_sos=3), callbacks)
+    stylizer = make(vgg16_weights, scene, steps_sos=3)
+    run(stylizer, callbacks)
     assert saved == [1, 2, 3]
+    assert stylizer.seconds_by_part["checkpoint"] > 0
     assert shown == []
 
 
