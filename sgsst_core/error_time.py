@@ -2,22 +2,22 @@
 
 Every variant gets the same seconds of optimisation. At the same moments its colours are evaluated on all views by the
 float32 loss of all scales (`exact.ExactTwin`); evaluation does not count. Nor does preparing the views, once for each,
-which in a short budget would hide the rest; its seconds are stated. What lies on the Pareto front reaches its error
-sooner than anything else does.
+which in a short budget would hide the rest; its seconds are stated. All variants are in memory at once. What lies on
+the Pareto front reaches its error sooner than anything else does.
 """
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from sgsst_core.budget import default_memory_limit
 from sgsst_core.camera import Camera
 from sgsst_core.errors import SettingsError
 from sgsst_core.exact import ExactTwin
@@ -27,8 +27,11 @@ from sgsst_core.settings import Settings, make_settings
 from sgsst_core.stylizer import Phase, Stylizer, mean_loss
 from sgsst_core.weights import BackboneWeights
 
-#: Evaluations of a variant: after these shares of the budget.
-MOMENTS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+#: The budget is cut into so many slices, and the variants take turns: where the machine is slower for a while, it is
+#: slower for all of them.
+SLICES = 32
+#: Slices after which the variants are evaluated.
+MOMENTS = (1, 2, 4, 8, 16, 32)
 #: Share of the time that phase 1 gets where a variant has one: about as much as in the standard preset.
 PHASE_1 = 0.15
 #: Of the variant with pruning: Gaussians that all views together show in less than a pixel.
@@ -165,29 +168,43 @@ def error_time(
         settings: for all variants, on top of the standard preset.
     """
     base = make_settings("standard", **settings)
+    share = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
+    base = base.model_copy(update={"memory_limit": share})
     exact = ExactTwin(Stylizer(scene, cameras, style, base, weights=weights))
     views = exact.views.covered
     start = exact.evaluate(views, scene.sh_dc)
-    curves = []
-    for variant in variants:
-        chosen = base.model_copy(update=variant.settings)
-        stylizer = _TimedStylizer(scene, cameras, style, chosen, weights=weights)
-        stylizer.budget = seconds
-        stylizer.shares = variant.shares(max(stylizer.scale_count(index) for index in views))
-        reason = _reason_to_leave_out(chosen, stylizer)
-        preparation = 0.0 if reason else _prepare(stylizer)
-        points: list[Point] = []
-        for moment in () if reason else MOMENTS:
-            while stylizer.seconds < moment * seconds:
+    running = [_begin(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
+    for part in range(1, SLICES + 1):
+        for curve, stylizer in running:
+            if stylizer is None:
+                continue
+            while stylizer.seconds < part / SLICES * seconds:
                 stylizer.run_step()
-            loss = exact.evaluate(views, stylizer.stylized())
-            by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
-            points.append(Point(stylizer.seconds, stylizer.step, mean_loss(loss) / mean_loss(start), by_scale))
-            progress(variant, points[-1])
-        curves.append(Curve(variant, points, preparation, reason, None if reason else stylizer.stylized()))
-        del stylizer
-        gc.collect()  # a variant's kept weights must not stand in the next one's way
-    return curves
+            if part in MOMENTS:
+                loss = exact.evaluate(views, stylizer.stylized())
+                by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
+                relative = mean_loss(loss) / mean_loss(start)
+                curve.points.append(Point(stylizer.seconds, stylizer.step, relative, by_scale))
+                progress(curve.variant, curve.points[-1])
+    return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
+
+
+def _begin(
+    variant: Variant,
+    seconds: float,
+    inputs: tuple[Scene, Sequence[Camera], Tensor],
+    base: Settings,
+    weights: BackboneWeights | None,
+) -> tuple[Curve, _TimedStylizer | None]:
+    """A variant that is ready to run, or the reason why it is left out."""
+    settings = base.model_copy(update=variant.settings)
+    stylizer = _TimedStylizer(*inputs, settings, weights=weights)
+    reason = _reason_to_leave_out(settings, stylizer)
+    if reason:
+        return Curve(variant, [], left_out=reason), None
+    stylizer.budget = seconds
+    stylizer.shares = variant.shares(max(stylizer.scale_count(index) for index in stylizer.views.covered))
+    return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
 
 
 def _prepare(stylizer: _TimedStylizer) -> float:
