@@ -14,11 +14,12 @@ import pytest
 from PIL import Image
 
 from sgsst_core.errors import OutputError
+from sgsst_core.loop import run
 from sgsst_core.report import Sources, build_report, running_mean
 from sgsst_core.report_figures import PLACES, draw_figures, thinned
 from sgsst_core.report_page import render_page, write_page
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizer import Stylizer, run
+from sgsst_core.stylizer import Stylizer
 from sgsst_core.weights import BackboneWeights
 from tests.small_scenes import ball, cameras, style
 
