@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.table import Table
+from rich.table import Column, Table
 
 from api.jobs import SceneRequest, check_choice, check_folder, read_cameras_of
 from sgsst_core.error_time import Curve, Point, Variant, as_dict, choose_variants, error_time, write_plot
@@ -90,10 +90,15 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
     moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
-    table = Table("variant", *moments, *(f"scale {scale}" for scale in scales), "steps", title="loss that is left")
+    table = Table(
+        Column("variant", no_wrap=True),
+        *moments,
+        *(f"scale {scale}" for scale in scales),
+        "steps",
+        title="loss that is left",
+    )
     for curve in curves:
         if not curve.points:
-            table.add_row(curve.variant.name, f"left out: {curve.left_out}")
             continue
         losses = [f"{point.relative:.3f}" for point in curve.points]
         ends = [f"{curve.points[-1].by_scale[scale]:.3f}" for scale in scales]

@@ -39,6 +39,8 @@ BAD_INPUT, FAILURE = 2, 1
 MAX_RESOLUTION = 16384
 #: Where the progress bar cannot be drawn (a log file), a line is printed instead, this often.
 LOG_SECONDS = 60.0
+#: Characters of tables that would be cut in a narrower terminal.
+TABLE_WIDTH = 180
 #: The demo's resolution and steps, and seconds after which it stops on a slow machine: less than five minutes with all
 #: that is around.
 DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
@@ -429,7 +431,10 @@ def bench_error_time(
     names = [name.strip() for name in variants.split(",") if name.strip()]
     request = ErrorTimeRequest(source, style, out, names, seconds, backbone, settings)
     curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
-    out_console.print(error_time_table(curves))
+    Console(width=TABLE_WIDTH).print(error_time_table(curves))
+    for curve in curves:
+        if curve.left_out:
+            out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
     out_console.print(f"{'results:':<22}{out}")
 
 
@@ -443,7 +448,7 @@ def bench_stability(
     from api.bench import run_stability, stability_table
 
     found = run_stability(only, quick, out, lambda case: error_console.print(f"{case.group}: {case.name}"))
-    Console(width=180).print(stability_table(found))
+    Console(width=TABLE_WIDTH).print(stability_table(found))
     if not all(measured.result.passed for _, measured in found):
         raise typer.Exit(FAILURE)
 

@@ -60,3 +60,7 @@ FRUSTUM_MARGIN = 0.3
 
 #: Edge of a raster tile in pixels. 16 neighbouring pixels of a row fill one 512-bit or two 256-bit vectors.
 RASTER_TILE = 16
+
+#: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST). Where full views are no
+#: larger than that, a smaller bound gives them several scales too.
+COARSEST_SHORTER_SIDE = 511

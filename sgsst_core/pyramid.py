@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-#: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST). Where full views are no
-#: larger than that, a smaller bound gives them several scales too.
-COARSEST_SHORTER_SIDE = 511
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
+
 #: A style image is downscaled only where it is larger than the view by more than this factor.
 STYLE_SIZE_TOLERANCE = 1.1
 

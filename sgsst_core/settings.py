@@ -6,9 +6,8 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from sgsst_core.constants import NEAR
+from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
-from sgsst_core.pyramid import COARSEST_SHORTER_SIDE
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "bfloat16"]

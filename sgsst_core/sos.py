@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.loss import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
 from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, covered_region, partition
 from sgsst_core.pyramid import (
-    COARSEST_SHORTER_SIDE,
     add_upscaled_,
     coverage_pyramid,
     downscale,

@@ -6,8 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.loss import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
-from sgsst_core.pyramid import COARSEST_SHORTER_SIDE, scale_count
+from sgsst_core.pyramid import scale_count
 from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
 from sgsst_core.weights import BackboneWeights
 

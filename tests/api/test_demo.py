@@ -26,7 +26,9 @@ def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
     assert cli.main(["demo", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     names = {"stylized.ply", "stylized.report.json", "stylized.before_after.jpg", "stylized.loss.png"}
-    assert {path.name for path in out.iterdir()} == names | {"motorcycle.ply", "cameras.json", "style.png"}
+    names |= {"stylized.report.html"}
+    inputs = {"motorcycle.ply", "cameras.json", "style.png"}
+    assert {path.name for path in out.iterdir()} == names | inputs | {"stylized.plan.json"}
     for name in names:
         assert str(out / name) in shown
     before, after = read_scene(out / "motorcycle.ply").scene, read_scene(out / "stylized.ply").scene

@@ -41,16 +41,17 @@ def evaluate(network, case, tile_size, **options):
         ((200, 333), [128], False),
     ],
 )
-def test_float64_agrees_with_untiled_autograd(vgg16_weights, monkeypatch, size, tile_sizes, covered):
-    # several scales of small views: float64 convolutions are slow
-    monkeypatch.setattr(pyramid, "COARSEST_SHORTER_SIDE", 100)
+def test_float64_agrees_with_untiled_autograd(vgg16_weights, size, tile_sizes, covered):
+    coarsest = 100  # several scales of small views: float64 convolutions are slow
     case = setting(size, covered=covered)
     image, style, content, coverage = case
-    expected, expected_gradient = sos_reference(vgg16_weights, image, style, content, coverage=coverage)
+    expected, expected_gradient = sos_reference(
+        vgg16_weights, image, style, content, coverage=coverage, coarsest=coarsest
+    )
     network = FeatureNetwork(vgg16_weights, dtype=torch.float64)
     for tile_size in tile_sizes:
-        result = evaluate(network, case, tile_size)
-        assert len(result.terms) == pyramid.scale_count(*size)
+        result = evaluate(network, case, tile_size, coarsest=coarsest)
+        assert len(result.terms) == pyramid.scale_count(*size, coarsest)
         assert result.loss == pytest.approx(expected, rel=FLOAT64_TOLERANCE)
         assert relative_error(result.image_gradient, expected_gradient) < FLOAT64_TOLERANCE
 
