@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable
 from typing import Generic, TypeVar
 
 import psutil
+import torch
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -14,12 +15,17 @@ V = TypeVar("V")
 #: other programs. The first rules as long as half of the memory is free, so that the same job on the same machine makes
 #: the same plan, and rounds the same, whatever else happens to run.
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
+#: Of all memory of a GPU, which a job has to itself.
+GPU_SHARE = 0.7
 #: Of the memory limit: activations of one iteration, view targets and colours, and the rasterizer's lists or weights.
 MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 
 
-def default_memory_limit() -> int:
-    """Bytes that a job may plan with on this machine, now."""
+def default_memory_limit(device: torch.device | None = None) -> int:
+    """Bytes that a job may plan with on this machine, now; those of a GPU where it computes on one."""
+    if device is not None and device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        return int(min(total * GPU_SHARE, free * FREE_SHARE))
     memory = psutil.virtual_memory()
     return int(min(memory.total * TOTAL_SHARE, memory.available * FREE_SHARE))
 
@@ -30,19 +36,26 @@ class Shelf(Generic[K, V]):
     Nothing is ever evicted: views come round in turn, and evicting one would only trade it for another.
     """
 
-    def __init__(self, capacity: int, size: Callable[[V], int]) -> None:
+    def __init__(self, capacity: int, size: Callable[[V], int] | None = None) -> None:
         self.used = 0
         self._capacity = capacity
         self._size = size
         self._kept: dict[K, V] = {}
 
-    def get(self, key: K, make: Callable[[], V]) -> V:
-        """The value of a key: kept, or made and kept if it fits."""
+    def get(self, key: K, make: Callable[[], V], size: int | None = None) -> V:
+        """The value of a key: kept, or made and kept if it fits. `size` takes the place of the shelf's own."""
         if key in self._kept:
             return self._kept[key]
         value = make()
-        size = self._size(value)
+        if size is None:
+            assert self._size is not None
+            size = self._size(value)
         if self.used + size <= self._capacity:
             self._kept[key] = value
             self.used += size
         return value
+
+    def clear(self) -> None:
+        """Keep nothing of what is there."""
+        self._kept.clear()
+        self.used = 0

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.camera import Camera
-from sgsst_core.partition import Rectangle
+from sgsst_core.division import Piece
+from sgsst_core.partition import Rectangle, covered_region
 from sgsst_core.pyramid import downscale
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -46,6 +47,21 @@ def probe(loss: SosLoss, side: int) -> Rate:
             torch.cuda.synchronize()
         seconds.append(time.perf_counter() - started)
     return Rate(forward=seconds[2] / side**2, both=seconds[1] / side**2)
+
+
+def pieces_of(camera: Camera, loss: SosLoss, region: Rectangle | None, *, coarsest: bool = False) -> tuple[Piece, ...]:
+    """What of a view goes through the network: one piece for each scale, or for the coarsest alone.
+
+    Args:
+        region: that holds every covered pixel; None where uncovered pixels go through too.
+    """
+    count = loss.scale_count(camera.height, camera.width)
+    pieces = []
+    for scale in range(count - 1 if coarsest else 0, count):
+        size = (camera.height >> scale, camera.width >> scale)
+        part = Rectangle(0, 0, *size) if region is None else covered_region(_scaled(region, scale, size))
+        pieces.append(Piece(scale, size, part))
+    return tuple(pieces)
 
 
 @dataclass(frozen=True)

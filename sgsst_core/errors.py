@@ -68,6 +68,12 @@ class TooManyIntersectionsError(SgsstError):
     code = "too-many-intersections"
 
 
+class RanksDriftedError(SgsstError):
+    """Ranks that must have the same colours have not: a machine computes wrongly, or not like the others."""
+
+    code = "ranks-drifted"
+
+
 class DivergedError(SgsstError):
     """Colours or gradients have left the range in which the optimiser works."""
 

@@ -1,6 +1,7 @@
 """The optimiser loop: all steps of a job, and when it ends before them.
 
-The loop prints nothing and writes nothing; what is to be shown or saved goes through `Callbacks`.
+The loop prints nothing and writes nothing; what is to be shown or saved goes through `Callbacks`. Of several ranks,
+each runs it; the first one decides when it ends.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ class Progress:
 class Callbacks:
     """What the loop calls between iterations; each is optional.
 
+    `measure` and `moments` are the same on every rank; the others are the first rank's alone.
+
     Attributes:
         progress: after every iteration.
         stop: asked before every iteration; True ends the loop as "interrupted".
@@ -65,9 +68,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     last_checkpoint = last_preview = started
     _measure(stylizer, callbacks)
     while stylizer.step < stylizer.total:
-        if callbacks.stop and callbacks.stop():
-            return _end_early(stylizer, callbacks, "interrupted")
-        reason = _reason_to_end(stylizer)
+        reason = stylizer.collectives.from_first(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
             return _end_early(stylizer, callbacks, reason)
         stylizer.run_step()
@@ -84,11 +85,17 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     return "finished"
 
 
-def _reason_to_end(stylizer: Stylizer) -> Stopped | None:
-    """Which of the settings ends the run before the next step."""
+def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
+    """Whether the user or the clock ends the run before the next step; ranks may see these differently."""
+    if callbacks.stop and callbacks.stop():
+        return "interrupted"
+    seconds = stylizer.settings.max_seconds
+    return "max-seconds" if seconds and stylizer.seconds >= seconds else None
+
+
+def _enough(stylizer: Stylizer) -> Stopped | None:
+    """Whether the losses end the run before the next step; they are the same on every rank."""
     settings = stylizer.settings
-    if settings.max_seconds and stylizer.seconds >= settings.max_seconds:
-        return "max-seconds"
     if not (settings.target_loss or settings.early_stop):
         return None
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]

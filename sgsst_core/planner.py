@@ -6,8 +6,9 @@ and predicts seconds an iteration and peak memory. `Stylizer` follows it; the re
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -17,16 +18,19 @@ from torch import Tensor
 
 from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.camera import Camera
+from sgsst_core.collectives import ALONE, Collectives
 from sgsst_core.convergence import LEAST_FALL, window_length
-from sgsst_core.cost import RasterCost, Rate, Work, content_bytes, image_bytes, probe, raster_cost
+from sgsst_core.cost import RasterCost, Rate, Work, content_bytes, image_bytes, pieces_of, probe, raster_cost
+from sgsst_core.division import divide, loads
 from sgsst_core.errors import SettingsError
 from sgsst_core.pruning import distinct_views, pruned_image_error
 from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scaling import IterationWork, Link, RanksChoice, choose_ranks, probe_link
 from sgsst_core.scene import Scene
 from sgsst_core.settings import KeptWeights, Settings
 from sgsst_core.sos import SosLoss
 from sgsst_core.survey import Survey, survey
-from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.vgg import ALIGNMENT, CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.weights import BackboneWeights
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
@@ -36,6 +40,8 @@ PROBE_SIDE = 384
 #: Building a view's kept weights costs about three renders with gradient, and each use of them saves two thirds of one:
 #: with fewer visits they do not pay.
 LEAST_VISITS = 5
+#: Views on which the model of several ranks is evaluated; the others are taken to be like them.
+SAMPLED_VIEWS = 3
 #: Bytes an optimised Gaussian costs beside the scene: colours, gradient and two moments, float32.
 OPTIMISER_BYTES = 4 * 3 * 4
 
@@ -68,12 +74,16 @@ class Prediction:
     Attributes:
         seconds: of an SOS iteration.
         seconds_coarse: of an iteration of phase 1.
-        peak_bytes: of physical memory, at any time.
+        peak_bytes: of physical memory of a rank, at any time.
+        communication: seconds of an SOS iteration in which a rank waits for what others send.
+        speed_up: of the whole schedule over one rank.
     """
 
     seconds: float
     seconds_coarse: float
     peak_bytes: int
+    communication: float = 0.0
+    speed_up: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,7 @@ class Plan:
         steps_coarse: of phase 1; 0 where it is left out.
         kept_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
+        ranks: how many take part.
         decisions: for people.
         prediction: for comparison with what happens.
     """
@@ -101,6 +112,7 @@ class Plan:
     steps_coarse: int
     kept_weights: KeptWeights = "none"
     coarse_weights: bool = False
+    ranks: int = 1
     decisions: list[Decision] = field(default_factory=list)
     prediction: Prediction | None = None
 
@@ -113,21 +125,46 @@ class Plan:
 
 
 def make_plan(
-    scene: Scene, cameras: Sequence[Camera], settings: Settings, loss: SosLoss, rasterizer: Rasterizer, memory: int
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: Settings,
+    loss: SosLoss,
+    rasterizer: Rasterizer,
+    memory: int,
+    collectives: Collectives = ALONE,
 ) -> Plan:
-    """Survey the views, time network and rasterizer, decide.
+    """Survey the views, time network, rasterizer and what connects the ranks, decide. Every rank gets the same plan.
 
     Args:
         cameras: at the size at which they are stylized.
-        loss: the job's loss, whose network and memory budget are used.
+        loss: of one rank, whose network and memory budget are used.
         rasterizer: of the whole scene.
-        memory: bytes that the job may plan with.
+        memory: bytes that this rank may plan with.
+        collectives: of all ranks that there are.
 
     Raises:
         CameraError: no camera sees a Gaussian.
         SettingsError: pruning would leave no Gaussian.
     """
-    looked = survey(scene, cameras, rasterizer)
+    looked = survey(scene, cameras, rasterizer, collectives)
+    link = probe_link(collectives, rasterizer.device)
+    # Timings differ from rank to rank: one decides for all.
+    return collectives.from_first(
+        lambda: _decide(scene, cameras, settings, loss, rasterizer, memory, looked, link, collectives.size)
+    )
+
+
+def _decide(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: Settings,
+    loss: SosLoss,
+    rasterizer: Rasterizer,
+    memory: int,
+    looked: Survey,
+    link: Link,
+    available: int,
+) -> Plan:
     plan = _choose(scene, cameras, settings, loss, looked)
     leave_out = plan.weighted and "uncovered" not in settings.keep
     work = Work.of(cameras, loss, looked, plan.covered, leave_out=leave_out)
@@ -144,12 +181,88 @@ def make_plan(
     seconds = raster.kept_seconds if plan.kept_weights != "none" and raster.kept_seconds else raster.seconds
     kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[plan.kept_weights]
     content = 0 if "content" in settings.keep else content_bytes(cameras, plan.covered, settings, loss)
-    peak = psutil.Process().memory_info().rss + work.peak_bytes(loss) + min(kept, budget) + image_bytes(cameras)
-    peak += min(content, int(memory * MEMORY_SHARES["views"]) // 2)
-    return replace(plan, prediction=Prediction(work.seconds(rate) + seconds, coarse.seconds(rate) + seconds, int(peak)))
+    peak = psutil.Process().memory_info().rss + image_bytes(cameras)
+    peak += min(content // available, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // available, budget)
+    if available == 1:
+        peak += work.peak_bytes(loss)
+        expected = Prediction(work.seconds(rate) + seconds, coarse.seconds(rate) + seconds, int(peak))
+        return replace(plan, prediction=expected)
+    samples = _samples(plan, cameras, loss, rate, seconds, leave_out=leave_out)
+    return _share_out(plan, settings, loss, samples, link, available, int(peak))
 
 
-def choose_network(weights: BackboneWeights, settings: Settings) -> tuple[FeatureNetwork, list[Decision]]:
+def _samples(
+    plan: Plan, cameras: Sequence[Camera], loss: SosLoss, rate: Rate, raster: float, *, leave_out: bool
+) -> tuple[list[IterationWork], list[IterationWork]]:
+    """Iterations of some views, for the model of several ranks: of phase 1, and on all scales."""
+    fixed = probe(loss, ALIGNMENT).both * ALIGNMENT**2  # as good as no pixel: what it takes is the same for any number
+    views = plan.covered[:: max(1, len(plan.covered) // SAMPLED_VIEWS)]
+    gaussians = int(plan.seen.sum())
+
+    def of(index: int, coarsest: bool) -> IterationWork:
+        region = plan.survey.regions[index] if leave_out else None
+        pieces = pieces_of(cameras[index], loss, region, coarsest=coarsest)
+        return IterationWork(
+            pieces,
+            loss.network.halo,
+            rate.both,
+            raster,
+            fixed * len(pieces),
+            gaussians,
+            whole_image=not (coarsest and plan.coarse_weights),
+        )
+
+    return [of(index, True) for index in views], [of(index, False) for index in views]
+
+
+def _share_out(
+    plan: Plan,
+    settings: Settings,
+    loss: SosLoss,
+    samples: tuple[list[IterationWork], list[IterationWork]],
+    link: Link,
+    available: int,
+    peak: int,
+) -> Plan:
+    """How many of the ranks take part, and what is expected of them."""
+    phases = list(zip((plan.steps_coarse, settings.steps_sos), samples, strict=True))
+    choice = choose_ranks(phases, settings.views_per_step, available, link)
+    ranks = available if "ranks" in settings.keep else choice.ranks
+    choice = replace(choice, ranks=ranks)
+    # Ranks that form groups take a view each, at the same time.
+    groups = math.gcd(settings.views_per_step, ranks)
+    each, turns = ranks // groups, settings.views_per_step // groups
+
+    def mean(values: Iterable[float]) -> float:
+        found = list(values)
+        return turns * sum(found) / len(found)
+
+    largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in samples[1])
+    held = loss.network.held_bytes_per_pixel() + loss.network.working_bytes_per_pixel()
+    expected = Prediction(
+        mean(work.seconds(each, link) for work in samples[1]),
+        mean(work.seconds(each, link) for work in samples[0]),
+        peak + int(min(largest * held, loss.memory)),
+        mean(work.communication(each, link) for work in samples[1]),
+        choice.speed_up,
+    )
+    decisions = [*plan.decisions, _ranks_decision(choice, available, link, expected)]
+    return replace(plan, ranks=ranks, decisions=decisions, prediction=expected)
+
+
+def _ranks_decision(choice: RanksChoice, available: int, link: Link, expected: Prediction) -> Decision:
+    speed = f"{choice.speed_up:.2f} times as fast as one"
+    measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
+    if choice.ranks == available:
+        return Decision("ranks", f"all {available} take part, {speed}", measured)
+    other = choice.seconds[1] / choice.seconds[available]
+    reason = f"all of them would be {other:.2f} times as fast: the rest would only add communication; {measured}"
+    return Decision("ranks", f"{choice.ranks} of {available} take part, {speed}", reason)
+
+
+def choose_network(
+    weights: BackboneWeights, settings: Settings, collectives: Collectives = ALONE
+) -> tuple[FeatureNetwork, list[Decision]]:
     """The feature network: layers up to the deepest one used, in the precision that was asked for if that pays.
 
     Processors without bfloat16 instructions compute it hundreds of times slower than float32, so both are timed.
@@ -158,7 +271,9 @@ def choose_network(weights: BackboneWeights, settings: Settings) -> tuple[Featur
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if settings.precision == "float32":
         return FeatureNetwork(weights, layers, torch.float32, device), []
-    ratio = _convolution_seconds(torch.float32, device) / _convolution_seconds(torch.bfloat16, device)
+    ratio = collectives.from_first(
+        lambda: _convolution_seconds(torch.float32, device) / _convolution_seconds(torch.bfloat16, device)
+    )
     if ratio > 1:
         error = "about 20 % of the gradient's norm; measured during the run"
         made = Decision("precision", "features in bfloat16", f"asked for, {ratio:.1f} times faster here", error=error)
@@ -209,7 +324,7 @@ def _choose(scene: Scene, cameras: Sequence[Camera], settings: Settings, loss: S
 def _choose_kept_weights(plan: Plan, settings: Settings, raster: RasterCost, budget: int) -> Plan:
     """How blend weights are kept: exactly where they fit, in half precision where only that fits, and where it pays."""
     form = settings.kept_weights
-    visits = (plan.steps_coarse + settings.steps_sos) / len(plan.covered)
+    visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
     if "blend-weights" in settings.keep or (form == "auto" and visits < LEAST_VISITS):
         form = "none"
     elif form == "auto":
@@ -335,7 +450,7 @@ def _weights_decision(plan: Plan, settings: Settings, raster: RasterCost, budget
     room = f"{budget / 1e9:.1f} GB are there for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
     if plan.kept_weights == "none":
-        visits = (plan.steps_coarse + settings.steps_sos) / len(plan.covered)
+        visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
         reason = (
             "asked for" if "none" in (settings.kept_weights, *settings.keep) else f"a view comes {visits:.1f} times"
         )

@@ -306,8 +306,10 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     with torch.no_grad():
         for index in stylizer.evaluation_views:
             dcs = (views.scene.sh_dc.to(device), stylizer.sh_dc.detach())
-            renders = [_picture(views.render(index, views.colours(index, dc))) for dc in dcs]
-            pairs.append((views.cameras[index], renders))
+            # The rasterizer's own render: one rank writes the sheet, and the others take no part in it.
+            camera = views.cameras[index]
+            renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]
+            pairs.append((camera, renders))
     sheet = _sheet(_picture(stylizer.style), pairs)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)

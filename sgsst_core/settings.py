@@ -14,7 +14,7 @@ Precision = Literal["float32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 #: What can be left out without changing the result, for `Settings.keep`.
-Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights"]
+Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
 
 
@@ -47,6 +47,9 @@ class Settings(BaseModel):
         similar_views: leave out views whose picture differs from that of a kept view by a shift of less than this share
             of the longer side; 0 leaves out none.
         kept_weights: how blend weights are kept between iterations; "auto" lets the memory decide.
+        views_per_step: views of each step, whose gradients are averaged; ranks that form groups take them side by side.
+        rebalance: share the work out anew, once, when ranks turn out to differ in speed. Without it a run on the same
+            number of ranks can be repeated bit for bit even then.
         keep: items that are not left out although the scene does not need them; for comparison, the result is the same.
     """
 
@@ -75,6 +78,8 @@ class Settings(BaseModel):
     prune_weight: float = Field(0.0, ge=0, allow_inf_nan=False)
     similar_views: float = Field(0.0, ge=0, lt=1)
     kept_weights: KeptWeights = "auto"
+    views_per_step: int = Field(1, ge=1, le=10_000)
+    rebalance: bool = True
     keep: tuple[Item, ...] = ()
 
     def learning_rate_at(self, share: float) -> float:

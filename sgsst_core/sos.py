@@ -2,18 +2,20 @@
 
 Each scale goes through the network in partition tiles, in two passes: statistics of the whole scale first, then
 back-propagation of the loss that they give. Activations of the first pass are kept as far as the memory budget
-reaches; only tiles beyond it are computed twice.
+reaches; only tiles beyond it are computed twice. Of several ranks, each has its share of the tiles (`division`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from sgsst_core.collectives import ALONE, Collectives, Merged
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
+from sgsst_core.division import Piece, Size, divide, rounds
 from sgsst_core.loss import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
 from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, covered_region, partition
 from sgsst_core.pyramid import (
@@ -38,7 +40,8 @@ class SosResult:
 
     Attributes:
         terms: the split loss of each scale that was evaluated.
-        image_gradient: dE/dimage [H, W, 3]; None if only the loss was asked for.
+        image_gradient: dE/dimage [H, W, 3], of which every rank has a part: they add up to the whole. None if only the
+            loss was asked for.
     """
 
     terms: dict[int, LossTerms]
@@ -50,19 +53,42 @@ class SosResult:
         return sum(terms.total for terms in self.terms.values()) / len(self.terms)
 
 
+@dataclass(frozen=True)
+class Share:
+    """How some scales of a view are shared out.
+
+    Attributes:
+        pieces: scale to every rank's pieces of it; the same on every rank.
+        tiles: scale to the partition tiles of this rank.
+    """
+
+    pieces: dict[int, tuple[tuple[Piece, ...], ...]]
+    tiles: dict[int, list[PartitionTile]]
+
+    def cost(self, rank: int, halo: int) -> int:
+        """Pixels through the network on a rank."""
+        return sum(piece.cost(halo) for every in self.pieces.values() for piece in every[rank])
+
+
+#: Content features [h, w, 512] of the cells that each of this rank's partition tiles owns.
+ContentFeatures = dict[PartitionTile, Tensor]
+
+
 @dataclass
 class ViewTarget:
     """What a view is compared with, apart from the style.
 
     Attributes:
-        content: scale to content features [h/8, w/8, 512], as far as they are kept.
+        content: scale to content features, as far as they are kept.
         content_image: [H, W, 3], from which they can be computed again.
         coverage: position weights at powers of two, [H >> k, W >> k] each; None for equal weights.
+        share: for which the content was prepared; None for one rank, whose share is always everything.
     """
 
     content_image: Tensor | None = None
-    content: dict[int, Tensor] = field(default_factory=dict)
+    content: dict[int, ContentFeatures] = field(default_factory=dict)
     coverage: list[Tensor] | None = None
+    share: Share | None = None
 
 
 class SosLoss:
@@ -76,7 +102,11 @@ class SosLoss:
         coarsest: pixels of the coarsest scale's shorter side at most.
         leave_out: pixels without weight do not go through the network; False for comparison.
         keep_activations: as many as fit between the two passes; False computes each tile twice, for comparison.
-        timer: receives the seconds of `vgg_forward`, `vgg_backward` and `statistics`.
+        timer: receives the seconds of `vgg_forward`, `vgg_backward`, `statistics` and `communication`.
+        collectives: of the ranks that evaluate each view together; all call the same methods with the same arguments.
+
+    Attributes:
+        speeds: of these ranks, in any unit: work is shared out in proportion.
     """
 
     def __init__(
@@ -90,6 +120,7 @@ class SosLoss:
         leave_out: bool = True,
         keep_activations: bool = True,
         timer: Timer | None = None,
+        collectives: Collectives = ALONE,
     ) -> None:
         self.network = network
         self.content_weight = content_weight
@@ -99,6 +130,8 @@ class SosLoss:
         self.leave_out = leave_out
         self.keep_activations = keep_activations
         self.timer = timer or Timer()
+        self.collectives = collectives
+        self.speeds = (1.0,) * collectives.size
         self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
 
     def scale_count(self, height: int, width: int) -> int:
@@ -107,59 +140,101 @@ class SosLoss:
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
         """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
-        if not self.leave_out:
-            coverage = None
-        region = None if coverage is None else covered_region(coverage)
+        return self._partition(self._piece(0, (height, width), coverage), coverage)
+
+    def share(self, sizes: Mapping[int, Size], coverage: Sequence[Tensor] | None = None) -> Share:
+        """Share out the work on some scales of a view.
+
+        Args:
+            sizes: (height, width) of each scale.
+            coverage: from `position_weights`.
+        """
+        weights = {scale: coverage[scale] if coverage else None for scale in sizes}
+        pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
+        shares = divide(pieces, self.network.halo, self.speeds)
+        own = shares[self.collectives.rank]
+        return Share(
+            {scale: tuple(tuple(part for part in each if part.scale == scale) for each in shares) for scale in sizes},
+            {
+                scale: [tile for part in own if part.scale == scale for tile in self._partition(part, weights[scale])]
+                for scale in sizes
+            },
+        )
+
+    def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
+        """All of a scale that has to go through the network."""
+        if coverage is None or not self.leave_out:
+            return Piece(scale, size, Rectangle(0, 0, *size))
+        return Piece(scale, size, covered_region(coverage))
+
+    def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
+        """The partition tiles of a piece, as large as the memory allows."""
         halo = self.network.halo
-        size = self.tile_size
-        if size is None:
+        tile_size = self.tile_size
+        if tile_size is None:
             held = self.network.held_bytes_per_pixel()
             working = self.network.working_bytes_per_pixel() / held
-            size = choose_tile_size(height, width, halo, held=self.memory / held, working=working, region=region)
-        tiles = partition(height, width, size, halo, region)
-        return tiles if coverage is None else [tile for tile in tiles if coverage[tile.inner.slices].any()]
+            tile_size = choose_tile_size(
+                *piece.size, halo, held=self.memory / held, working=working, region=piece.region
+            )
+        tiles = partition(*piece.size, tile_size, halo, piece.region)
+        if coverage is None or not self.leave_out:
+            return tiles
+        return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
-    def style_targets(self, style: Tensor, view_size: tuple[int, int]) -> dict[int, dict[str, LayerTarget]]:
+    def style_targets(self, style: Tensor, view_size: Size) -> dict[int, dict[str, LayerTarget]]:
         """Targets of every scale of views of view_size (height, width) from a style image [H, W, 3] in 0..1.
 
         A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
         """
-        image = resize_area(style, style_size((style.shape[0], style.shape[1]), view_size))
+        image = resize_area(style, style_size((style.shape[0], style.shape[1]), view_size)).to(self.network.device)
+        scaled = {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
+        share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
-        for scale in range(self.scale_count(*view_size)):
-            scaled = downscale(image, scale).to(self.network.device)
-            pass_ = _ScalePass(self, (scaled.shape[0], scaled.shape[1]), scale, ViewTarget(), None)
-            statistics, _, _ = self._first_pass(scaled, pass_, keep=False)
-            targets[scale] = {layer: LayerTarget.of(part) for layer, part in statistics.items() if not part.empty}
+        for scales in rounds(list(scaled), self.collectives.size):
+            passes = [_ScalePass(self, scaled[s], s, share.tiles[s], ViewTarget(), None) for s in scales]
+            for pass_, merged in zip(passes, self._first_passes(passes, keep=False)[0], strict=True):
+                parts = zip(self.style_layers, self._wait(merged)[0], strict=True)
+                targets[pass_.scale] = {layer: LayerTarget.of(part) for layer, part in parts if not part.empty}
         return targets
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
         """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""
-        scales = self.scale_count(content.shape[0], content.shape[1])
         weights = None if coverage is None else self.position_weights(coverage)
-        target = ViewTarget(content_image=content, coverage=weights)
+        share = self.share(self._sizes(_size(content)), weights)
+        target = ViewTarget(content_image=content, coverage=weights, share=share)
         if self.content_weight and keep_content:
-            target.content = {scale: self.content_features(content, scale, weights) for scale in range(scales)}
+            target.content = {
+                scale: self.content_features(content, scale, tiles) for scale, tiles in share.tiles.items()
+            }
             target.content_image = None
         return target
+
+    def _sizes(self, size: Size, scales: Sequence[int] | None = None) -> dict[int, Size]:
+        """(height, width) of scales of a view; None for all."""
+        scales = range(self.scale_count(*size)) if scales is None else scales
+        return {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
 
     def position_weights(self, coverage: Tensor) -> list[Tensor]:
         """Coverage [H, W] in 0..1 at every power of two that a layer of a scale needs."""
         levels = self.scale_count(coverage.shape[0], coverage.shape[1]) + layer_stride("relu5_1").bit_length()
         return coverage_pyramid(coverage.to(self.network.device, _gradient_dtype(self.network)), levels)
 
-    def content_features(self, content: Tensor, scale: int, coverage: list[Tensor] | None = None) -> Tensor:
-        """Features of the content layer [h/8, w/8, 512] of a content image [H, W, 3] at a scale; 0 without coverage."""
+    def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        """Features of the content layer on the cells that some tiles own, of a content image [H, W, 3] at a scale."""
         image = downscale(content.to(self.network.device), scale)
-        size = (image.shape[0], image.shape[1])
-        stride = layer_stride(CONTENT_LAYER)
-        shape = (size[0] // stride, size[1] // stride, self.network.channels(CONTENT_LAYER))
-        result = torch.zeros(shape, dtype=self.network.dtype, device=self.network.device)
-        for tile in self.tiles(*size, None if coverage is None else coverage[scale]):
-            view, own = tile.owned_cells(CONTENT_LAYER, size)
-            features = self._forward(image, tile, keep=False).features[CONTENT_LAYER]
-            result[view.slices] = features[own.slices]
+        result = {}
+        for tile in tiles:
+            own = tile.owned_cells(CONTENT_LAYER, _size(image))[1]
+            # A copy: a slice would keep the features of the halo in memory too.
+            result[tile] = self._forward(image, tile, keep=False).features[CONTENT_LAYER][own.slices].clone()
         return result
+
+    def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
+        """What `content_features` of a scale takes on the rank that holds most, from every rank's pieces of it."""
+        value = torch.finfo(self.network.dtype).bits // 8 * self.network.channels(CONTENT_LAYER)
+        cells = [sum(part.cells(CONTENT_LAYER) for part in own) for own in pieces]
+        return max(cells) * value
 
     def evaluate(
         self,
@@ -178,79 +253,113 @@ class SosLoss:
             scales: which scales; None for all (SOS). Phase 1 passes the coarsest alone.
             gradient: False evaluates the loss only.
         """
-        scales = range(self.scale_count(image.shape[0], image.shape[1])) if scales is None else scales
+        sizes = self._sizes(_size(image), scales)
+        share = self._share_of(view, sizes)
         total = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=self.network.device)
         terms: dict[int, LossTerms] = {}
-        for scale in scales:
-            scaled = downscale(image.to(self.network.device), scale)
-            terms[scale], pixel_gradient = self._scale(scaled, style[scale], view, scale, gradient)
-            if pixel_gradient is not None:
-                add_upscaled_(total, pixel_gradient, scale, 1.0 / len(scales))
+        for some in rounds(list(sizes), self.collectives.size):
+            scaled = {scale: downscale(image.to(self.network.device), scale) for scale in some}
+            for pass_, pixel_gradient in self._round(scaled, style, view, share, gradient):
+                terms[pass_.scale] = pass_.terms
+                if pixel_gradient is not None:
+                    add_upscaled_(total, pixel_gradient, pass_.scale, 1.0 / len(sizes))
         return SosResult(terms, total if gradient else None)
 
     def evaluate_scale(self, image: Tensor, style: ScaleTarget, view: ViewTarget, scale: int) -> SosResult:
         """Loss of one scale from the image at that scale, [H >> scale, W >> scale, 3], and dE/dimage of that size."""
-        terms, gradient = self._scale(image.to(self.network.device), style, view, scale, gradient=True)
-        return SosResult({scale: terms}, gradient)
+        share = self._share_of(view, {scale: _size(image)})
+        scaled = {scale: image.to(self.network.device)}
+        ((pass_, pixel_gradient),) = self._round(scaled, {scale: style}, view, share, True)
+        return SosResult({scale: pass_.terms}, pixel_gradient)
 
-    def _scale(
-        self, image: Tensor, style: ScaleTarget, view: ViewTarget, scale: int, gradient: bool
-    ) -> tuple[LossTerms, Tensor | None]:
-        """One scale's loss and pixel gradient [h, w, 3]."""
-        size = (image.shape[0], image.shape[1])
-        pass_ = _ScalePass(self, size, scale, view, self._content(view, scale))
-        statistics, content, kept = self._first_pass(image, pass_, keep=gradient)
-        terms = LossTerms(content=content)
+    def _share_of(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Share:
+        if view.share is not None and view.share.tiles.keys() == sizes.keys():
+            return view.share
+        return self.share(sizes, view.coverage)
+
+    def _round(
+        self,
+        scaled: Mapping[int, Tensor],
+        style: Mapping[int, ScaleTarget],
+        view: ViewTarget,
+        share: Share,
+        gradient: bool,
+    ) -> Iterator[tuple[_ScalePass, Tensor | None]]:
+        """Loss (in the pass) and pixel gradient [h, w, 3] of some scales, whose statistics travel together."""
+        passes = [
+            _ScalePass(self, image, scale, share.tiles[scale], view, self._content(view, scale, share.tiles[scale]))
+            for scale, image in scaled.items()
+        ]
+        merged, kept = self._first_passes(passes, keep=gradient)
+        for pass_, waiting in zip(passes, merged, strict=True):
+            statistics, content = self._wait(waiting)
+            with self.timer("statistics"):
+                self._compare(pass_, dict(zip(self.style_layers, statistics, strict=True)), content, style[pass_.scale])
+        for pass_ in passes:
+            yield pass_, self._backward(pass_, kept.pop(0)) if gradient else None
+
+    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], float]:
+        with self.timer("communication"):
+            return merged()
+
+    def _compare(
+        self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], content: float, style: ScaleTarget
+    ) -> None:
+        """Loss of one scale and its gradient maps, from the statistics of the whole scale."""
+        pass_.terms = LossTerms(content=content)
         for layer, part in statistics.items():
             if layer in style and not part.empty:
                 eps = torch.finfo(self.network.dtype).eps
                 layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=eps)
-                terms += layer_terms
-        if not gradient:
-            return terms, None
-        result = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=image.device)
-        for tile in list(kept):
-            activations = kept.pop(tile) or self._forward(image, tile)
+                pass_.terms += layer_terms
+
+    def _backward(self, pass_: _ScalePass, kept: dict[PartitionTile, Activations | None]) -> Tensor:
+        result = torch.zeros(pass_.image.shape, dtype=_gradient_dtype(self.network), device=pass_.image.device)
+        for tile in pass_.tiles:
+            activations = kept.pop(tile) or self._forward(pass_.image, tile)
             with self.timer("vgg_backward"):
                 result[tile.outer.slices] += self.network.backward(activations, pass_.feature_gradient(tile))
-        return terms, result
+        return result
 
-    def _content(self, view: ViewTarget, scale: int) -> Tensor | None:
+    def _content(self, view: ViewTarget, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures | None:
         if not self.content_weight:
             return None
         if scale in view.content:
             return view.content[scale]
         if view.content_image is None:
             raise ValueError("the view was prepared without content, but content_weight is not 0")
-        return self.content_features(view.content_image, scale, view.coverage)
+        return self.content_features(view.content_image, scale, tiles)
 
-    def _first_pass(
-        self, image: Tensor, pass_: _ScalePass, *, keep: bool
-    ) -> tuple[dict[str, LayerStatistics], float, dict[PartitionTile, Activations | None]]:
-        """Merged statistics of each style layer, the content loss, and the activations that fit the budget."""
-        merged = {
-            layer: LayerStatistics.zero(self.network.channels(layer), image.device) for layer in self.style_layers
-        }
-        content = 0.0
-        kept: dict[PartitionTile, Activations | None] = {}
-        tiles = self.tiles(*pass_.size, pass_.coverage)
+    def _first_passes(
+        self, passes: Sequence[_ScalePass], *, keep: bool
+    ) -> tuple[list[Merged], list[dict[PartitionTile, Activations | None]]]:
+        """For each scale, the merge of its statistics and content loss under way, and the activations that fit."""
+        merged: list[Merged] = []
+        kept: list[dict[PartitionTile, Activations | None]] = []
+        tiles = [tile for pass_ in passes for tile in pass_.tiles]
         held = self.network.held_bytes_per_pixel()
         # Whatever is kept, there must be room to back-propagate the largest tile.
         budget = self.memory - max((tile.outer.pixels for tile in tiles), default=0) * (
             held + self.network.working_bytes_per_pixel()
         )
-        for tile in tiles:
-            keep_this = keep and self.keep_activations and (len(tiles) == 1 or tile.outer.pixels * held <= budget)
-            budget -= tile.outer.pixels * held if keep_this else 0
-            activations = self._forward(image, tile, keep=keep_this)
-            with self.timer("statistics"):
-                for layer in self.style_layers:
-                    view, own = tile.owned_cells(layer, pass_.size)
-                    part = layer_statistics(activations.features[layer][own.slices], pass_.weights(layer, view))
-                    merged[layer] = merge(merged[layer], part)
-                content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
-            kept[tile] = activations if keep_this else None
-        return merged, content, kept
+        for pass_ in passes:
+            statistics = [
+                LayerStatistics.zero(self.network.channels(layer), pass_.image.device) for layer in self.style_layers
+            ]
+            content = 0.0
+            kept.append({})
+            for tile in pass_.tiles:
+                keep_this = keep and self.keep_activations and (len(tiles) == 1 or tile.outer.pixels * held <= budget)
+                budget -= tile.outer.pixels * held if keep_this else 0
+                activations = self._forward(pass_.image, tile, keep=keep_this)
+                with self.timer("statistics"):
+                    for place, layer in enumerate(self.style_layers):
+                        part = pass_.statistics(layer, tile, activations.features[layer])
+                        statistics[place] = merge(statistics[place], part)
+                    content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
+                kept[-1][tile] = activations if keep_this else None
+            merged.append(self.collectives.merge_statistics(statistics, content))
+        return merged, kept
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
         with self.timer("vgg_forward"):
@@ -258,34 +367,44 @@ class SosLoss:
 
 
 class _ScalePass:
-    """What the tiles of one scale share: size, position weights, content, and the gradient maps once known."""
+    """What the tiles of one scale share: pixels, position weights, content; loss and gradient maps once known."""
 
     def __init__(
-        self, loss: SosLoss, size: tuple[int, int], scale: int, view: ViewTarget, content: Tensor | None
+        self,
+        loss: SosLoss,
+        image: Tensor,
+        scale: int,
+        tiles: list[PartitionTile],
+        view: ViewTarget,
+        content: ContentFeatures | None,
     ) -> None:
-        self.size = size
+        self.image = image
+        self.scale = scale
+        self.tiles = tiles
+        self.size = _size(image)
         self.maps: dict[str, StyleGradient] = {}
-        self._scale = scale
+        self.terms = LossTerms()
         self._coverage = view.coverage
         self._content_weight = loss.content_weight
         self._timer = loss.timer
         self._content = content
         self._content_count = 0.0
         if content is not None:
-            cells = Rectangle(0, 0, content.shape[0], content.shape[1])
+            stride = layer_stride(CONTENT_LAYER)
+            cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
             weights = self.weights(CONTENT_LAYER, cells)
             self._content_count = cells.pixels if weights is None else float(weights.sum(dtype=torch.float64))
-
-    @property
-    def coverage(self) -> Tensor | None:
-        """Coverage [h, w] of the scaled view's pixels; None for equal weights."""
-        return None if self._coverage is None else self._coverage[self._scale]
 
     def weights(self, layer: str, cells: Rectangle) -> Tensor | None:
         """Weights [h, w] of some cells of a layer: the coverage, box-averaged to the cells; None for equal weights."""
         if self._coverage is None:
             return None
-        return self._coverage[self._scale + layer_stride(layer).bit_length() - 1][cells.slices]
+        return self._coverage[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
+
+    def statistics(self, layer: str, tile: PartitionTile, features: Tensor) -> LayerStatistics:
+        """Of the cells that a tile owns; features are those of all its cells."""
+        view, own = tile.owned_cells(layer, self.size)
+        return layer_statistics(features[own.slices], self.weights(layer, view))
 
     def content_loss(self, tile: PartitionTile, features: Tensor | None) -> tuple[float, Tensor | None]:
         """The tile's share of the content loss and its gradient on owned cells; features are those of all its cells."""
@@ -294,7 +413,7 @@ class _ScalePass:
         view, own = tile.owned_cells(CONTENT_LAYER, self.size)
         return content_loss(
             features[own.slices],
-            self._content[view.slices],
+            self._content[tile],
             self._content_count,
             self._content_weight,
             self.weights(CONTENT_LAYER, view),
@@ -331,6 +450,10 @@ def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
     planes = image.permute(2, 0, 1).unsqueeze(0)
     resized = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True, align_corners=False)
     return resized[0].permute(1, 2, 0).contiguous()
+
+
+def _size(image: Tensor) -> Size:
+    return image.shape[0], image.shape[1]
 
 
 def _gradient_dtype(network: FeatureNetwork) -> torch.dtype:

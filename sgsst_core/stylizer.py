@@ -6,7 +6,9 @@ One step at a time; `loop.run` makes them all.
 from __future__ import annotations
 
 import importlib.util
+import math
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,16 +19,16 @@ from torch import Tensor
 
 from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
 from sgsst_core.camera import Camera, resized
-from sgsst_core.errors import CameraError, DivergedError
+from sgsst_core.collectives import ALONE, Collectives, RankLeftOut, same_on_all
+from sgsst_core.errors import CameraError, DivergedError, RanksDriftedError
 from sgsst_core.loss import LayerTarget, LossTerms
-from sgsst_core.planner import choose_network, make_plan
+from sgsst_core.planner import Plan, choose_network, make_plan
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.sos import SosLoss, SosResult, ViewTarget
-from sgsst_core.spherical_harmonics import view_colours_gradient
 from sgsst_core.timing import Timer
 from sgsst_core.unseen import neighbours_change
 from sgsst_core.views import PhotoLoader, Views
@@ -37,6 +39,13 @@ from sgsst_core.weights import BackboneWeights, load_weights
 ADAM_EPS = 1e-15
 #: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
 LARGEST_GRADIENT = 1e19
+
+#: Steps between two proofs that all ranks have the same colours.
+DRIFT_STEPS = 50
+#: Steps of a phase after which the ranks' speeds are compared; the first one, which prepares more, does not count.
+BALANCE_STEPS = 6
+#: Ranks are given other shares of the work only where the fastest is faster than the slowest by more than this.
+LEAST_IMBALANCE = 1.15
 
 #: Views on which a job is evaluated before and after, and which the contact sheet shows.
 EVALUATION_VIEWS = 4
@@ -70,9 +79,9 @@ class StepRecord:
     Attributes:
         step: counted from 1 over both phases.
         stage: of the phase: "coarse", "sos".
-        view: index of the camera.
+        view: index of the camera; the first one where a step has several.
         seconds: wall-clock seconds of iterations so far, of all sessions of a resumed job.
-        loss: E of the view before the step.
+        loss: E of the step's views before the step, their mean.
         terms: split loss by scale.
         parts: seconds of this step by what they went into.
         memory: bytes of physical memory that the process held after the step.
@@ -118,10 +127,18 @@ class Stylizer:
         photos: content image of a camera by its index, at its (brought down) size; None for unstylized renders.
         rasterizer: "auto", "cpu", "cached", "cuda" or "reference".
         schedule: phases in their order; None for those of the settings, as planned.
+        collectives: of the ranks that stylize the scene together. Every rank has a stylizer with the same arguments and
+            calls the same methods in the same order; `state`, `stylized` and the like, which only read, need no other.
+        plan: of an earlier run of the same job; None makes one.
+
+    Attributes:
+        collectives: of all ranks that take part.
+        group: of those that work on the same views as this one.
 
     Raises:
         CameraError: no cameras, or none sees a Gaussian.
         WeightsError: no weights.
+        RankLeftOut: the job goes on without this rank.
     """
 
     def __init__(
@@ -135,6 +152,8 @@ class Stylizer:
         photos: PhotoLoader | None = None,
         rasterizer: str = "auto",
         schedule: Sequence[Phase] | None = None,
+        collectives: Collectives = ALONE,
+        plan: Plan | None = None,
     ) -> None:
         if not cameras:
             raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
@@ -146,24 +165,19 @@ class Stylizer:
         self.history: list[StepRecord] = []
         #: What was measured between steps (`loop.Callbacks.measure`): values for JSON, kept through a resume.
         self.measured: list[dict[str, Any]] = []
-        self.memory = settings.memory_limit or default_memory_limit()
         self.weights = weights or load_weights("auto")
         self.photos = photos
         self.style = style
-        self.network, precision = choose_network(self.weights, settings)
-        self.loss = SosLoss(
-            self.network,
-            content_weight=settings.content_weight,
-            memory=int(self.memory * MEMORY_SHARES["activations"]),
-            coarsest=settings.coarsest_side,
-            leave_out="uncovered" not in settings.keep,
-            keep_activations="activations" not in settings.keep,
-            timer=self.timer,
-        )
+        self.network, precision = choose_network(self.weights, settings, collectives)
+        self._agree_on_memory(collectives)
         cameras = fit_cameras(cameras, settings)
-        whole = self._rasterizer(scene, "cpu" if rasterizer in ("auto", "cached") else rasterizer)
-        self.plan = make_plan(scene, cameras, settings, self.loss, whole, self.memory)
-        self.plan.decisions.extend(precision)
+        if plan is None:
+            whole = self._rasterizer(scene, "cpu" if rasterizer in ("auto", "cached") else rasterizer)
+            plan = make_plan(scene, cameras, settings, self._loss(ALONE), whole, self.memory, collectives)
+            plan.decisions.extend(precision)
+        self.plan = plan
+        self._join(collectives)
+        self.loss = self._loss(self.group)
         self.scene = scene
         seen = scene if self.plan.seen.all() else scene.subset(self.plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
@@ -178,6 +192,8 @@ class Stylizer:
             memory=int(self.memory * MEMORY_SHARES["views"]),
             keep_content="content" not in settings.keep,
             revive=settings.revive,
+            regions=self.plan.survey.regions if self.plan.weighted else None,
+            collectives=self.group,
         )
         self._coarse = self._coarse_rasterizer(seen)
         self._style_targets: dict[tuple[int, int], dict[int, dict[str, LayerTarget]]] = {}
@@ -192,6 +208,40 @@ class Stylizer:
         self.total = sum(phase.steps for phase in self.schedule)
         self._process = psutil.Process()
         self._start: Evaluation | None = None
+
+    def _agree_on_memory(self, collectives: Collectives) -> None:
+        """What each rank may plan with: the partition, and so rounding, must be the same on all of them."""
+        device = self.network.device
+        limit = self.settings.memory_limit or default_memory_limit(device)
+        sharing = 1 if device.type == "cuda" else collectives.local_size
+        limits = collectives.gather((limit, sharing))
+        self.memory_limit = min(limit for limit, _ in limits)
+        self.memory = min(limit // sharing for limit, sharing in limits)
+
+    def _join(self, collectives: Collectives) -> None:
+        """Take part in what the plan needs, in the group whose views are this rank's."""
+        taking_part = collectives.first(min(self.plan.ranks, collectives.size))
+        if taking_part is None:
+            raise RankLeftOut
+        self.collectives = taking_part
+        self.groups = math.gcd(self.settings.views_per_step, taking_part.size)
+        self.group = taking_part.split(self.groups)
+        #: Pixels and seconds of this rank's share of the network in each step, until ranks have been compared.
+        self._pace: list[tuple[int, float]] | None = [] if self.settings.rebalance and self.group.size > 1 else None
+        self._cost = 0
+
+    def _loss(self, collectives: Collectives) -> SosLoss:
+        settings = self.settings
+        return SosLoss(
+            self.network,
+            content_weight=settings.content_weight,
+            memory=int(self.memory * MEMORY_SHARES["activations"]),
+            coarsest=settings.coarsest_side,
+            leave_out="uncovered" not in settings.keep,
+            keep_activations="activations" not in settings.keep,
+            timer=self.timer,
+            collectives=collectives,
+        )
 
     def _rasterizer(self, scene: Scene, name: str) -> Rasterizer:
         """The rasterizer of a name; "auto" is gsplat on a GPU that has it, else what the plan says."""
@@ -234,7 +284,7 @@ class Stylizer:
     @property
     def round_length(self) -> int:
         """Steps in which every view comes once."""
-        return len(self.views.covered)
+        return math.ceil(len(self.views.covered) / self.settings.views_per_step)
 
     def scale_count(self, index: int) -> int:
         """n_s of a view."""
@@ -269,33 +319,85 @@ class Stylizer:
         """
         started = time.perf_counter()
         self.timer.seconds.clear()
-        index = self._next_view()
         phase = self.phase
         if phase.scale is None:
             self._coarse = None  # phase 1 is over
-        scales = phase.scales(self.scale_count(index))
-        with self.timer("prepare"):
-            target = self.views.target(index, scales)
-            style = self.style_targets(self.views.cameras[index])
-        gradient, result = self._gradient(index, style, target, scales)
+        views = [self._next_view() for _ in range(self.settings.views_per_step)]
+        gradient, terms = self._mean_gradient(views, phase)
         with self.timer("optimiser"):
             self._update(gradient)
         self.step += 1
+        self._check_drift()
+        self._balance(phase)
         self.seconds += time.perf_counter() - started
         for name, seconds in self.timer.seconds.items():
             self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
         record = StepRecord(
             self.step,
             phase.stage,
-            index,
+            views[0],
             self.seconds,
-            result.loss,
-            result.terms,
+            mean_loss(terms),
+            terms,
             dict(self.timer.seconds),
             self._process.memory_info().rss,
         )
         self.history.append(record)
         return record
+
+    def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, Evaluation]:
+        """dE/dsh_dc [n, 3] and loss, mean over some views: each group of ranks takes its own."""
+        gradient: Tensor | None = None
+        evaluations = []
+        self._cost = 0
+        for index in views[self.collectives.rank // self.group.size :: self.groups]:
+            scales = phase.scales(self.scale_count(index))
+            with self.timer("prepare"):
+                target = self.views.target(index, scales)
+                style = self.style_targets(self.views.cameras[index])
+            assert target.share is not None
+            self._cost += target.share.cost(self.group.rank, self.network.halo)
+            own, result = self._gradient(index, style, target, scales)
+            gradient = own if gradient is None else gradient.add_(own)
+            evaluations.append(result.terms)
+        assert gradient is not None
+        if len(views) > 1:
+            with self.timer("communication"):
+                every = self.collectives.gather(evaluations)[:: self.group.size]
+                evaluations = [terms for part in every for terms in part]
+                if self.groups > 1:  # all ranks of a group have the same gradient: count it once
+                    gradient = self.collectives.sum(gradient / self.group.size)
+            gradient = gradient / len(views)
+        return gradient, mean_evaluation(evaluations)
+
+    def _check_drift(self) -> None:
+        """Prove now and then that all ranks have the same colours."""
+        if self.collectives.size == 1 or self.step % DRIFT_STEPS:
+            return
+        with self.timer("communication"):
+            checksum = zlib.crc32(self.sh_dc.detach().cpu().numpy().tobytes())
+            if not same_on_all(self.collectives, checksum):
+                raise RanksDriftedError(
+                    f"Step {self.step}: the ranks' colours are no longer the same. They compute differently: run on "
+                    "machines of one kind, with the same versions of this program and of PyTorch."
+                )
+
+    def _balance(self, phase: Phase) -> None:
+        """Once in the phase on all scales, share the work out in proportion to the speeds that ranks have shown."""
+        if self._pace is None or phase.scale is not None:
+            return
+        seconds = sum(self.timer.seconds.get(part, 0.0) for part in ("vgg_forward", "vgg_backward", "statistics"))
+        self._pace.append((self._cost, seconds))
+        if len(self._pace) < BALANCE_STEPS:
+            return
+        # Medians: one step in which the machine did something else says nothing.
+        rates = sorted(cost / seconds for cost, seconds in self._pace[1:] if cost)
+        self._pace = None
+        speeds = self.group.gather(rates[len(rates) // 2] if rates else 0.0)
+        known = [speed for speed in speeds if speed > 0]
+        if max(known) > LEAST_IMBALANCE * min(known):
+            self.loss.speeds = tuple(speed or sum(known) / len(known) for speed in speeds)
+            self.views.share_anew()
 
     def _update(self, gradient: Tensor) -> None:
         largest = float(gradient.abs().max())
@@ -370,7 +472,7 @@ class Stylizer:
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
             gradient = rasterizer.colour_gradient(result.image_gradient.to(image.device), camera, scale)
-            return view_colours_gradient(gradient, colours, revive=self.views.revive), result
+            return self.views.add_up(gradient, colours), result
 
     def stylized(self) -> Tensor:
         """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians."""
@@ -400,7 +502,7 @@ class Stylizer:
             queue=list(self._queue),
             history=list(self.history),
             seconds_by_part=dict(self.seconds_by_part),
-            memory=self.memory,
+            memory=self.memory_limit,
             measured=list(self.measured),
         )
 
@@ -438,15 +540,23 @@ def evaluate(
     sh_dc: Tensor,
 ) -> Evaluation:
     """Mean SOS loss of colours [n, 3] over views, split by scale."""
-    total: Evaluation = {}
+    evaluations = []
     for index in indices:
         camera = views.cameras[index]
         with torch.no_grad():
             image = views.render(index, views.colours(index, sh_dc))
         target = views.target(index, range(views.loss.scale_count(camera.height, camera.width)))
-        for scale, part in views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms.items():
+        evaluations.append(views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
+    return mean_evaluation(evaluations)
+
+
+def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Mean over views, scale by scale."""
+    total: Evaluation = {}
+    for evaluation in evaluations:
+        for scale, part in evaluation.items():
             total[scale] = total.get(scale, LossTerms()) + part
-    return {scale: terms.divided(len(indices)) for scale, terms in total.items()}
+    return {scale: terms.divided(len(evaluations)) for scale, terms in total.items()}
 
 
 def mean_loss(evaluation: Evaluation) -> float:

@@ -10,9 +10,12 @@ from torch import Tensor
 
 from sgsst_core.budget import Shelf
 from sgsst_core.camera import Camera
-from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.collectives import ALONE, Collectives
+from sgsst_core.division import Piece, divide_rows
+from sgsst_core.partition import PartitionTile, Rectangle
+from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.scene import Scene
-from sgsst_core.sos import SosLoss, ViewTarget
+from sgsst_core.sos import ContentFeatures, SosLoss, ViewTarget
 from sgsst_core.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
 
 PhotoLoader = Callable[[int], Tensor]
@@ -20,6 +23,9 @@ PhotoLoader = Callable[[int], Tensor]
 
 class Views:
     """Renders views, and prepares their targets at first use.
+
+    Of several ranks, each renders a band of rows. What is kept is decided by sizes that are the same on every rank, so
+    that all of them find a view's targets, or none: preparing them takes all ranks.
 
     Args:
         scene: supplies the colours' frozen part and the content (the unstylized render).
@@ -32,6 +38,8 @@ class Views:
         memory: bytes that content features, coverage and colours of views may take.
         revive: let colours that the clamp holds at 0 come back (`view_colours_gradient`).
         keep_content: keep content features that fit; False computes them at each visit, for comparison.
+        regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
+        collectives: of the ranks that render each view together; `loss` has the same.
     """
 
     def __init__(
@@ -47,18 +55,27 @@ class Views:
         memory: int = 1 << 30,
         keep_content: bool = True,
         revive: bool = False,
+        regions: Sequence[Rectangle] | None = None,
+        collectives: Collectives = ALONE,
     ) -> None:
         self.scene = scene
         self.cameras = list(cameras)
         self.rasterizer = rasterizer
         self.loss = loss
+        self.collectives = collectives
         self._photos = photos
+        self._bands = [
+            divide_rows(
+                camera.height, collectives.size, (regions[index].top, regions[index].bottom) if regions else None
+            )
+            for index, camera in enumerate(cameras)
+        ]
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
         self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
         kept = memory // 2 if keep_content else 0
-        self._content: Shelf[tuple[int, int], Tensor] = Shelf(kept, _tensor_bytes)
+        self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept)
         self.covered = covered
         self.weighted = weighted
         self.revive = revive
@@ -75,12 +92,35 @@ class Views:
 
     def render(self, index: int, colours: Tensor) -> Tensor:
         """Image [H, W, 3] of a view with its colours [N, 3]."""
-        return self.rasterizer.render(colours, self.cameras[index])
+        band, camera = self._own_band(index), self.cameras[index]
+        some = band[0] < band[1]
+        rows = self.rasterizer.render(colours, camera, band) if some else self._nothing(0, camera.width, 3)
+        with self.loss.timer("communication"):
+            return self.collectives.gather_rows(rows, self._bands[index])
 
     def gradient(self, index: int, image_gradient: Tensor, colours: Tensor) -> Tensor:
-        """dL/dsh_dc [N, 3] from dL/dimage [H, W, 3] and the colours that were rendered."""
-        gradient = self.rasterizer.colour_gradient(image_gradient, self.cameras[index])
+        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [H, W, 3] and the colours that were rendered."""
+        with self.loss.timer("communication"):
+            rows = self.collectives.scatter_rows(image_gradient, self._bands[index])
+        if len(rows):
+            gradient = self.rasterizer.colour_gradient(rows, self.cameras[index], self._own_band(index))
+        else:
+            gradient = self._nothing(len(colours), 3)
+        return self.add_up(gradient, colours)
+
+    def add_up(self, gradient: Tensor, colours: Tensor) -> Tensor:
+        """dL/dsh_dc [N, 3] from this rank's part of dL/dcolours [N, 3] and the colours that were rendered."""
+        with self.loss.timer("communication"):
+            gradient = self.collectives.sum(gradient)
+        # After the sum: which colours are let through depends on the sign of their whole gradient.
         return view_colours_gradient(gradient, colours, revive=self.revive)
+
+    def _nothing(self, *shape: int) -> Tensor:
+        """What a rank without rows has to add."""
+        return torch.zeros(shape, dtype=self.rasterizer.dtype, device=self.rasterizer.device)
+
+    def _own_band(self, index: int) -> Rows:
+        return self._bands[index][self.collectives.rank]
 
     def content(self, index: int) -> Tensor:
         """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
@@ -94,20 +134,34 @@ class Views:
         Features are computed only of scales that are asked for: phase 1 needs those of one.
         """
         coverage = self._coverage.get(index, lambda: self._position_weights(index)) if self.weighted else None
-        target = ViewTarget(coverage=coverage)
+        camera = self.cameras[index]
+        share = self.loss.share({s: (camera.height >> s, camera.width >> s) for s in scales}, coverage)
+        target = ViewTarget(coverage=coverage, share=share)
         if self.loss.content_weight:
             image = functools.cache(lambda: self.content(index))
             for scale in scales:
-                target.content[scale] = self._content.get(
-                    (index, scale), functools.partial(self._features, image, scale, coverage)
-                )
+                pieces = share.pieces[scale]
+                make = functools.partial(self._features, image, scale, share.tiles[scale])
+                size = self.loss.content_bytes(pieces)
+                target.content[scale] = self._content.get((index, scale, pieces), make, size)
         return target
 
-    def _position_weights(self, index: int) -> list[Tensor]:
-        return self.loss.position_weights(self.rasterizer.coverage(self.cameras[index]))
+    def share_anew(self) -> None:
+        """Forget what belongs to the present division of the work, because another follows."""
+        self._content.clear()
 
-    def _features(self, image: Callable[[], Tensor], scale: int, coverage: list[Tensor] | None) -> Tensor:
-        return self.loss.content_features(image(), scale, coverage)
+    def _position_weights(self, index: int) -> list[Tensor]:
+        band, camera = self._own_band(index), self.cameras[index]
+        some = band[0] < band[1]
+        rows = self.rasterizer.coverage(camera, band) if some else self._nothing(0, camera.width)
+        return self.loss.position_weights(self.collectives.gather_rows(rows, self._bands[index]))
+
+    def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        return self.loss.content_features(image(), scale, tiles)
+
+
+#: View, scale, and every rank's pieces of it.
+_ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
 
 
 def _tensor_bytes(tensor: Tensor) -> int:

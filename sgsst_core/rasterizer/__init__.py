@@ -27,11 +27,12 @@ class Rasterizer(Protocol):
 
     `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colours` are the
     colours of one view, after spherical harmonics and clamp. Arguments may come in any floating dtype and from any
-    device; results are on `device`, in float32 (`reference`: in its own dtype). A wrong shape is a ValueError.
+    device; results are on `device`, in `dtype`. A wrong shape is a ValueError.
     """
 
     name: str
     device: torch.device
+    dtype: torch.dtype
 
     def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Image [h, width, 3] of colours [N, 3] in the camera's rows, over the background."""

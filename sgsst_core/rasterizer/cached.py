@@ -196,6 +196,7 @@ class CachedRasterizer:
     """
 
     name = "cached"
+    dtype = torch.float32
 
     def __init__(
         self,

@@ -46,6 +46,7 @@ class CpuRasterizer:
     """
 
     name = "cpu"
+    dtype = torch.float32
     device = _CPU
 
     def __init__(

@@ -78,6 +78,7 @@ class CudaRasterizer:
     """
 
     name = "cuda"
+    dtype = torch.float32
 
     def __init__(
         self,

@@ -1,0 +1,1 @@
+"""One job on several ranks: process group, Ray workers, recovery."""
