@@ -96,10 +96,9 @@ class ProcessGroupCollectives:
         # All ranks send equally many rows: that is all that the back ends can do.
         padded = band.new_zeros((largest, *band.shape[1:]))
         padded[: len(band)] = band
-        gathered = band.new_empty((self.size * largest, *band.shape[1:]))
-        dist.all_gather_into_tensor(gathered, padded, group=self._group)
-        parts = gathered.view(self.size, largest, *band.shape[1:])
-        return torch.cat([part[: stop - start] for part, (start, stop) in zip(parts, bands, strict=True)])
+        gathered = [torch.empty_like(padded) for _ in bands]
+        dist.all_gather(gathered, padded, group=self._group)
+        return torch.cat([part[: stop - start] for part, (start, stop) in zip(gathered, bands, strict=True)])
 
     def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
         """See `Collectives`."""

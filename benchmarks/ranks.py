@@ -1,0 +1,174 @@
+"""Two ranks of one thread each against one rank of one thread, on all scales of a view, in turn in one run.
+
+python -m benchmarks.ranks SCENE.ply CAMERAS STYLE [--ranks 2] [--sizes 1280x720,2048x2048] [--rounds 3]
+
+Ranks are gloo processes on this machine. Beside the ratio stand the bound that halos set, the share of an iteration in
+which ranks wait for each other or for bytes, and what the planner's model says from constants measured on one rank.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import socket
+import statistics
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.machine import write_result
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.camera import Camera, spread
+from sgsst_core.camera_files import read_cameras
+from sgsst_core.collectives import ALONE, Collectives
+from sgsst_core.cost import pieces_of
+from sgsst_core.division import Piece, divide, loads
+from sgsst_core.images import load_image
+from sgsst_core.partition import Rectangle
+from sgsst_core.ply import read_scene
+from sgsst_core.scaling import IterationWork, Link, probe_link
+from worker.process_group import process_group
+
+NETWORK = ("vgg_forward", "vgg_backward", "statistics")
+RASTER = ("render", "raster_backward")
+
+
+def main() -> None:
+    """Measure, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("cameras", type=Path)
+    parser.add_argument("style", type=Path)
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--sizes", default="1280x720,2048x2048")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--memory", type=float, default=16.0, help="GB to plan with")
+    arguments = parser.parse_args()
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+    context = multiprocessing.get_context("spawn")
+    others = [context.Process(target=run_rank, args=(rank, address, arguments)) for rank in range(1, arguments.ranks)]
+    for process in others:
+        process.start()
+    run_rank(0, address, arguments)
+    for process in others:
+        process.join()
+
+
+def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
+    """One rank's part of the comparison; rank 0 prints and stores."""
+    torch.set_num_threads(1)
+    scene = read_scene(arguments.scene).scene
+    camera = spread(read_cameras(arguments.cameras), 1)[0]
+    style = load_image(arguments.style)
+    results = []
+    with process_group(rank, arguments.ranks, address) as collectives:
+        link = probe_link(collectives, torch.device("cpu"))
+        for size in arguments.sizes.split(","):
+            view = with_size(camera, *map(int, size.split("x")))
+            figures = compare(
+                collectives, lambda c, view=view: make(c, scene, view, style, arguments), arguments.rounds
+            )
+            if rank == 0:
+                results.append({"view": size, **figures, **modelled(figures, len(scene), link, arguments.ranks)})
+                print(describe(results[-1]), flush=True)
+    if rank == 0:
+        link_figures = {"bandwidth_gb_s": link.bandwidth / 1e9, "latency_us": link.latency * 1e6}
+        write_result("ranks", {"scene": arguments.scene.parent.name, "link": link_figures, "views": results})
+
+
+def with_size(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with another picture: the same field of view across, as much above and below as then fits."""
+    focal = camera.fx * width / camera.width
+    return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+
+
+def make(collectives: Collectives, scene: Any, view: Camera, style: Any, arguments: argparse.Namespace) -> Stylizer:
+    """A job of one view that stays in the second phase."""
+    settings = make_settings(
+        "paper",
+        steps_coarse=0,
+        steps_sos=10_000,
+        memory_limit=int(arguments.memory * 1e9),
+        rebalance=False,
+        keep=("ranks",),
+    )
+    return Stylizer(scene, [view], style, settings, collectives=collectives)
+
+
+def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]:
+    """Seconds of iterations on all ranks and on one, in turn; the first of each prepares the view."""
+    together = build(collectives)
+    alone = build(ALONE) if collectives.rank == 0 else None
+    steps: dict[str, list[dict[str, float]]] = {"together": [], "alone": []}
+    for turn in range(rounds + 1):
+        for name, stylizer in (("together", together), ("alone", alone)):
+            collectives.gather(None)  # nobody else computes while one rank is alone
+            if stylizer is not None:
+                before = stylizer.seconds
+                record = stylizer.run_step()
+                if turn:
+                    steps[name].append({**record.parts, "total": stylizer.seconds - before})
+    waiting = collectives.gather([step["communication"] / step["total"] for step in steps["together"]])
+    if alone is None:
+        return {}
+    loss = alone.loss
+    pieces = pieces_of(alone.views.cameras[0], loss, None)
+    halo = loss.network.halo
+    one, shared = (divide(pieces, halo, (1.0,) * count) for count in (1, collectives.size))
+    return {
+        "ranks": collectives.size,
+        "seconds_one_rank": median(steps["alone"], "total"),
+        "seconds": median(steps["together"], "total"),
+        "ratio": median(steps["alone"], "total") / median(steps["together"], "total"),
+        "bound_by_halos": max(loads(one, halo)) / max(loads(shared, halo)),
+        "waiting_share_by_rank": [statistics.median(share) for share in waiting],
+        "steps": steps,
+        "pieces": [[piece.scale, *piece.size] for piece in pieces],
+        "halo": halo,
+    }
+
+
+def modelled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> dict[str, Any]:
+    """What the planner's model makes of one rank's seconds."""
+    steps = figures["steps"]["alone"]
+    network = sum(median(steps, part) for part in NETWORK)
+    raster = sum(median(steps, part) for part in RASTER)
+    pieces = tuple(whole_piece(*values) for values in figures["pieces"])
+    pixels = loads(divide(pieces, figures["halo"], (1.0,)), figures["halo"])[0]
+    fixed = max(median(steps, "total") - network - raster, 0.0)
+    work = IterationWork(pieces, figures["halo"], network / pixels, raster, fixed, gaussians)
+    seconds = work.seconds(ranks, link)
+    return {
+        "model_seconds": seconds,
+        "model_communication_share": work.communication(ranks, link) / seconds,
+        "model_error": seconds / figures["seconds"] - 1,
+    }
+
+
+def whole_piece(scale: int, height: int, width: int) -> Piece:
+    """All of a scale."""
+    return Piece(scale, (height, width), Rectangle(0, 0, height, width))
+
+
+def median(steps: list[dict[str, float]], part: str) -> float:
+    """Seconds of a part of a step."""
+    return statistics.median(step.get(part, 0.0) for step in steps) if steps else math.nan
+
+
+def describe(result: dict[str, Any]) -> str:
+    """One line."""
+    waiting = ", ".join(f"{share:.1%}" for share in result["waiting_share_by_rank"])
+    return (
+        f"{result['view']}: {result['seconds_one_rank']:.2f} s on one rank, {result['seconds']:.2f} s on "
+        f"{result['ranks']}: {result['ratio']:.2f} times faster (halos bound it to {result['bound_by_halos']:.2f}); "
+        f"waiting {waiting}; the model says {result['model_seconds']:.2f} s ({result['model_error']:+.0%})"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Forecast of an SOS iteration on 1 to 64 GPUs, by the model with which the planner chooses ranks.
+
+python -m benchmarks.scaling [--tflops 100]
+
+Nothing here is measured on GPUs: the assumptions are the constants below, and are stored and printed with the table.
+The same model, fed with one CPU rank's seconds, is held against two ranks by `benchmarks.ranks`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from typing import Any
+
+from benchmarks.machine import write_result
+from sgsst_core.division import Piece, divide, loads
+from sgsst_core.partition import Rectangle
+from sgsst_core.pyramid import scale_count
+from sgsst_core.scaling import IterationWork, Link
+from sgsst_core.vgg import HALO
+
+RANKS = (1, 2, 4, 8, 16, 32, 64)
+#: VGG19 up to relu5_1: operations a pixel, forward, and as many backward.
+FLOP_PER_PIXEL = 2 * 0.72e6
+#: Four fifths of what the data sheets promise in one direction; seconds from one rank to the next.
+LINKS = {
+    "NVLink 4": Link(0.8 * 450e9, 5e-6),
+    "PCIe 4.0 x16": Link(0.8 * 32e9, 10e-6),
+    "25 Gb/s Ethernet": Link(0.8 * 25e9 / 8, 30e-6),
+}
+#: Height, width, optimised Gaussians, seconds of render and gradient: a scene of Tanks and Temples, and the garden of
+#: Mip-NeRF 360 at its full size.
+VIEWS = {"980x545": (545, 980, 2_500_000, 0.006), "5187x3361": (3361, 5187, 5_800_000, 0.030)}
+#: Comparing statistics, the optimiser and launching kernels, in every iteration on every rank.
+FIXED_SECONDS = 0.003
+
+
+def main() -> None:
+    """Forecast, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tflops", type=float, default=100.0, help="that one GPU sustains in VGG's convolutions")
+    arguments = parser.parse_args()
+    results: dict[str, Any] = {}
+    for name, (height, width, gaussians, raster) in VIEWS.items():
+        work = IterationWork(
+            pieces=tuple(
+                Piece(s, (height >> s, width >> s), Rectangle(0, 0, height >> s, width >> s))
+                for s in range(scale_count(height, width))
+            ),
+            halo=HALO["vgg19"],
+            pixel=FLOP_PER_PIXEL / (arguments.tflops * 1e12),
+            raster=raster,
+            fixed=FIXED_SECONDS,
+            gaussians=gaussians,
+        )
+        results[name] = forecast(work)
+        print(f"\n{name}: {1e3 * work.computing(1):.0f} ms an iteration on one GPU\n{table(results[name])}")
+    assumptions = {
+        "tflops": arguments.tflops,
+        "flop_per_pixel": FLOP_PER_PIXEL,
+        "fixed_seconds": FIXED_SECONDS,
+        "halo": HALO["vgg19"],
+        "links": {name: asdict(link) for name, link in LINKS.items()},
+        "views": VIEWS,
+    }
+    write_result("scaling", {"assumptions": assumptions, "forecast": results})
+
+
+def forecast(work: IterationWork) -> dict[str, Any]:
+    """Speed-up by number of ranks: bounded by halos alone, and over each link with communication's share."""
+    one = max(loads(divide(work.pieces, work.halo, (1.0,)), work.halo))
+    found = {}
+    for ranks in RANKS:
+        largest = max(loads(divide(work.pieces, work.halo, (1.0,) * ranks), work.halo))
+        links = {
+            name: {
+                "speed_up": work.computing(1) / work.seconds(ranks, link),
+                "communication_share": work.communication(ranks, link) / work.seconds(ranks, link),
+            }
+            for name, link in LINKS.items()
+        }
+        found[str(ranks)] = {"bound_by_halos": one / largest, "links": links}
+    return found
+
+
+def table(found: dict[str, Any]) -> str:
+    """The forecast as Markdown."""
+    lines = ["| GPUs | halos alone | " + " | ".join(LINKS) + " |", "|---:" * (2 + len(LINKS)) + "|"]
+    for ranks, entry in found.items():
+        cells = [f"{part['speed_up']:.1f} ({part['communication_share']:.0%})" for part in entry["links"].values()]
+        lines.append(f"| {ranks} | {entry['bound_by_halos']:.1f} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
