@@ -76,14 +76,14 @@ class Prediction:
         seconds_coarse: of an iteration of phase 1.
         peak_bytes: of physical memory of a rank, at any time.
         communication: seconds of an SOS iteration in which a rank waits for what others send.
-        speed_up: of the whole schedule over one rank.
+        seconds_one_rank: of an SOS iteration on one rank; None where there is only one.
     """
 
     seconds: float
     seconds_coarse: float
     peak_bytes: int
     communication: float = 0.0
-    speed_up: float = 1.0
+    seconds_one_rank: float | None = None
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def _share_out(
         mean(work.seconds(each, link) for work in samples[0]),
         peak + int(min(largest * held, loss.memory)),
         mean(work.communication(each, link) for work in samples[1]),
-        choice.speed_up,
+        mean(work.seconds(1, link) for work in samples[1]) * groups,
     )
     decisions = [*plan.decisions, _ranks_decision(choice, available, link, expected)]
     return replace(plan, ranks=ranks, decisions=decisions, prediction=expected)

@@ -144,7 +144,11 @@ def plan_json(plan: Plan) -> dict[str, Any]:
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
-    """What happened, beside the plan's prediction: median seconds of a step of either phase, peak memory in bytes."""
+    """What happened, beside the plan's prediction.
+
+    Median seconds of a step of either phase and, in the second, of waiting for other ranks; the speed-up over one rank,
+    whose seconds are the predicted ones; peak memory in bytes.
+    """
     values = {
         stage: [
             sum(seconds for name, seconds in record.parts.items() if name != "prepare")
@@ -154,7 +158,16 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
         for stage in ("sos", "coarse")
     }
     seconds = {stage: median(steps) if steps else None for stage, steps in values.items()}
-    return {"seconds": seconds["sos"], "seconds_coarse": seconds["coarse"], "peak_bytes": peak_memory()}
+    waited = [record.parts.get("communication", 0.0) for record in stylizer.history if record.stage == "sos"]
+    expected = stylizer.plan.prediction
+    one_rank = expected.seconds_one_rank if expected else None
+    return {
+        "seconds": seconds["sos"],
+        "seconds_coarse": seconds["coarse"],
+        "communication": median(waited) if waited else None,
+        "speed_up": one_rank / seconds["sos"] if one_rank and seconds["sos"] else None,
+        "peak_bytes": peak_memory(),
+    }
 
 
 #: Losses relative to the start, for which the report says when they were reached.

@@ -264,6 +264,14 @@ def _predictions(report: dict[str, Any]) -> Table:
         before, after = predicted.get(key), measured.get(key)
         ratio = after / before if before and after is not None else None
         rows.append([name, text(before), text(after), _number(ratio)])
+    one_rank = predicted.get("seconds_one_rank")
+    if one_rank and predicted.get("seconds"):
+        before, after = predicted["communication"], measured.get("communication")
+        ratio = after / before if before and after is not None else None
+        rows.append(["of it waiting for other ranks", _duration(before), _duration(after), _number(ratio)])
+        before, after = one_rank / predicted["seconds"], measured.get("speed_up")
+        ratio = after / before if after is not None else None
+        rows.append(["speed-up over one rank", _number(before), _number(after), _number(ratio)])
     return Table(
         [Column(""), Column("predicted", True), Column("measured", True), Column("measured / predicted", True)], rows
     )

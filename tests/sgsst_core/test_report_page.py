@@ -391,6 +391,24 @@ def test_prediction_stands_beside_the_measurement() -> None:
     ]
 
 
+def test_speed_up_of_several_ranks_stands_beside_its_prediction() -> None:
+    report = sample_report()
+    report["plan"]["prediction"] |= {"seconds_one_rank": 3.6, "communication": 0.1}
+    report["plan"]["measured"] |= {"communication": 0.2, "speed_up": 1.44}
+    cells = parsed_without_figures(report).cells
+    place = cells.index("of it waiting for other ranks")
+    assert cells[place : place + 8] == [
+        "of it waiting for other ranks",
+        "0.1 s",
+        "0.2 s",
+        "2",
+        "speed-up over one rank",
+        "1.8",
+        "1.44",
+        "0.8",
+    ]
+
+
 def test_approximations_stand_beside_the_exact_ones() -> None:
     page = parsed_without_figures(sample_report())
     place = page.cells.index("0.21")

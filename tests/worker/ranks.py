@@ -23,7 +23,7 @@ def on_ranks(size: int, function: Callable[..., Any], *arguments: Any) -> list[A
 
     The function and its arguments must be picklable.
     """
-    address = f"127.0.0.1:{_free_port()}"
+    address = f"127.0.0.1:{free_port()}"
     futures = [_pool().submit(_run, rank, size, address, function, arguments) for rank in range(size)]
     return [_result(future) for future in futures]
 
@@ -46,7 +46,8 @@ def _result(future: Future[Any]) -> Any:
     return future.result(timeout=300)
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nobody listens at."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port: int = listener.getsockname()[1]

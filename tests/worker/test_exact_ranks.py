@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -160,3 +161,42 @@ def test_gradients_of_a_steps_views_are_averaged() -> None:
     stylizer.run_step()
     assert stylizer.sh_dc.grad is not None
     assert relative_error(stylizer.sh_dc.grad, one_view_a_step_by_hand(views)) < 1e-6
+
+
+def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=20, keep=("ranks",), rebalance=rebalance)
+    stylizer = Stylizer(
+        wall(), cameras(2, 192, 144), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+    )
+    forward = stylizer.network.forward
+
+    def slowly(rgb: Tensor, **options: Any) -> Any:
+        started = time.perf_counter()
+        result = forward(rgb, **options)
+        time.sleep(4 * (time.perf_counter() - started))
+        return result
+
+    if collectives.rank == 1:
+        stylizer.network.forward = slowly  # type: ignore[method-assign]
+    before = stylizer.gradient(0, [0])[0]
+    colours = stylizer.sh_dc.detach().clone()
+    for _ in range(8):
+        stylizer.run_step()
+    speeds = stylizer.loss.speeds
+    with torch.no_grad():
+        stylizer.sh_dc.copy_(colours)
+    return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}
+
+
+def test_a_slow_rank_gets_less_to_do_and_the_gradient_stays() -> None:
+    first, second = on_ranks(2, run_beside_a_slow_rank, True)
+    assert first["speeds"] == second["speeds"]
+    assert first["speeds"][0] > 1.3 * first["speeds"][1]
+    assert relative_error(first["after"], first["before"]) < 1e-5
+    assert torch.equal(first["after"], second["after"])
+
+
+def test_work_is_not_shared_out_anew_where_that_is_not_wanted() -> None:
+    first, _ = on_ranks(2, run_beside_a_slow_rank, False)
+    assert first["speeds"] == (1.0, 1.0)
+    assert torch.equal(first["after"], first["before"])
