@@ -89,6 +89,7 @@ VARIANTS = {
         Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
         Variant("half-weights", "standard with blend weights in half precision", settings={"kept_weights": "half"}),
         Variant("no-kept-weights", "standard, blend weights computed anew", settings={"kept_weights": "none"}),
+        Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
         Variant("pruned", "standard without hardly visible Gaussians", settings={"prune_weight": PRUNE_WEIGHT}),
     )
 }
