@@ -14,6 +14,7 @@ import multiprocessing
 import socket
 import statistics
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,8 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
     camera = spread(read_cameras(arguments.cameras), 1)[0]
     style = load_image(arguments.style)
     results = []
-    with process_group(rank, arguments.ranks, address) as collectives:
+    # One rank may take long alone, while the others wait.
+    with process_group(rank, arguments.ranks, address, timeout=timedelta(hours=1)) as collectives:
         link = probe_link(collectives, torch.device("cpu"))
         for size in arguments.sizes.split(","):
             view = with_size(camera, *map(int, size.split("x")))

@@ -61,6 +61,13 @@ class Collectives(Protocol):
         """What `make` returns on rank 0, the only one that calls it; an `SgsstError` of it is raised on every rank."""
         ...
 
+    def expect(self, seconds: float) -> None:
+        """From now on ranks meet about so often: one that keeps the others waiting for much longer is given up.
+
+        Until this is called, they wait for as long as it may take to prepare a job.
+        """
+        ...
+
     def first(self, count: int) -> Collectives | None:
         """The group of the first `count` ranks; None on the others."""
         ...
@@ -96,6 +103,9 @@ class _Alone:
 
     def from_first(self, make: Callable[[], T]) -> T:
         return make()
+
+    def expect(self, seconds: float) -> None:
+        return None
 
     def first(self, count: int) -> Collectives | None:
         return self

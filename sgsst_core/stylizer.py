@@ -226,6 +226,9 @@ class Stylizer:
         self.collectives = taking_part
         self.groups = math.gcd(self.settings.views_per_step, taking_part.size)
         self.group = taking_part.split(self.groups)
+        expected = self.plan.prediction
+        for ranks in (self.collectives, self.group):
+            ranks.expect(expected.seconds if expected else 0.0)
         #: Pixels and seconds of this rank's share of the network in each step, until ranks have been compared.
         self._pace: list[tuple[int, float]] | None = [] if self.settings.rebalance and self.group.size > 1 else None
         self._cost = 0

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch.distributed.distributed_c10d import _set_pg_timeout
 
 from sgsst_core.collectives import ALONE, Collectives, Merged
 from sgsst_core.errors import SgsstError
@@ -25,8 +26,12 @@ from sgsst_core.statistics import LayerStatistics
 
 T = TypeVar("T")
 
-#: After which a rank that waits for another one gives up.
+#: After which a rank that waits for another one gives up, at the earliest.
 DEFAULT_TIMEOUT = timedelta(seconds=120)
+#: The same while a job is prepared: one rank may read or plan for long, with nothing for the others to do.
+PREPARING = timedelta(minutes=30)
+#: The same, in iterations, where one takes long: ranks are never so uneven.
+ITERATIONS = 5
 
 
 @contextmanager
@@ -45,7 +50,7 @@ def process_group(
         size: ranks in all; with 1 there is no group.
         address: "host:port" at which rank 0 listens.
         device: that this rank computes on; tensors of all exchanges lie there.
-        timeout: of each exchange.
+        timeout: of each exchange, once `Collectives.expect` was called.
     """
     if size == 1:
         yield ALONE
@@ -55,7 +60,9 @@ def process_group(
         torch.cuda.set_device(device)
     # Values that are not tensors (plans, decisions) travel between CPUs in any case.
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
-    dist.init_process_group(backend, init_method=f"tcp://{address}", rank=rank, world_size=size, timeout=timeout)
+    dist.init_process_group(
+        backend, init_method=f"tcp://{address}", rank=rank, world_size=size, timeout=max(timeout, PREPARING)
+    )
     collectives = ProcessGroupCollectives(dist.group.WORLD, device, timeout)
     try:
         yield collectives
@@ -70,7 +77,7 @@ class ProcessGroupCollectives:
     Args:
         group: whose exchanges these are.
         device: of the tensors.
-        timeout: for groups that are made of this one.
+        timeout: see `process_group`.
     """
 
     def __init__(self, group: Any, device: torch.device, timeout: timedelta) -> None:
@@ -163,6 +170,10 @@ class ProcessGroupCollectives:
             raise error
         return value
 
+    def expect(self, seconds: float) -> None:
+        """See `Collectives`."""
+        _set_pg_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * seconds)), self._group)
+
     def first(self, count: int) -> Collectives | None:
         """See `Collectives`."""
         return self if count == self.size else self._subgroup([list(range(count))])
@@ -181,7 +192,7 @@ class ProcessGroupCollectives:
         own: Collectives | None = None
         for ranks in all_ranks:
             members = [dist.get_global_rank(self._group, rank) for rank in ranks]
-            group = dist.new_group(members, timeout=self._timeout)
+            group = dist.new_group(members, timeout=max(self._timeout, PREPARING))
             if self.rank in ranks:
                 own = ALONE if len(ranks) == 1 else ProcessGroupCollectives(group, self._device, self._timeout)
         if isinstance(own, ProcessGroupCollectives):

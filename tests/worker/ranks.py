@@ -18,13 +18,13 @@ from worker.process_group import process_group
 MOST_RANKS = 4
 
 
-def on_ranks(size: int, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+def on_ranks(size: int, function: Callable[..., Any], *arguments: Any, timeout: float = 60.0) -> list[Any]:
     """What function(collectives, *arguments) returns on each rank; its first error is raised here.
 
-    The function and its arguments must be picklable.
+    The function and its arguments must be picklable. Ranks give each other up after `timeout` seconds.
     """
     address = f"127.0.0.1:{free_port()}"
-    futures = [_pool().submit(_run, rank, size, address, function, arguments) for rank in range(size)]
+    futures = [_pool().submit(_run, rank, size, address, timeout, function, arguments) for rank in range(size)]
     return [_result(future) for future in futures]
 
 
@@ -36,9 +36,11 @@ def _pool() -> ProcessPoolExecutor:
     return pool
 
 
-def _run(rank: int, size: int, address: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def _run(
+    rank: int, size: int, address: str, timeout: float, function: Callable[..., Any], arguments: tuple[Any, ...]
+) -> Any:
     torch.set_num_threads(1)
-    with process_group(rank, size, address, timeout=timedelta(seconds=60)) as collectives:
+    with process_group(rank, size, address, timeout=timedelta(seconds=timeout)) as collectives:
         return function(collectives, *arguments)
 
 

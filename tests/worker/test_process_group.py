@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -172,3 +173,24 @@ def test_one_rank_has_nobody_to_tell() -> None:
     assert ALONE.scatter_rows(band, [(0, HEIGHT)]) is band
     assert ALONE.sum(band) is band
     assert ALONE.gather("a") == ["a"]
+
+
+def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
+    """Whether rank 1 waits for rank 0, which comes three seconds late, where one second is the time-out."""
+    collectives.gather(None)
+    if expected is not None:
+        collectives.expect(expected)
+    if collectives.rank == 0:
+        time.sleep(3)
+    try:
+        collectives.gather(None)
+    except RuntimeError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("expected", "patient"), [(None, True), (20.0, True), (0.1, False)], ids=["preparing", "slow", "quick"]
+)
+def test_ranks_wait_as_long_as_an_iteration_may_take(expected: float | None, patient: bool) -> None:
+    assert on_ranks(2, keep_waiting, expected, timeout=1.0)[1] is patient
