@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from rich.table import Column, Table
 
-from api.jobs import SceneRequest, check_choice, check_folder, read_cameras_of
 from sgsst_core.error_time import Curve, Point, Variant, as_dict, choose_variants, error_time, write_plot
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files import ensure_writable_folder
@@ -19,6 +18,7 @@ from sgsst_core.ply import read_scene, write_stylized
 from sgsst_core.report import machine, write_json
 from sgsst_core.stability import Case, Measurement, all_cases, measure
 from sgsst_core.weights import load_weights
+from worker.job import SceneRequest, check_choice, check_folder, read_cameras_of
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -30,8 +30,9 @@ from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
 from sgsst_core.settings import EVERYTHING, KeptWeights, PositionWeights, Precision, PresetName, make_settings
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
-    from api.jobs import Job, Result, StylizeRequest
     from sgsst_core.loop import Progress
+    from worker.attempts import RanksResult, WorkerOptions
+    from worker.job import Outputs, Prepared, Result, StylizeRequest
 
 #: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
 BAD_INPUT, FAILURE = 2, 1
@@ -165,6 +166,16 @@ def stylize(
         bool, typer.Option("--keep-everything", help="Leave nothing out; slower, with the same result.")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")] = False,
+    checkpoint_seconds: Annotated[
+        float, typer.Option(min=0, help="Between checkpoints: what is lost at most when a worker is.")
+    ] = 60.0,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Work on so many GPUs, or parts of the processor: here, or in RAY_ADDRESS's cluster."),
+    ] = None,
+    rank_timeout: Annotated[
+        float, typer.Option(min=1, help="Seconds without an answer after which a worker counts as lost.")
+    ] = 120.0,
 ) -> None:
     """Give a scene the style of a picture."""
     settings = make_settings(
@@ -192,52 +203,109 @@ def stylize(
         kept_weights=kept_weights,
         keep=EVERYTHING if keep_everything else None,
     )
-    from api.jobs import SceneRequest, StylizeRequest
+    from worker.attempts import WorkerOptions
+    from worker.job import SceneRequest, StylizeRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
-    _stylize(StylizeRequest(source, style, images, out, backbone, resume, settings), context.obj)
+    request = StylizeRequest(source, style, images, out, backbone, resume, settings)
+    _stylize(request, context.obj, workers, WorkerOptions(rank_timeout, checkpoint_seconds))
 
 
-def _stylize(request: StylizeRequest, arguments: Sequence[str]) -> None:
+def _stylize(
+    request: StylizeRequest,
+    arguments: Sequence[str],
+    workers: int | None = None,
+    options: WorkerOptions | None = None,
+) -> None:
     """Prepare, run, and tell what was decided and what came out; `arguments` are for the command to go on with."""
-    from api.jobs import execute, prepare
+    from worker.attempts import WorkerOptions
+    from worker.job import check_request
+
+    outputs = check_request(request)
+    command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
+    options = options or WorkerOptions()
+    if workers is None:
+        _stylize_here(request, outputs, command, options.checkpoint_seconds)
+    else:
+        _stylize_on_ranks(request, outputs, command, workers, options)
+
+
+def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
+    """One rank, in this process."""
+    from worker.job import describe, execute, prepare
 
     with _status("Reading the scene and preparing its views"):
-        job = prepare(request)
-    with stop_on_signal(lambda: error_console.print("Stopping after this step; Ctrl-C again aborts at once.")) as stop:
-        _announce(job)
-        with _training_bar(job) as progress:
-            result = execute(job, progress=progress, stop=stop, warn=error_console.print)
-    command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
+        job = prepare(request, warn=error_console.print)
+    with stop_on_signal(_announce_stop) as stop:
+        prepared = describe(job)
+        _announce(prepared)
+        with _training_bar() as bar:
+            bar.start(prepared)
+            result = execute(
+                job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
+            )
     if result.stopped == "interrupted":
-        error_console.print(
-            f"Stopped at step {job.stylizer.step} of {job.stylizer.total}; saved in {job.outputs.checkpoint}.\n"
-            f"To go on, run:\n{command}"
-        )
+        _tell_interrupted(outputs, result.step, result.total, result.step, command)
         raise typer.Exit(stop.exit_code)
-    _conclude(job, result, command)
+    _conclude(outputs, result, command)
 
 
-def _announce(job: Job) -> None:
-    from api.jobs import describe
+def _stylize_on_ranks(
+    request: StylizeRequest, outputs: Outputs, command: str, workers: int, options: WorkerOptions
+) -> None:
+    """Several ranks, in processes of their own."""
+    from worker.attempts import Listener, stylize_on_ranks
 
-    for heading, line in describe(job):
+    with stop_on_signal(_announce_stop) as stop, _training_bar() as bar:
+
+        def prepared(found: Prepared) -> None:
+            _announce(found)
+            bar.start(found)
+
+        listener = Listener(prepared, bar.show, error_console.print, error_console.print, stop)
+        ended = stylize_on_ranks(request, workers, listener, options=options)
+    if ended.interrupted:
+        _tell_interrupted(outputs, ended.step, ended.total, ended.saved, command)
+        raise typer.Exit(stop.exit_code)
+    assert ended.result is not None
+    _tell_losses(ended)
+    _conclude(outputs, ended.result, command)
+
+
+def _announce_stop() -> None:
+    error_console.print("Stopping after this step; Ctrl-C again aborts at once.")
+
+
+def _announce(prepared: Prepared) -> None:
+    for heading, line in prepared.lines:
         out_console.print(f"{heading + ':':<22}{line}")
-    if job.state is None and job.outputs.checkpoint.exists():
+
+
+def _tell_interrupted(outputs: Outputs, step: int, total: int, saved: int | None, command: str) -> None:
+    if saved is None:
+        error_console.print(f"Stopped at step {step}; nothing has been saved.")
+        return
+    there = "saved" if saved == step else f"step {saved} is saved"
+    error_console.print(
+        f"Stopped at step {step} of {total}; {there} in {outputs.checkpoint}.\nTo go on, run:\n{command}"
+    )
+
+
+def _tell_losses(ended: RanksResult) -> None:
+    for attempt in ended.attempts:
         out_console.print(
-            f"{'note:':<22}{job.outputs.checkpoint} of an earlier run is there. This run starts anew and will "
-            "replace it; --resume would go on from it."
+            f"{'lost:':<22}{attempt.reason}, at step {attempt.last_step}; on from step {attempt.saved_step} "
+            f"{attempt.seconds_to_resume:.1f} s later"
         )
 
 
-def _conclude(job: Job, result: Result, command: str) -> None:
+def _conclude(outputs: Outputs, result: Result, command: str) -> None:
     from sgsst_core.report import mean_loss
 
     before, after = mean_loss(result.before), mean_loss(result.after)
     out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
-    for line in _time_bought(job, result):
+    for line in _time_bought(result):
         out_console.print(f"{'time bought:':<22}{line}")
-    outputs = job.outputs
     paths = [("stylized scene", outputs.ply)]
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
@@ -245,10 +313,10 @@ def _conclude(job: Job, result: Result, command: str) -> None:
     for heading, path in paths:
         out_console.print(f"{heading + ':':<22}{path}")
     if result.stopped in _ENDED:
-        out_console.print(f"Stopped at step {job.stylizer.step} of {job.stylizer.total}: {_ENDED[result.stopped]}.")
+        out_console.print(f"Stopped at step {result.step} of {result.total}: {_ENDED[result.stopped]}.")
     if result.stopped == "max-seconds":
         out_console.print(
-            f"The time was up at step {job.stylizer.step} of {job.stylizer.total}. The checkpoint stays: to go on, "
+            f"The time was up at step {result.step} of {result.total}. The checkpoint stays: to go on, "
             f"give more time (--max-seconds counts from the beginning):\n{command}"
         )
     if result.report_error is not None:
@@ -262,10 +330,8 @@ _ENDED = {
 }
 
 
-def _time_bought(job: Job, result: Result) -> list[str]:
-    from sgsst_core.report import bought
-
-    found = bought(job.stylizer, result.before)
+def _time_bought(result: Result) -> list[str]:
+    found = result.bought
     if found is None:
         return []
     lines = [
@@ -298,7 +364,8 @@ def plan(
     memory_limit: MemoryOption = None,
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
-    from api.jobs import SceneRequest, make_plan
+    from api.jobs import make_plan
+    from worker.job import SceneRequest
 
     settings = make_settings(
         preset,
@@ -338,7 +405,8 @@ def check(
     near: NearOption = NEAR,
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
-    from api.jobs import SceneRequest, check_inputs
+    from api.jobs import check_inputs
+    from worker.job import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
     with _status("Looking at the scene and every view"):
@@ -366,7 +434,8 @@ def render(
     drop_invalid: DropOption = False,
 ) -> None:
     """Render the views of a scene."""
-    from api.jobs import SceneRequest, render_views
+    from api.jobs import render_views
+    from worker.job import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -382,8 +451,8 @@ def demo(
 ) -> None:
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.demo_scene import build_demo
-    from api.jobs import SceneRequest, StylizeRequest, check_folder
     from sgsst_core.weights import load_weights
+    from worker.job import SceneRequest, StylizeRequest, check_folder
 
     check_folder(out)
     try:
@@ -424,7 +493,7 @@ def bench_error_time(
 ) -> None:
     """Run variants of a job for the same time each, and plot the error that is left against seconds."""
     from api.bench import ErrorTimeRequest, error_time_table, point_line, run_error_time
-    from api.jobs import SceneRequest
+    from worker.job import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     settings = {"coarsest_side": coarsest_side, "background": background, "near": near, "memory_limit": memory_limit}
@@ -507,9 +576,30 @@ def _bar(*columns: ProgressColumn) -> Bar:
     return Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal)
 
 
+class _TrainingBar:
+    """A live bar, or a line a minute where there is no terminal."""
+
+    def __init__(self, bar: Bar) -> None:
+        self._bar = bar
+        self._task = bar.add_task("starting", total=None, loss="-", left="-")
+        self._last_line = time.monotonic()
+
+    def start(self, prepared: Prepared) -> None:
+        """Show where the job starts."""
+        self._bar.update(self._task, total=prepared.total, completed=prepared.step)
+
+    def show(self, progress: Progress) -> None:
+        """Show a step."""
+        stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
+        loss, left = f"{progress.loss:.3g}", _clock(progress.seconds_left)
+        self._bar.update(self._task, description=stage, completed=progress.step, loss=loss, left=left)
+        if self._bar.disable and time.monotonic() - self._last_line >= LOG_SECONDS:
+            self._last_line = time.monotonic()
+            error_console.print(f"{stage}: step {progress.step} of {progress.total}, loss {loss}, {left} left")
+
+
 @contextmanager
-def _training_bar(job: Job) -> Iterator[Callable[[Progress], None]]:
-    """A live bar, or a line a minute where there is no terminal; yields what to call with each step's `Progress`."""
+def _training_bar() -> Iterator[_TrainingBar]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -517,22 +607,8 @@ def _training_bar(job: Job) -> Iterator[Callable[[Progress], None]]:
         TextColumn("loss {task.fields[loss]}"),
         TextColumn("{task.fields[left]} left"),
     )
-    start = job.state.step if job.state else 0
     with _bar(*columns) as bar:
-        task = bar.add_task("starting", total=job.stylizer.total, completed=start, loss="-", left="-")
-
-        last_line = time.monotonic()
-
-        def show(progress: Progress) -> None:
-            nonlocal last_line
-            stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
-            loss, left = f"{progress.loss:.3g}", _clock(progress.seconds_left)
-            bar.update(task, description=stage, completed=progress.step, loss=loss, left=left)
-            if bar.disable and time.monotonic() - last_line >= LOG_SECONDS:
-                last_line = time.monotonic()
-                error_console.print(f"{stage}: step {progress.step} of {progress.total}, loss {loss}, {left} left")
-
-        yield show
+        yield _TrainingBar(bar)
 
 
 def _clock(seconds: float) -> str:

@@ -56,6 +56,12 @@ class WeightsError(InvalidInputError):
     code = "invalid-weights"
 
 
+class SceneTooLargeError(InvalidInputError):
+    """The memory of a machine, or of its GPU, cannot hold the scene."""
+
+    code = "scene-too-large"
+
+
 class CheckpointError(InvalidInputError):
     """A checkpoint is missing, corrupt or belongs to another job."""
 
@@ -66,6 +72,12 @@ class TooManyIntersectionsError(SgsstError):
     """A view has more Gaussian/raster-tile intersections than the rasterizer can address."""
 
     code = "too-many-intersections"
+
+
+class RanksFailedError(SgsstError):
+    """The workers of a job were lost too often, or failed for a reason of their own."""
+
+    code = "workers-failed"
 
 
 class RanksDriftedError(SgsstError):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.camera import Camera
-from sgsst_core.checkpoint import load_checkpoint, save_checkpoint
+from sgsst_core.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.constants import ALPHA_MIN, COLOUR_OFFSET, SH_C0, TRANSMITTANCE_MIN
 from sgsst_core.errors import DivergedError
 from sgsst_core.loop import run
@@ -202,7 +202,7 @@ def _resumed(full: bool) -> CaseResult:
         first.run_step()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
-        save_checkpoint(path, first.state(), "job")
-        second.load_state(load_checkpoint(path, "job"))
+        save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, first.start(), "run", versions()), "job")
+        second.load_state(load_checkpoint(path, "job").state)
     run(second)
     return CaseResult(float((whole.sh_dc - second.sh_dc).detach().abs().max()), 0.0, "the same bits")

@@ -1,0 +1,107 @@
+"""Where ranks run: a place for each of them, reserved together, with its share of the machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+#: Seconds to wait for places that are taken; what lost ranks held is free again after a moment.
+PLACE_SECONDS = 5.0
+
+
+class NoRoomError(Exception):
+    """There is not a single place."""
+
+
+@dataclass(frozen=True)
+class Reservation:
+    """Places for ranks.
+
+    Attributes:
+        group: Ray's placement group.
+        ranks: how many places.
+        threads: processor cores for each.
+        gpus: for each, 0 or 1.
+    """
+
+    group: Any
+    ranks: int
+    threads: int
+    gpus: int
+
+    def actor_options(self) -> list[dict[str, Any]]:
+        """Options of each rank's actor: dies once, and for good."""
+        from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+
+        return [
+            {
+                "num_cpus": self.threads,
+                "num_gpus": self.gpus,
+                "max_restarts": 0,
+                "max_task_retries": 0,
+                "max_concurrency": 2,
+                "scheduling_strategy": PlacementGroupSchedulingStrategy(self.group, placement_group_bundle_index=index),
+            }
+            for index in range(self.ranks)
+        ]
+
+    def release(self) -> None:
+        """Give the places back."""
+        from ray.util import remove_placement_group
+
+        remove_placement_group(self.group)
+
+
+def reserve(workers: int) -> Reservation:
+    """Places for as many of the ranks as there is room for now.
+
+    GPUs, where the cluster has any, are given out one for each rank, on as few machines as possible; otherwise ranks
+    are spread over the machines, and share the cores.
+
+    Raises:
+        NoRoomError: for none.
+    """
+    nodes = _nodes()
+    gpus = sum(int(node.get("GPU", 0)) for node in nodes)
+    wanted = min(workers, gpus) if gpus else workers
+    cores = [int(node.get("CPU", 0)) for node in nodes]
+    threads = _threads(cores, wanted)
+    wanted = min(wanted, sum(count // threads for count in cores))
+    deadline = time.monotonic() + PLACE_SECONDS
+    while wanted > 0:
+        group = _place(wanted, threads, 1 if gpus else 0, max(deadline - time.monotonic(), 1.0))
+        if group is not None:
+            return Reservation(group, wanted, threads, 1 if gpus else 0)
+        if threads > 1 and not gpus:  # other work may hold a part of the cores
+            threads = 1
+        else:
+            wanted -= 1
+    raise NoRoomError("Ray has no free place for a worker")
+
+
+def _nodes() -> list[dict[str, float]]:
+    """The resources of every machine that is there."""
+    import ray
+
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
+
+
+def _threads(cores: list[int], ranks: int) -> int:
+    """The most cores that each of so many ranks can have on these machines; at least one."""
+    return max(
+        (each for each in range(1, max(cores, default=1) + 1) if sum(count // each for count in cores) >= ranks),
+        default=1,
+    )
+
+
+def _place(ranks: int, threads: int, gpus: int, timeout: float) -> Any:
+    """A placement group once it is there; None where that takes too long."""
+    from ray.util import placement_group, remove_placement_group
+
+    bundle = {"CPU": threads, **({"GPU": gpus} if gpus else {})}
+    group = placement_group([bundle] * ranks, strategy="PACK" if gpus else "SPREAD")
+    if group.wait(timeout):
+        return group
+    remove_placement_group(group)
+    return None

@@ -1,0 +1,84 @@
+"""Processes as the system sees them: telling them apart, and ending them for certain."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class ProcessId:
+    """A process of some machine: a number alone may belong to another one later.
+
+    Attributes:
+        home: see `home`.
+        number: the process id.
+        started: when it started, seconds as psutil gives them.
+    """
+
+    home: tuple[str, ...]
+    number: int
+    started: float
+
+    @staticmethod
+    def of_this() -> ProcessId:
+        """The one that calls this."""
+        return ProcessId(home(), os.getpid(), psutil.Process().create_time())
+
+    def find(self) -> psutil.Process | None:
+        """The process, on its own machine; None where it is gone."""
+        try:
+            process = psutil.Process(self.number)
+            return process if abs(process.create_time() - self.started) < 1 else None
+        except psutil.Error:
+            return None
+
+
+def home() -> tuple[str, ...]:
+    """Equal for processes that see each other: one kernel, one view of its processes, one user."""
+    if not sys.platform.startswith("linux"):
+        return socket.gethostname(), str(os.geteuid())
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return boot, os.readlink("/proc/self/ns/pid"), str(os.geteuid())
+
+
+def kill(processes: Sequence[ProcessId], timeout: float = 10.0) -> None:
+    """End processes of this machine, stopped ones too, and wait until they are gone."""
+    found = [process for identity in processes if (process := identity.find()) is not None]
+    for process in found:
+        try:
+            process.kill()
+        except psutil.Error:
+            continue
+    psutil.wait_procs(found, timeout)
+
+
+def die_with_parent() -> None:
+    """Let the system kill this process when its parent ends, even while it is stopped. Only Linux can."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def interface_towards(address: str) -> str | None:
+    """The network interface over which this machine reaches an address; None where that cannot be told."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((address, 9))  # sends nothing: only the route is looked up
+        except OSError:
+            return None
+        own = probe.getsockname()[0]
+    for name, addresses in psutil.net_if_addrs().items():
+        if any(entry.address.partition("%")[0] == own for entry in addresses):
+            return name
+    return None
