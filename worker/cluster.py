@@ -27,6 +27,8 @@ from worker import sweeper
 OBJECT_STORE_BYTES = 512 << 20
 #: The longest folder for which the names of Ray's sockets fit what the system allows (107 bytes).
 _LONGEST_FOLDER = 40
+#: Of every Ray that this process starts: Ray reads it once.
+_SECRET = secrets.token_hex(32)
 #: Processes without which a Ray of one machine cannot go on.
 _DAEMONS = ("raylet", "gcs_server")
 
@@ -88,13 +90,13 @@ class Cluster:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray has many for this, some of them plain ones
             raise RanksFailedError(
-                f"The Ray cluster at {self.address} cannot be joined: {error}. Check RAY_ADDRESS, or leave it out for "
+                f"The Ray cluster at {self.address} cannot be joined: {_first_line(error)}. Check RAY_ADDRESS, or leave it out for "
                 "workers on this machine."
             ) from error
 
     def _start(self) -> None:
         os.environ["RAY_AUTH_MODE"] = "token"
-        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+        os.environ["RAY_AUTH_TOKEN"] = _SECRET
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         import ray
 
@@ -126,7 +128,7 @@ class Cluster:
             if not isinstance(error, Exception):
                 raise
             raise RanksFailedError(
-                f"Ray could not be started on this machine: {error}. Run without --workers, or set RAY_ADDRESS to a "
+                f"Ray could not be started on this machine: {_first_line(error)}. Run without --workers, or set RAY_ADDRESS to a "
                 "cluster."
             ) from error
         started = [process for process in psutil.Process().children() if process not in earlier]
@@ -159,3 +161,7 @@ def _quiet() -> None:
     import ray._private.worker as worker
 
     worker.print_to_stdstream = lambda *arguments, **options: None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__).rstrip(".")
