@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import secrets
 import shutil
@@ -49,6 +50,13 @@ def atomic_path(target: Path) -> Iterator[Path]:
     _flush_folder(final.parent)
 
 
+def remove_leftovers(target: Path) -> None:
+    """Delete what writers of `target` that were killed have left beside it. Nobody may be writing it now."""
+    final = Path(os.path.realpath(target))
+    for path in final.parent.glob(f".sgsst-{_tag(final)}-*.part*"):
+        path.unlink(missing_ok=True)
+
+
 def ensure_writable_folder(path: Path) -> None:
     """Create the folder where it is missing, and prove by a trial file that it can be written to.
 
@@ -68,7 +76,7 @@ def _reserve(final: Path) -> Path:
     """Create an empty file beside `final`, with the permissions that a newly written file gets."""
     if final.is_dir():
         raise OutputError(f"{final}: is a folder. Name a file.")
-    temporary = final.with_name(f".sgsst-{secrets.token_hex(6)}.part{final.suffix}")
+    temporary = final.with_name(f".sgsst-{_tag(final)}-{secrets.token_hex(6)}.part{final.suffix}")
     try:
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     except OSError as error:
@@ -76,6 +84,11 @@ def _reserve(final: Path) -> Path:
             f"{final.parent}: is not writable: {error.strerror}. Create the folder, or name another place."
         ) from error
     return temporary
+
+
+def _tag(final: Path) -> str:
+    """What temporary files of a target have in common; its name itself may be as long as names can be."""
+    return hashlib.sha256(os.fsencode(final.name)).hexdigest()[:8]
 
 
 def _flush(path: Path) -> None:

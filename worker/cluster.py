@@ -90,8 +90,8 @@ class Cluster:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray has many for this, some of them plain ones
             raise RanksFailedError(
-                f"The Ray cluster at {self.address} cannot be joined: {_first_line(error)}. Check RAY_ADDRESS, or leave it out for "
-                "workers on this machine."
+                f"The Ray cluster at {self.address} cannot be joined: {_first_line(error)}. Check RAY_ADDRESS, or "
+                "leave it out for workers on this machine."
             ) from error
 
     def _start(self) -> None:
@@ -128,8 +128,8 @@ class Cluster:
             if not isinstance(error, Exception):
                 raise
             raise RanksFailedError(
-                f"Ray could not be started on this machine: {_first_line(error)}. Run without --workers, or set RAY_ADDRESS to a "
-                "cluster."
+                f"Ray could not be started on this machine: {_first_line(error)}. Run without --workers, or set "
+                "RAY_ADDRESS to a cluster."
             ) from error
         started = [process for process in psutil.Process().children() if process not in earlier]
         self._daemons = [process for process in started if process.name() in _DAEMONS]

@@ -22,7 +22,7 @@ from sgsst_core.check import Finding, check_scene, check_style, check_views
 from sgsst_core.checkpoint import Checkpoint, Checkpoints, fingerprint, versions
 from sgsst_core.collectives import ALONE, Collectives
 from sgsst_core.errors import CameraError, CheckpointError, OutputError, SettingsError, SgsstError
-from sgsst_core.files import ensure_writable_folder
+from sgsst_core.files import ensure_writable_folder, remove_leftovers
 from sgsst_core.images import check_photos, load_image, load_photo
 from sgsst_core.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.measure import Measurements, with_measuring
@@ -139,6 +139,11 @@ class Outputs:
     def checkpoint(self) -> Path:
         """The newest of the `checkpoints`."""
         return self._beside(".checkpoint.safetensors")
+
+    @property
+    def all(self) -> list[Path]:
+        """Every file, but for the older checkpoint, which is never written itself."""
+        return [self.ply, self.report, self.page, self.plan, self.sheet, self.curves, self.checkpoint]
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -354,6 +359,8 @@ def execute(
         stylizer.load_state(job.resumed.state)
     if first:
         outputs.ply.parent.mkdir(parents=True, exist_ok=True)
+        for path in outputs.all:
+            remove_leftovers(path)  # of an attempt that was killed
     unsaved: list[OutputError] = []
     run_id = run_id or secrets.token_hex(8)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files import atomic_path, ensure_writable_folder
+from sgsst_core.files import atomic_path, ensure_writable_folder, remove_leftovers
 
 
 def test_the_target_appears_only_at_the_end_and_nothing_else_stays(tmp_path: Path) -> None:
@@ -104,3 +104,13 @@ def test_ensure_writable_folder_refuses_files(tmp_path: Path) -> None:
 def test_ensure_writable_folder_tries_to_write() -> None:
     with pytest.raises(OutputError, match="not writable"):
         ensure_writable_folder(Path("/proc/self"))
+
+
+def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    target, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    paths = []
+    for path in (target, other):
+        writer = atomic_path(path)
+        paths.append(writer.__enter__())
+    remove_leftovers(target)
+    assert [path.exists() for path in paths] == [False, True]

@@ -1,0 +1,101 @@
+"""A job from files to files on one rank: what it goes on from, and what it does where the disk is full."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.errors import CheckpointError
+from sgsst_core.ply import read_scene
+from tests.worker.faults import Fault, small_request
+from worker.job import Job, Result, Resume, StylizeRequest, execute, prepare
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+
+def go_on(
+    job: Job, steps: int | None = None, checkpoint_seconds: float = 60.0, warnings: list[str] | None = None
+) -> Result:
+    """Run a job; with `steps`, ask it to stop after so many."""
+    made = 0
+
+    def count(progress: object) -> None:
+        nonlocal made
+        made += 1
+
+    return execute(
+        job,
+        progress=count,
+        stop=lambda: steps is not None and made >= steps,
+        warn=(warnings if warnings is not None else []).append,
+        checkpoint_seconds=checkpoint_seconds,
+        run_id="run",
+    )
+
+
+@pytest.fixture
+def request_(tmp_path: Path) -> StylizeRequest:
+    return small_request(tmp_path, 8)
+
+
+def test_a_resumed_job_follows_the_plan_of_the_first(request_: StylizeRequest, tmp_path: Path) -> None:
+    whole = small_request(tmp_path / "whole", 8)
+    go_on(prepare(whole))
+    first = prepare(request_)
+    assert go_on(first, steps=3).stopped == "interrupted"
+    second = prepare(request_, resume=Resume(True))
+    assert second.resumed is not None
+    assert second.resumed.state.step == 3
+    assert second.stylizer.plan == second.resumed.plan
+    assert second.stylizer.plan.prediction == first.stylizer.plan.prediction
+    assert go_on(second).stopped == "finished"
+    assert request_.out.read_bytes() == whole.out.read_bytes()
+    assert not Path(request_.out).with_name("s.checkpoint.safetensors").exists()
+    assert not Path(request_.out).with_name("s.checkpoint.previous.safetensors").exists()
+
+
+def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: StylizeRequest) -> None:
+    job = prepare(request_)
+    go_on(job, steps=4, checkpoint_seconds=0)
+    job.outputs.checkpoint.write_bytes(job.outputs.checkpoint.read_bytes()[:-100])
+    warnings: list[str] = []
+    again = prepare(request_, resume=Resume(True), warn=warnings.append)
+    assert again.resumed is not None
+    # The last one was written when the job was asked to stop, the one before after the same step.
+    assert again.resumed.state.step == 4
+    assert len(warnings) == 1
+    assert "not a readable checkpoint" in warnings[0]
+
+
+def test_what_may_start_anew_does_so_without_a_checkpoint(request_: StylizeRequest) -> None:
+    with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
+        prepare(request_, resume=Resume(True))
+    assert prepare(request_, resume=Resume(True, required=False)).resumed is None
+    go_on(prepare(request_), steps=2)
+    assert prepare(request_, resume=Resume(True, required=False, run="another run")).resumed is None
+    found = prepare(request_, resume=Resume(True, required=False, run="run")).resumed
+    assert found is not None
+    assert found.state.step == 2
+
+
+def test_a_disk_that_is_full_for_a_while_is_a_warning(
+    request_: StylizeRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sgsst_core import checkpoint
+
+    monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # put back what the fault leaves
+    fault = Fault(0, "checkpoint", 2, "full")
+    fault.write(request_)
+    fault.arm(request_)
+    warnings: list[str] = []
+    assert go_on(prepare(request_), checkpoint_seconds=0, warnings=warnings).stopped == "finished"
+    assert len(warnings) == 1
+    assert "No checkpoint could be written" in warnings[0]
+    assert len(read_scene(request_.out).scene) == 616
+    left = {path.suffix for path in request_.out.parent.iterdir()}
+    assert ".safetensors" not in left
+    report = json.loads(request_.out.with_name("s.report.json").read_text())
+    assert report["workers"]["used"] == report["workers"]["asked"] == 1
+    assert report["workers"]["attempts"] == []
