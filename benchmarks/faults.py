@@ -1,0 +1,211 @@
+"""Kill ranks, Ray and the driver at random moments of small jobs, and see what it costs and what comes out.
+
+python -m benchmarks.faults [--faults 33] [--drivers 3] [--seed 0]
+
+Jobs of two ranks on this machine; faults follow each other within a job, one an attempt. Results go to
+benchmarks/results/faults.json: for each fault what happened, steps lost, and seconds from the fault to the first step
+after it; for each job its loss against that of an undisturbed one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import psutil
+
+from benchmarks.machine import write_result
+from sgsst_core.loop import Progress
+from sgsst_core.stylizer import mean_loss
+from tests.worker.faults import Fault, FaultyRank, Place, fired, small_request
+from worker.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
+from worker.cluster import Cluster
+from worker.job import StylizeRequest
+
+STEPS = 250
+#: Faults of one job: an attempt makes some dozen steps before its fault.
+FAULTS_A_JOB = 9
+CHECKPOINT_SECONDS, RANK_TIMEOUT = 0.5, 5.0
+#: Of every ten faults: ranks that are stopped instead of killed, and Ray's own processes.
+STOPPED, DAEMONS = 2, 1
+
+
+@dataclass(frozen=True)
+class DaemonFault:
+    """One of Ray's own processes is killed after so many reports of progress."""
+
+    daemon: str
+    reports: int
+
+
+def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
+    """Every place in turn, everything else by chance."""
+    for number, place in enumerate(itertools.cycle(get_args(Place))):
+        if number % 10 < DAEMONS:
+            yield DaemonFault(chance.choice(["raylet", "gcs_server"]), chance.randint(3, 12))
+            continue
+        what = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
+        rank = 0 if place == "checkpoint" else chance.randint(0, 1)
+        call = chance.randint(2, 5) if place == "checkpoint" else chance.randint(20, 60)
+        # Half of them at once, half in the middle of what takes some milliseconds.
+        yield Fault(rank, place, call, what, chance.choice([0.0, chance.uniform(0, 0.005)]))
+
+
+class Chaos:
+    """Lets faults happen to a job, one in each attempt, and writes down what becomes of it.
+
+    Args:
+        request: the job.
+        faults: to take from; those that have not happened when the job ends stay there.
+    """
+
+    def __init__(self, request: StylizeRequest, cluster: Cluster, faults: list[Fault | DaemonFault]) -> None:
+        self._request = request
+        self._cluster = cluster
+        self._faults = faults
+        self._current: Fault | DaemonFault | None = None
+        self._reports = 0
+        self._at: float | None = None  # when the current one happened, seconds since the epoch
+        self.found: list[dict[str, Any]] = []
+        self._arm()
+
+    def run(self) -> RanksResult:
+        """The job to its end."""
+        options = WorkerOptions(RANK_TIMEOUT, CHECKPOINT_SECONDS, FaultyRank)
+        listener = Listener(progress=self._progress, happened=self._happened)
+        ended = stylize_on_ranks(self._request, 2, listener, options=options, cluster=self._cluster)
+        if self._current is not None:
+            self._faults.insert(0, self._current)
+        for entry, attempt in zip(self.found, ended.attempts, strict=True):
+            entry |= {
+                "reason": attempt.reason,
+                "steps_lost": attempt.last_step - attempt.saved_step,
+                "seconds_lost": attempt.seconds_lost,
+            }
+        return ended
+
+    def _arm(self) -> None:
+        self._current, self._at, self._reports = None, None, 0
+        if len(self.found) < FAULTS_A_JOB and self._faults:
+            self._current = self._faults.pop(0)
+        if isinstance(self._current, Fault):
+            self._current.write(self._request)
+
+    def _progress(self, progress: Progress) -> None:
+        self._reports += 1
+        if isinstance(self._current, DaemonFault) and self._at is None and self._reports >= self._current.reports:
+            self._at = time.time()
+            next(child for child in psutil.Process().children() if child.name() == self._current.daemon).kill()
+
+    def _happened(self, line: str) -> None:
+        print(f"  {line}", flush=True)
+        if line.startswith("Going on"):
+            self.found[-1]["seconds_to_running"] = round(time.time() - self.found[-1].pop("at"), 2)
+            return
+        assert self._current is not None
+        if isinstance(self._current, Fault):
+            at = fired(self._request)
+            assert at is not None
+            self._at = at + self._current.delay
+        self.found.append({"fault": asdict(self._current), "at": self._at})
+        self._arm()
+
+
+def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
+    """Kill the command itself after a random time; then let the same command go on, where something was saved."""
+    request = small_request(folder, STEPS)
+    source = request.source
+    arguments = ["stylize", str(source.scene), "--cameras", str(source.cameras), "--style", str(request.style)]
+    arguments += ["--out", str(request.out), "--backbone", "vgg16", "--steps-sos", "60", "--no-early-stop"]
+    arguments += ["--keep-everything", "--workers", "2", "--checkpoint-seconds", str(CHECKPOINT_SECONDS)]
+    command = [sys.executable, "-m", "api.cli", *arguments]
+    shared_memory = set(os.listdir("/dev/shm"))
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    while not process.stdout.readline().startswith("schedule"):
+        pass
+    delay = chance.uniform(0, 5)
+    time.sleep(delay)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGKILL)
+    started = time.monotonic()
+    process.wait()
+    _, alive = psutil.wait_procs(family, timeout=30)
+    seconds = time.monotonic() - started
+    time.sleep(2)  # the folder goes last
+    left = [str(path) for path in Path(tempfile.gettempdir()).glob("sgsst-ray-*")]
+    saved = request.out.with_name("s.checkpoint.safetensors").exists()
+    again = subprocess.run([*command, *(["--resume"] if saved else [])], capture_output=True, text=True)
+    return {
+        "seconds_after_schedule": round(delay, 2),
+        "processes_left": len(alive),
+        "folders_left": left,
+        "shared_memory_left": sorted(set(os.listdir("/dev/shm")) - shared_memory),
+        "seconds_until_all_gone": round(seconds, 2),
+        "saved": saved,
+        "exit_code_of_next": again.returncode,
+        "scene_written": request.out.exists(),
+    }
+
+
+def main() -> None:
+    """Run, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--faults", type=int, default=33)
+    parser.add_argument("--drivers", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    chance = random.Random(arguments.seed)
+    faults = list(itertools.islice(random_faults(chance), arguments.faults))
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
+    found: list[dict[str, Any]] = []
+    jobs: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as name:
+        drivers = [kill_driver(Path(name) / f"driver_{number}", chance) for number in range(arguments.drivers)]
+        print(json.dumps(drivers, indent=1))
+        with Cluster(2) as cluster:
+            request = small_request(Path(name) / "undisturbed", STEPS)
+            loss = _loss(Chaos(request, cluster, []).run())
+            content = request.out.read_bytes()
+            while faults:
+                request = small_request(Path(name) / f"job_{len(jobs)}", STEPS)
+                chaos = Chaos(request, cluster, faults)
+                ended = chaos.run()
+                found += chaos.found
+                difference = abs(_loss(ended) / loss - 1)
+                same = request.out.read_bytes() == content
+                jobs.append({"faults": len(chaos.found), "loss_relative_error": difference, "same_file": same})
+                print(json.dumps(jobs[-1]), flush=True)
+    killed = [entry for entry in found if entry["fault"].get("what") == "SIGKILL"]
+    seconds = sorted(entry["seconds_to_running"] for entry in killed)
+    figures = {
+        "job": {"steps": STEPS, "ranks": 2, "view": "64x48", "checkpoint_seconds": CHECKPOINT_SECONDS},
+        "rank_timeout": RANK_TIMEOUT,
+        "loss_of_undisturbed": loss,
+        "seconds_to_running_after_sigkill": {"median": seconds[len(seconds) // 2], "most": seconds[-1]},
+        "jobs": jobs,
+        "faults": found,
+        "drivers": drivers,
+    }
+    print(write_result("faults", figures))
+
+
+def _loss(ended: RanksResult) -> float:
+    assert ended.result is not None
+    return mean_loss(ended.result.after)
+
+
+if __name__ == "__main__":
+    main()
