@@ -29,7 +29,7 @@ import psutil
 from benchmarks.machine import write_result
 from sgsst_core.loop import Progress
 from sgsst_core.stylizer import mean_loss
-from tests.worker.faults import Fault, FaultyRank, Place, fired, small_request
+from tests.worker.faults import Fault, FaultyRank, Place, fired, shared_memory, small_request
 from worker.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.cluster import Cluster
 from worker.job import StylizeRequest
@@ -131,7 +131,6 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     arguments += ["--out", str(request.out), "--backbone", "vgg16", "--steps-sos", "60", "--no-early-stop"]
     arguments += ["--keep-everything", "--workers", "2", "--checkpoint-seconds", str(CHECKPOINT_SECONDS)]
     command = [sys.executable, "-m", "api.cli", *arguments]
-    shared_memory = set(os.listdir("/dev/shm"))
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     while not process.stdout.readline().startswith("schedule"):
@@ -139,6 +138,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     delay = chance.uniform(0, 5)
     time.sleep(delay)
     family = psutil.Process(process.pid).children(recursive=True)
+    shared = shared_memory(family)
     process.send_signal(signal.SIGKILL)
     started = time.monotonic()
     process.wait()
@@ -152,7 +152,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
         "seconds_after_schedule": round(delay, 2),
         "processes_left": len(alive),
         "folders_left": left,
-        "shared_memory_left": sorted(set(os.listdir("/dev/shm")) - shared_memory),
+        "shared_memory_left": sorted(str(path) for path in shared if path.exists()),
         "seconds_until_all_gone": round(seconds, 2),
         "saved": saved,
         "exit_code_of_next": again.returncode,

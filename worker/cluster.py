@@ -98,6 +98,7 @@ class Cluster:
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN"] = _SECRET
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_worker_niceness", "0")  # ranks are the work itself, not something beside it
         import ray
 
         _quiet()

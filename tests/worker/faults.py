@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+import psutil
 
 from sgsst_core.settings import make_settings
 from tests.small_scenes import wall, write_files
@@ -97,6 +100,15 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
     options = {"steps_sos": steps, "early_stop": False, "keep": ("ranks",), "rebalance": False, **settings}
     source = SceneRequest(ply, cameras, None, "-y", None, None, 0.2, False)
     return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
+
+
+def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
+    """Files of shared memory that processes have mapped."""
+    found = set()
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            found |= {Path(entry.path) for entry in process.memory_maps() if entry.path.startswith("/dev/shm/")}
+    return found
 
 
 def _file(request: StylizeRequest) -> Path:
