@@ -9,7 +9,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,6 +24,7 @@ from torch import Tensor
 
 from sgsst_core.camera import Camera
 from sgsst_core.check import Finding
+from sgsst_core.checkpoint import versions
 from sgsst_core.convergence import smoothed
 from sgsst_core.files import atomic_path
 from sgsst_core.loop import Stopped
@@ -259,10 +259,7 @@ def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
 
 def program_version() -> str:
     """Version of the installed distribution; "unknown" where the source tree is used without installing it."""
-    try:
-        return version("sgsst-service")
-    except PackageNotFoundError:
-        return "unknown"
+    return versions()["program"]
 
 
 def peak_memory() -> int:

@@ -166,6 +166,16 @@ class _Rank:
     def outcome(self) -> Outcome | None:
         return self.status.outcome
 
+    @property
+    def left_out(self) -> bool:
+        """Whether the job goes on without it, whatever becomes of it."""
+        return self.outcome is not None and self.outcome.kind == "left-out"
+
+    @property
+    def silence(self) -> float:
+        """Seconds since its last answer."""
+        return 0.0 if self.left_out else time.monotonic() - self.answered
+
 
 class _Job:
     """All attempts of one job."""
@@ -303,7 +313,7 @@ class _Job:
 
         now = time.monotonic()
         for rank in self._ranks:
-            if rank.question is None and now - rank.asked >= POLL_SECONDS:
+            if rank.question is None and not rank.left_out and now - rank.asked >= POLL_SECONDS:
                 rank.question, rank.asked = rank.actor.poll.remote(), now
         questions = {rank.question: rank for rank in self._ranks if rank.question is not None}
         if not questions:
@@ -366,10 +376,9 @@ class _Job:
             assert rank.outcome is not None
             if not rank.outcome.echo:
                 self._raise_failure(rank, rank.outcome)
-        silent = max(self._ranks, key=lambda rank: time.monotonic() - rank.answered)
-        silence = time.monotonic() - silent.answered
-        if silence > self._options.rank_timeout:
-            raise _Lost(f"{self._name(silent)} was lost: it has not answered for {silence:.0f} s")
+        silent = max(self._ranks, key=lambda rank: rank.silence)
+        if silent.silence > self._options.rank_timeout:
+            raise self._silent(silent)
         if not failed:
             return
         # Connections break when another rank ends: wait until it shows which, and why.
@@ -383,10 +392,12 @@ class _Job:
                     self._raise_failure(rank, rank.outcome)
         outcome = failed[0].outcome
         assert outcome is not None
-        silence = time.monotonic() - silent.answered
-        if silence > _GRACE:
-            raise _Lost(f"{self._name(silent)} was lost: it has not answered for {silence:.0f} s")
+        if silent.silence > _GRACE:
+            raise self._silent(silent)
         raise _Lost(f"{self._name(failed[0])} lost its connection: {_first_line(outcome.error)}", outcome.error)
+
+    def _silent(self, rank: _Rank) -> _Lost:
+        return _Lost(f"{self._name(rank)} was lost: it has not answered for {rank.silence:.0f} s")
 
     def _raise_failure(self, rank: _Rank, outcome: Outcome) -> None:
         assert outcome.error is not None
