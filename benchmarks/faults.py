@@ -58,7 +58,8 @@ def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
             continue
         what = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
         rank = 0 if place == "checkpoint" else chance.randint(0, 1)
-        call = chance.randint(2, 5) if place == "checkpoint" else chance.randint(20, 60)
+        # Checkpoints are written twice a second, and values are gathered only while a job is prepared.
+        call = chance.randint(*{"checkpoint": (2, 5), "gather": (2, 8)}.get(place, (20, 60)))
         # Half of them at once, half in the middle of what takes some milliseconds.
         yield Fault(rank, place, call, what, chance.choice([0.0, chance.uniform(0, 0.005)]))
 
@@ -68,7 +69,7 @@ class Chaos:
 
     Args:
         request: the job.
-        faults: to take from; those that have not happened when the job ends stay there.
+        faults: to take from; one that has not happened when the job ends goes back to the end.
     """
 
     def __init__(self, request: StylizeRequest, cluster: Cluster, faults: list[Fault | DaemonFault]) -> None:
@@ -87,7 +88,7 @@ class Chaos:
         listener = Listener(progress=self._progress, happened=self._happened)
         ended = stylize_on_ranks(self._request, 2, listener, options=options, cluster=self._cluster)
         if self._current is not None:
-            self._faults.insert(0, self._current)
+            self._faults.append(self._current)
         for entry, attempt in zip(self.found, ended.attempts, strict=True):
             entry |= {
                 "reason": attempt.reason,
