@@ -345,14 +345,14 @@ class _Job:
             if not self._prepared:
                 self._prepared = True
                 self._listener.prepared(status.prepared)
-        if status.saved is not None and status.saved != self._saved:
-            self._saved, self._safe_at = status.saved, time.monotonic()
         if status.progress is not None and status.progress.step != self._last_step:
             if self._last_step == self._first_step:
                 self._running_again()
             self._last_step = status.progress.step
             self._step = max(self._step, self._last_step)
             self._listener.progress(status.progress)
+        if status.saved is not None and status.saved != self._saved:
+            self._saved, self._safe_at = status.saved, time.monotonic()
 
     def _running_again(self) -> None:
         """The first step after a loss."""
@@ -361,7 +361,6 @@ class _Job:
         now = time.monotonic()
         lost = self._attempts[-1]
         lost.seconds_lost, lost.seconds_to_resume = round(now - self._safe_at, 3), round(now - self._lost_at, 3)
-        self._safe_at = now if self._saved is None else self._safe_at
         count = f"{len(self._ranks)} worker{'s' if len(self._ranks) > 1 else ''}"
         self._listener.happened(
             f"Going on from step {self._first_step} with {count}, {lost.seconds_to_resume:.1f} s after the loss."
