@@ -176,6 +176,14 @@ def stylize(
     rank_timeout: Annotated[
         float, typer.Option(min=1, help="Seconds without an answer after which a worker counts as lost.")
     ] = 120.0,
+    views_per_step: Annotated[
+        int | None,
+        typer.Option(min=1, help="Average the gradients of V views in each step; groups of workers share them."),
+    ] = None,
+    rebalance: Annotated[
+        bool | None,
+        typer.Option("--rebalance/--no-rebalance", help="Give slower workers less to do, once. [--rebalance]"),
+    ] = None,
 ) -> None:
     """Give a scene the style of a picture."""
     settings = make_settings(
@@ -201,6 +209,8 @@ def stylize(
         prune_weight=prune_weight,
         similar_views=similar_views,
         kept_weights=kept_weights,
+        views_per_step=views_per_step,
+        rebalance=rebalance,
         keep=EVERYTHING if keep_everything else None,
     )
     from worker.attempts import WorkerOptions

@@ -165,9 +165,9 @@ class ProcessGroupCollectives:
             except SgsstError as error:
                 message = [(None, error)]
         dist.broadcast_object_list(message, group=self._group, group_src=0, device=torch.device("cpu"))
-        value, error = message[0]
-        if error is not None:
-            raise error
+        value, problem = message[0]
+        if problem is not None:
+            raise problem
         return value
 
     def expect(self, seconds: float) -> None:
