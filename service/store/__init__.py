@@ -1,0 +1,33 @@
+"""The durable store: jobs, inputs, keys, in SQLite or PostgreSQL behind the same code."""
+
+from __future__ import annotations
+
+import time
+
+from service.settings import ServiceSettings
+from service.store.database import Clock, Database
+from service.store.inputs import Inputs
+from service.store.jobs import Jobs
+from service.store.keys import Keys, Operations
+
+
+class Store:
+    """All parts of the store on one database."""
+
+    def __init__(self, settings: ServiceSettings, clock: Clock = time.time) -> None:
+        self.database = Database(settings.database_url, clock)
+        self.jobs = Jobs(self.database, settings.lease_seconds, settings.max_attempts, settings.retry_seconds)
+        self.inputs = Inputs(self.database)
+        self.keys = Keys(self.database)
+        self.operations = Operations(self.database)
+
+    def close(self) -> None:
+        """Close all connections."""
+        self.database.close()
+
+
+def open_store(settings: ServiceSettings, clock: Clock = time.time) -> Store:
+    """The store, with its tables created or brought up to date."""
+    store = Store(settings, clock)
+    store.database.upgrade()
+    return store

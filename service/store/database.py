@@ -1,0 +1,145 @@
+"""One way to SQLite and PostgreSQL: engine, transactions, migrations."""
+
+from __future__ import annotations
+
+import fcntl
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.orm import Session
+
+from service.store.tables import Base, CounterRow
+
+#: The newest migration; a database that says so needs no look at the migrations themselves.
+SCHEMA = "0001"
+MIGRATIONS = Path(__file__).with_name("migrations")
+#: Seconds that a writer waits for another one's transaction. All are short.
+_BUSY_SECONDS = 30
+#: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
+_LOCK = 7_347_758
+
+Clock = Callable[[], float]
+
+
+class Database:
+    """Transactions on the store's database, and the clock that its times come from."""
+
+    def __init__(self, url: str, clock: Clock = time.time) -> None:
+        self.url = make_url(url)
+        self.clock = clock
+        self.sqlite = self.url.get_backend_name() == "sqlite"
+        if self.sqlite and self.url.database:
+            Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
+        options: dict[str, Any] = {"pool_size": 20, "max_overflow": 30, "pool_pre_ping": not self.sqlite}
+        if self.sqlite:
+            options["connect_args"] = {"timeout": _BUSY_SECONDS, "check_same_thread": False}
+        self.engine = create_engine(self.url, **options)
+        if self.sqlite:
+            event.listen(self.engine, "connect", _set_pragmas)
+            event.listen(self.engine, "begin", _begin)
+        self._writer = self.engine.execution_options(sgsst_writes=True)
+
+    @contextmanager
+    def writing(self) -> Iterator[Session]:
+        """A transaction that is committed at the end of the block; on SQLite it is the only writer from the start."""
+        with Session(self._writer, expire_on_commit=False) as session, session.begin():
+            yield session
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        """A transaction that sees one state of the database, and never waits for a writer."""
+        with Session(self.engine, expire_on_commit=False) as session:
+            yield session
+
+    def upgrade(self) -> None:
+        """Bring the tables to this version; of several processes that start at once one does it."""
+        if self._version() == SCHEMA:
+            return
+        with self._upgrading():
+            if self._version() != SCHEMA:
+                self._migrate()
+
+    def ping(self) -> None:
+        """Prove that the database answers; raises whatever its driver raises."""
+        with self.reading() as session:
+            session.execute(text("SELECT 1"))
+
+    def close(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
+
+    def _version(self) -> str | None:
+        try:
+            with self.reading() as session:
+                return session.execute(text("SELECT version_num FROM alembic_version")).scalar()
+        except DBAPIError:  # a new database
+            return None
+
+    def _migrate(self) -> None:
+        from alembic import command
+        from alembic.config import Config
+
+        config = Config()
+        config.set_main_option("script_location", str(MIGRATIONS))
+        config.attributes["engine"] = self.engine
+        command.upgrade(config, "head")
+
+    @contextmanager
+    def _upgrading(self) -> Iterator[None]:
+        if self.sqlite and self.url.database:
+            with Path(self.url.database).with_suffix(".lock").open("w") as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                yield
+        elif self.sqlite:
+            yield
+        else:
+            with self.engine.connect() as connection:
+                connection.execute(text("SELECT pg_advisory_lock(:lock)"), {"lock": _LOCK})
+                try:
+                    yield
+                finally:
+                    connection.execute(text("SELECT pg_advisory_unlock(:lock)"), {"lock": _LOCK})
+
+
+def _set_pragmas(connection: Any, record: Any) -> None:
+    connection.isolation_level = None  # else the driver begins transactions by itself, and too late
+    cursor = connection.cursor()
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={_BUSY_SECONDS * 1000}"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _begin(connection: Connection) -> None:
+    """A transaction that reads first and writes later could fail halfway on SQLite: writers take the lock at once."""
+    writes = connection.get_execution_options().get("sgsst_writes")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def new_id(prefix: str, now: float) -> str:
+    """An id that sorts by time and cannot be guessed: milliseconds, then 80 random bits."""
+    return f"{prefix}_{int(now * 1000):011x}{secrets.token_hex(10)}"
+
+
+def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:
+    """Add to a counter, within the transaction of what is counted."""
+    insert = upsert(session)(CounterRow).values(name=name, labels=labels, value=amount)
+    added = CounterRow.value + insert.excluded.value
+    session.execute(insert.on_conflict_do_update(index_elements=["name", "labels"], set_={"value": added}))
+
+
+def upsert(session: Session) -> Any:
+    """The `insert` that knows ON CONFLICT, of the database that the session is on."""
+    return sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
+
+
+def create_all(engine: Engine) -> None:
+    """All tables at once, for comparing with what the migrations make."""
+    Base.metadata.create_all(engine)

@@ -1,0 +1,156 @@
+"""Blobs, uploads and inspections in the store: the rows; the files are `service.blobs`'."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import delete, exists, select
+
+from service.errors import ConflictError, NotFoundError
+from service.store.database import Database, new_id, upsert
+from service.store.tables import BlobRow, BlobUseRow, InspectionRow, UploadRow
+
+#: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
+GRACE_SECONDS = 3600.0
+#: What checking an input found is kept for so long.
+_INSPECTION_SECONDS = 30 * 86_400.0
+
+
+class Inputs:
+    """The input part of the store."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add_blob(self, sha256: str, location: str, size: int) -> str:
+        """Register a file's content; returns the location to use, an older one where the content was there already."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            insert = upsert(session)(BlobRow).values(sha256=sha256, location=location, size=size, touched_at=now)
+            session.execute(insert.on_conflict_do_update(index_elements=["sha256"], set_={"touched_at": now}))
+            return session.get_one(BlobRow, sha256, populate_existing=True).location
+
+    def blob(self, sha256: str) -> BlobRow:
+        """A blob, which stays for a while from now on.
+
+        Raises:
+            NotFoundError: it is gone.
+        """
+        with self._database.writing() as session:
+            row = session.get(BlobRow, sha256, with_for_update=True)
+            if row is None:
+                raise NotFoundError(f"There is no file with SHA-256 {sha256}.")
+            row.touched_at = self._database.clock()
+            return row
+
+    def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
+        """Blobs by their digest, for a job that holds them."""
+        with self._database.reading() as session:
+            found: dict[str, BlobRow] = {}
+            for start in range(0, len(digests), 500):
+                part = select(BlobRow).where(BlobRow.sha256.in_(digests[start : start + 500]))
+                found |= {row.sha256: row for row in session.scalars(part)}
+            return found
+
+    def collect(self) -> list[str]:
+        """Drop blobs that nobody has referred to for a while; returns their locations, for removing the files."""
+        before = self._database.clock() - GRACE_SECONDS
+        used = exists().where(BlobUseRow.sha256 == BlobRow.sha256)
+        with self._database.writing() as session:
+            query = select(BlobRow).where(BlobRow.touched_at < before, ~used).limit(1000)
+            rows = session.scalars(query.with_for_update(skip_locked=True)).all()
+            for row in rows:
+                session.delete(row)
+            return [row.location for row in rows]
+
+    def locations(self) -> set[str]:
+        """All locations that rows refer to."""
+        with self._database.reading() as session:
+            return set(session.scalars(select(BlobRow.location)))
+
+    def create_upload(self, owner: str, length: int, filename: str, header: str, seconds: float) -> UploadRow:
+        """Begin an upload that expires when nothing has been heard of it for so many seconds."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
+            row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
+            session.add(row)
+        return row
+
+    def upload(self, upload_id: str, owner: str) -> UploadRow:
+        """An upload of this owner that has not expired.
+
+        Raises:
+            NotFoundError: there is none.
+        """
+        with self._database.reading() as session:
+            row = session.get(UploadRow, upload_id)
+        if row is None or row.owner != owner or row.expires_at < self._database.clock():
+            raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+        return row
+
+    def advance_upload(self, upload_id: str, offset: int, seconds: float) -> float:
+        """Record how much of an upload is on the disk for good; returns when it expires now."""
+        expires = self._database.clock() + seconds
+        with self._database.writing() as session:
+            row = session.get(UploadRow, upload_id, with_for_update=True)
+            if row is None:
+                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+            row.offset, row.expires_at = offset, expires
+        return expires
+
+    def finish_upload(self, upload_id: str, sha256: str, seconds: float) -> None:
+        """Tie an upload to the blob that its bytes have become."""
+        with self._database.writing() as session:
+            row = session.get(UploadRow, upload_id, with_for_update=True)
+            if row is None:
+                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+            row.offset, row.sha256, row.expires_at = row.length, sha256, self._database.clock() + seconds
+            use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
+            session.execute(use.on_conflict_do_nothing())
+
+    def delete_upload(self, upload_id: str, owner: str) -> None:
+        """Forget an upload; a blob that it has become stays for the jobs that use it."""
+        with self._database.writing() as session:
+            row = session.get(UploadRow, upload_id, with_for_update=True)
+            if row is None or row.owner != owner:
+                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+            session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{upload_id}"))
+            session.delete(row)
+
+    def expire_uploads(self) -> list[str]:
+        """Forget uploads whose time is over; returns their ids, for removing what has arrived of them."""
+        with self._database.writing() as session:
+            query = select(UploadRow).where(UploadRow.expires_at < self._database.clock()).limit(500)
+            rows = session.scalars(query.with_for_update(skip_locked=True)).all()
+            for row in rows:
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{row.id}"))
+                session.delete(row)
+            return [row.id for row in rows]
+
+    def open_uploads(self, owner: str) -> int:
+        """How many unfinished uploads this owner has."""
+        query = select(UploadRow.id).where(UploadRow.owner == owner, UploadRow.sha256.is_(None))
+        with self._database.reading() as session:
+            return len(session.scalars(query).all())
+
+    def inspection(self, key: str) -> dict[str, Any] | None:
+        """What an earlier check of the same content found."""
+        with self._database.reading() as session:
+            row = session.get(InspectionRow, key)
+            return row.result if row else None
+
+    def add_inspection(self, key: str, result: dict[str, Any]) -> None:
+        """Remember what a check found, and forget what is old."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
+            session.execute(insert.on_conflict_do_nothing())
+            session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
+
+
+def ensure_unfinished(upload: UploadRow) -> None:
+    """Raise ConflictError for an upload that has all its bytes."""
+    if upload.sha256 is not None:
+        raise ConflictError(f"Upload {upload.id} is complete already.")

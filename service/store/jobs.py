@@ -1,0 +1,568 @@
+"""Jobs in the store: created, listed, leased, written under a lease, ended, and forgotten.
+
+A job is leased for a few seconds at a time by the dispatcher that runs it. Each lease of a job has a number, its epoch;
+every write of a dispatcher names the epoch that it holds and does nothing but raise `LeaseLostError` where the job has
+been leased again since. So two dispatchers may both believe that they run a job, and still only one can write.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import Select, and_, case, delete, func, or_, select, update
+from sqlalchemy.orm import Session
+
+from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError
+from service.store.database import Database, count, new_id, upsert
+from service.store.tables import (
+    ArtifactRow,
+    AttemptRow,
+    BlobUseRow,
+    DeliveryRow,
+    EventRow,
+    IdempotencyRow,
+    JobRow,
+    TurnRow,
+)
+
+Status = Literal["queued", "starting", "running", "canceling", "succeeded", "failed", "canceled", "expired"]
+#: A dispatcher works on it.
+ACTIVE: tuple[Status, ...] = ("starting", "running", "canceling")
+UNFINISHED: tuple[Status, ...] = ("queued", *ACTIVE)
+FINISHED: tuple[Status, ...] = ("succeeded", "failed", "canceled")
+#: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
+KEPT_PROGRESS = 200
+#: A wait between attempts doubles, but not beyond this.
+_MAX_RETRY_SECONDS = 300.0
+DAY = 86_400.0
+#: An Idempotency-Key is remembered for so long.
+IDEMPOTENCY_SECONDS = DAY
+
+
+@dataclass(frozen=True)
+class NewJob:
+    """What a job is created from.
+
+    Attributes:
+        inputs: for each file its `role`, `name`, `sha256` and `size`.
+    """
+
+    owner: str
+    name: str
+    priority: int
+    parameters: dict[str, Any]
+    inputs: list[dict[str, Any]]
+    webhook: str | None = None
+
+
+@dataclass(frozen=True)
+class Idempotency:
+    """The key that a client gave a request, and a digest of the request."""
+
+    key: str
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to write to a job, until somebody else has a higher epoch."""
+
+    job: JobRow
+    dispatcher: str
+    epoch: int
+
+    @property
+    def job_id(self) -> str:
+        """The job's id."""
+        return self.job.id
+
+
+@dataclass(frozen=True)
+class Published:
+    """A file that was put to its place, for the row that makes it visible."""
+
+    name: str
+    location: str
+    size: int
+    sha256: str
+
+
+class Jobs:
+    """The job part of the store."""
+
+    def __init__(self, database: Database, lease_seconds: float, max_attempts: int, retry_seconds: float) -> None:
+        self._database = database
+        self._lease_seconds = lease_seconds
+        self._max_attempts = max_attempts
+        self._retry_seconds = retry_seconds
+
+    # --- what users do ---------------------------------------------------------------------------------------------
+
+    def create(
+        self,
+        new: NewJob,
+        *,
+        limit: int,
+        idempotency: Idempotency | None = None,
+    ) -> tuple[JobRow, bool]:
+        """Queue a job; its blobs are held from now on.
+
+        Returns:
+            The job, and whether it is new: with an Idempotency-Key that was used before it is the job of that time.
+
+        Raises:
+            IdempotencyError: the key was used for another request.
+            QueueFullError: the owner has `limit` unfinished jobs.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            remembered = self._remembered(session, new.owner, idempotency, now)
+            if remembered is not None and remembered.created_id:
+                known = session.get(JobRow, remembered.created_id)
+                if known is not None:
+                    return known, False
+            unfinished = select(func.count()).where(JobRow.owner == new.owner, JobRow.status.in_(UNFINISHED))
+            if (session.scalar(unfinished) or 0) >= limit:
+                raise QueueFullError(
+                    f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.",
+                    limit=limit,
+                )
+            job = JobRow(
+                id=new_id("job", now),
+                owner=new.owner,
+                name=new.name,
+                status="queued",
+                priority=new.priority,
+                parameters=new.parameters,
+                inputs=new.inputs,
+                created_at=now,
+                queued_at=now,
+                not_before=now,
+                attempt=0,
+                failures=0,
+                lease_epoch=0,
+                webhook=new.webhook,
+            )
+            session.add(job)
+            if remembered is not None:
+                remembered.created_id = job.id
+            session.flush()
+            for sha256 in sorted({entry["sha256"] for entry in new.inputs}):
+                session.add(BlobUseRow(holder=f"job:{job.id}", sha256=sha256))
+            _say(session, job, now)
+            count(session, "sgsst_jobs_submitted_total")
+        return job, True
+
+    @staticmethod
+    def _remembered(session: Session, owner: str, idempotency: Idempotency | None, now: float) -> IdempotencyRow | None:
+        """The row of this Idempotency-Key, new or of before; None where the request has no key."""
+        if idempotency is None:
+            return None
+        values = {"owner": owner, "key": idempotency.key, "fingerprint": idempotency.fingerprint}
+        # of two requests at once, the second waits here for the first one's end, on every database
+        insert = upsert(session)(IdempotencyRow).values(**values, created_id="", created_at=now)
+        session.execute(insert.on_conflict_do_nothing())
+        row = session.get_one(IdempotencyRow, (owner, idempotency.key), with_for_update=True)
+        if row.created_at < now - IDEMPOTENCY_SECONDS:
+            row.fingerprint, row.created_id, row.created_at = idempotency.fingerprint, "", now
+        if row.fingerprint != idempotency.fingerprint:
+            raise IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key.")
+        return row
+
+    def get(self, job_id: str, owner: str | None) -> JobRow:
+        """A job of this owner; of anybody for None.
+
+        Raises:
+            NotFoundError: there is none, or it is another's.
+        """
+        with self._database.reading() as session:
+            return _owned(session, job_id, owner)
+
+    def attempts(self, job_id: str) -> list[AttemptRow]:
+        """All attempts of a job, the first one first."""
+        with self._database.reading() as session:
+            found = select(AttemptRow).where(AttemptRow.job_id == job_id).order_by(AttemptRow.number)
+            return list(session.scalars(found))
+
+    def page(
+        self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
+    ) -> list[JobRow]:
+        """Jobs of an owner, the newest first, those older than the job `before`."""
+        query = select(JobRow).order_by(JobRow.id.desc()).limit(limit)
+        if owner is not None:
+            query = query.where(JobRow.owner == owner)
+        if status:
+            query = query.where(JobRow.status.in_(status))
+        if before is not None:
+            query = query.where(JobRow.id < before)
+        with self._database.reading() as session:
+            return list(session.scalars(query))
+
+    def queue_position(self, job: JobRow) -> int | None:
+        """How many queued jobs are ahead by priority and age, plus one; None for a job that is not queued.
+
+        Turns between owners, which change with every lease, are left out.
+        """
+        if job.status != "queued":
+            return None
+        ahead = or_(
+            JobRow.priority > job.priority,
+            and_(
+                JobRow.priority == job.priority,
+                or_(JobRow.queued_at < job.queued_at, and_(JobRow.queued_at == job.queued_at, JobRow.id < job.id)),
+            ),
+        )
+        with self._database.reading() as session:
+            return 1 + (session.scalar(select(func.count()).where(JobRow.status == "queued", ahead)) or 0)
+
+    def cancel(self, job_id: str, owner: str | None) -> JobRow:
+        """Cancel a job: at once where it is queued, else as soon as its dispatcher sees it.
+
+        Raises:
+            ConflictError: it has ended otherwise. A canceled job is returned as it is.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = _owned(session, job_id, owner, lock=True)
+            if job.status == "queued":
+                self._end(session, job, "canceled", now)
+            elif job.status in ("starting", "running"):
+                job.status = "canceling"
+                _say(session, job, now)
+            elif job.status in ("succeeded", "failed", "expired"):
+                raise ConflictError(f"The job has {_said(job)} and cannot be canceled.", status=job.status)
+        return job
+
+    def retry(self, job_id: str, owner: str | None, *, limit: int) -> JobRow:
+        """Queue a job again that failed or was canceled; it goes on from its last checkpoint, where it has one.
+
+        Raises:
+            ConflictError: it is in another state.
+            QueueFullError: the owner has `limit` unfinished jobs.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = _owned(session, job_id, owner, lock=True)
+            if job.status not in ("failed", "canceled"):
+                raise ConflictError(
+                    f"The job has status {job.status}; only one that failed or was canceled can be tried again.",
+                    status=job.status,
+                )
+            unfinished = select(func.count()).where(JobRow.owner == job.owner, JobRow.status.in_(UNFINISHED))
+            if (session.scalar(unfinished) or 0) >= limit:
+                raise QueueFullError(f"There are {limit} unfinished jobs of this key already.", limit=limit)
+            job.status, job.queued_at, job.not_before, job.failures = "queued", now, now, 0
+            job.finished_at = job.expires_at = job.error = job.progress = None
+            _say(session, job, now)
+        return job
+
+    def delete(self, job_id: str, owner: str | None) -> None:
+        """Forget a job that has ended, and let go of its inputs. Its files are the caller's to remove, afterwards.
+
+        Raises:
+            ConflictError: it has not ended.
+        """
+        with self._database.writing() as session:
+            job = _owned(session, job_id, owner, lock=True)
+            if job.status in UNFINISHED:
+                raise ConflictError(
+                    f"The job has status {job.status}. Cancel it first, and delete it once it has ended.",
+                    status=job.status,
+                )
+            _forget(session, job)
+
+    def artifacts(self, job_id: str) -> list[ArtifactRow]:
+        """The published files of a job, by name; those for the service alone start with a dot."""
+        with self._database.reading() as session:
+            found = select(ArtifactRow).where(ArtifactRow.job_id == job_id).order_by(ArtifactRow.name)
+            return list(session.scalars(found))
+
+    def artifact(self, job_id: str, name: str) -> ArtifactRow | None:
+        """One published file."""
+        with self._database.reading() as session:
+            return session.get(ArtifactRow, (job_id, name))
+
+    def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
+        """What happened to a job after the event of that number."""
+        query = select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after)
+        with self._database.reading() as session:
+            return list(session.scalars(query.order_by(EventRow.id).limit(limit)))
+
+    def last_events(self, job_ids: Sequence[str]) -> dict[str, int]:
+        """The number of the newest event of each job; jobs without events, or that are gone, are left out."""
+        query = select(EventRow.job_id, func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
+        with self._database.reading() as session:
+            return dict(session.execute(query.group_by(EventRow.job_id)).tuples().all())
+
+    # --- what a dispatcher does ------------------------------------------------------------------------------------
+
+    def lease(self, dispatcher: str, fits: Callable[[JobRow], bool] = lambda job: True) -> Lease | None:
+        """Take the next job: the highest priority, then the owner who has waited longest, then the oldest job.
+
+        Jobs whose lease has run out come with the queued ones. One that has used up its attempts ends as failed
+        here, one that was being canceled as canceled, and the next is looked at.
+
+        Args:
+            fits: whether there is room for the job. It is asked for the next one only: smaller jobs do not
+                overtake a big one for ever.
+        """
+        while True:
+            now = self._database.clock()
+            with self._database.writing() as session:
+                job = session.scalar(self._next(now))
+                if job is None:
+                    return None
+                lost = job.status != "queued"
+                if lost and self._settle_lost(session, job, now):
+                    continue
+                if not fits(job):
+                    return None
+                return self._take(session, job, dispatcher, now)
+
+    @staticmethod
+    def _next(now: float) -> Select[JobRow]:
+        ready = and_(JobRow.status == "queued", JobRow.not_before <= now)
+        expired = and_(JobRow.status.in_(ACTIVE), JobRow.lease_expires_at < now)
+        turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
+        query = select(JobRow).outerjoin(TurnRow, TurnRow.owner == JobRow.owner).where(or_(ready, expired))
+        order = (JobRow.priority.desc(), turn, JobRow.queued_at, JobRow.id)
+        return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
+
+    def _settle_lost(self, session: Session, job: JobRow, now: float) -> bool:
+        """Close the attempt of a dispatcher that was not heard of again; True if the job has ended with it."""
+        error = {"code": "dispatcher-lost", "message": "The process that ran the job was not heard of again."}
+        _close_attempt(session, job, "lost", error, now)
+        count(session, "sgsst_lease_expirations_total")
+        if job.status == "canceling":
+            self._end(session, job, "canceled", now)
+            return True
+        job.failures += 1
+        if job.failures >= self._max_attempts:
+            job.error = error | {"message": f"{error['message']} This happened at {job.failures} attempts."}
+            self._end(session, job, "failed", now)
+            return True
+        return False
+
+    def _take(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
+        job.status = "starting"
+        job.attempt += 1
+        job.lease_epoch += 1
+        job.lease_owner, job.lease_expires_at = dispatcher, now + self._lease_seconds
+        job.started_at = job.started_at or now
+        attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
+        attempt.started_at = now
+        session.add(attempt)
+        served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
+        turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
+        session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
+        _say(session, job, now)
+        count(session, "sgsst_attempts_total")
+        count(session, "sgsst_queue_wait_seconds_sum", amount=max(0.0, now - job.queued_at))
+        count(session, "sgsst_queue_wait_seconds_count")
+        return Lease(job, dispatcher, job.lease_epoch)
+
+    def renew(self, leases: Sequence[Lease]) -> dict[str, Status | None]:
+        """Hold leases for another term; a job's status where it is still held, None where the lease is lost."""
+        until = self._database.clock() + self._lease_seconds
+        found: dict[str, Status | None] = {}
+        with self._database.writing() as session:
+            for lease in leases:
+                job = self._held(session, lease)
+                if job is not None:
+                    job.lease_expires_at = until
+                found[lease.job_id] = job.status if job is not None else None  # type: ignore[assignment]
+        return found
+
+    def running(self, lease: Lease) -> None:
+        """Tell that the job's inputs are read and its steps begin; a job that is being canceled stays so."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            if job.status == "starting":
+                job.status = "running"
+                _say(session, job, now)
+
+    def progress(self, lease: Lease, progress: dict[str, Any]) -> None:
+        """Replace the job's progress."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            job.progress = {**progress, "updated_at": now}
+            session.add(EventRow(job_id=job.id, kind="progress", data=job.progress, created_at=now))
+            mine = and_(EventRow.job_id == job.id, EventRow.kind == "progress")
+            oldest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(KEPT_PROGRESS).limit(1)
+            found = session.scalar(oldest)
+            if found is not None:
+                session.execute(delete(EventRow).where(mine, EventRow.id <= found))
+
+    def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
+        """Make files visible; those of the same names are replaced. Returns locations that nothing refers to now."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            return _publish(session, job, files, now)
+
+    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any], retention: float) -> list[str]:
+        """End a job with its results, all in one transaction; as `publish` otherwise.
+
+        A job whose cancellation came too late has succeeded.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            unused = _publish(session, job, files, now)
+            job.result, job.error = result, None
+            _close_attempt(session, job, "succeeded", None, now)
+            count(session, "sgsst_job_seconds_sum", amount=max(0.0, now - (job.started_at or now)))
+            count(session, "sgsst_job_seconds_count")
+            self._end(session, job, "succeeded", now, retention)
+            return unused
+
+    def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool, retention: float) -> bool:
+        """End an attempt that failed: the job is queued again after a wait, or failed for good.
+
+        Args:
+            permanent: another attempt would fail the same way.
+
+        Returns:
+            Whether the job will be tried again.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            _close_attempt(session, job, "failed", error, now)
+            if job.status == "canceling":
+                self._end(session, job, "canceled", now, retention)
+                return False
+            job.failures += 1
+            job.error = error
+            if permanent or job.failures >= self._max_attempts:
+                self._end(session, job, "failed", now, retention)
+                return False
+            wait = min(self._retry_seconds * 2 ** (job.failures - 1), _MAX_RETRY_SECONDS)
+            self._requeue(session, job, now, now + wait)
+            return True
+
+    def release(self, lease: Lease) -> None:
+        """Give a job back unfinished, without counting the attempt as failed: the dispatcher is shutting down."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            _close_attempt(session, job, "released", None, now)
+            if job.status == "canceling":
+                self._end(session, job, "canceled", now)
+            else:
+                self._requeue(session, job, now, now)
+
+    def canceled(self, lease: Lease, retention: float) -> None:
+        """End a job that was being canceled."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            _close_attempt(session, job, "canceled", None, now)
+            self._end(session, job, "canceled", now, retention)
+
+    def expire(self, retention: float) -> list[str]:
+        """End the time of results that have been kept long enough, and forget jobs long after.
+
+        Returns:
+            Ids of jobs whose files are to be removed.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            due = session.scalars(select(JobRow).where(JobRow.expires_at < now).limit(100).with_for_update()).all()
+            for job in due:
+                if job.status == "expired":
+                    _forget(session, job)
+                    continue
+                job.status, job.expires_at = "expired", now + retention
+                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"job:{job.id}"))
+                _say(session, job, now)
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
+            return [job.id for job in due]
+
+    # --- shared ----------------------------------------------------------------------------------------------------
+
+    def _held(self, session: Session, lease: Lease) -> JobRow | None:
+        job = session.get(JobRow, lease.job_id, with_for_update=True)
+        held = (
+            job is not None
+            and job.status in ACTIVE
+            and job.lease_epoch == lease.epoch
+            and job.lease_owner == lease.dispatcher
+        )
+        return job if held else None
+
+    def _held_or_raise(self, session: Session, lease: Lease) -> JobRow:
+        job = self._held(session, lease)
+        if job is None:
+            raise LeaseLostError(f"{lease.job_id}: lease {lease.epoch} of {lease.dispatcher} is no longer held.")
+        return job
+
+    def _requeue(self, session: Session, job: JobRow, now: float, not_before: float) -> None:
+        job.status, job.not_before = "queued", not_before
+        job.lease_owner = job.lease_expires_at = None
+        _say(session, job, now)
+
+    def _end(self, session: Session, job: JobRow, status: Status, now: float, retention: float = 30 * DAY) -> None:
+        job.status, job.finished_at, job.expires_at = status, now, now + retention
+        job.lease_owner = job.lease_expires_at = None
+        _say(session, job, now)
+        count(session, "sgsst_jobs_finished_total", f'status="{status}"')
+        if job.webhook:
+            body = {"type": f"job.{status}", "timestamp": now, "data": {"id": job.id, "name": job.name}}
+            body["data"] |= {"status": status, "error": job.error}  # type: ignore[operator]
+            delivery = DeliveryRow(id=new_id("msg", now), job_id=job.id, url=job.webhook, body=body)
+            delivery.tries, delivery.next_at = 0, now
+            session.add(delivery)
+
+
+def _owned(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
+    job = session.get(JobRow, job_id, with_for_update=lock)
+    if job is None or (owner is not None and job.owner != owner):
+        raise NotFoundError(f"There is no job {job_id}.")
+    return job
+
+
+def _said(job: JobRow) -> str:
+    return "expired" if job.status == "expired" else job.status
+
+
+def _say(session: Session, job: JobRow, now: float) -> None:
+    data: dict[str, Any] = {"status": job.status, "attempt": job.attempt}
+    if job.error:
+        data["error"] = job.error
+    session.add(EventRow(job_id=job.id, kind="status", data=data, created_at=now))
+
+
+def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
+    unused = []
+    for file in files:
+        row = session.get(ArtifactRow, (job.id, file.name))
+        if row is None:
+            row = ArtifactRow(job_id=job.id, name=file.name)
+            session.add(row)
+        elif row.location != file.location:
+            unused.append(row.location)
+        row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+        if not file.name.startswith("."):
+            data = {"name": file.name, "size": file.size, "sha256": file.sha256}
+            session.add(EventRow(job_id=job.id, kind="artifact", data=data, created_at=now))
+    return unused
+
+
+def _close_attempt(session: Session, job: JobRow, outcome: str, error: dict[str, Any] | None, now: float) -> None:
+    session.execute(
+        update(AttemptRow)
+        .where(AttemptRow.job_id == job.id, AttemptRow.number == job.attempt)
+        .values(finished_at=now, outcome=outcome, error=error)
+    )
+    count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')
+
+
+def _forget(session: Session, job: JobRow) -> None:
+    session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"job:{job.id}"))
+    session.delete(job)  # its attempts, events and artifacts go with it

@@ -1,0 +1,121 @@
+"""API keys, counters, secrets and webhook messages in the store."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import secrets
+
+from sqlalchemy import func, select
+
+from service.errors import NotFoundError
+from service.store.database import Database, new_id, upsert
+from service.store.tables import CounterRow, DeliveryRow, JobRow, KeyRow, SecretRow
+
+#: What every key starts with, so that secret scanners can find one that got lost.
+KEY_PREFIX = "sgsst_"
+
+
+def digest(key: str) -> str:
+    """What is stored of a key. It has 256 random bits, so that no salt and no slow hash is needed."""
+    return hashlib.sha256(key.encode()).hexdigest()
+
+
+class Keys:
+    """API keys; a key's id is the owner of what its holder creates."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(self, name: str, priority: int = 0) -> tuple[KeyRow, str]:
+        """A new key, and the only copy of its text."""
+        text = KEY_PREFIX + secrets.token_urlsafe(32)
+        now = self._database.clock()
+        with self._database.writing() as session:
+            row = KeyRow(id=new_id("key", now), name=name, sha256=digest(text), priority=priority, created_at=now)
+            session.add(row)
+        return row, text
+
+    def all(self) -> list[KeyRow]:
+        """All keys, the oldest first."""
+        with self._database.reading() as session:
+            return list(session.scalars(select(KeyRow).order_by(KeyRow.id)))
+
+    def revoke(self, key_id: str) -> KeyRow:
+        """Make a key useless from now on; what it created stays until it expires.
+
+        Raises:
+            NotFoundError: there is no such key.
+        """
+        with self._database.writing() as session:
+            row = session.get(KeyRow, key_id, with_for_update=True)
+            if row is None:
+                raise NotFoundError(f"There is no key {key_id}. `sgsst keys list` shows their ids.")
+            row.revoked_at = row.revoked_at or self._database.clock()
+            return row
+
+    def find(self, text: str) -> KeyRow | None:
+        """The key of this text, unless it is unknown or revoked."""
+        with self._database.reading() as session:
+            row = session.scalar(select(KeyRow).where(KeyRow.sha256 == digest(text)))
+        return row if row is not None and row.revoked_at is None else None
+
+
+class Operations:
+    """What monitoring and webhooks need."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def counters(self) -> list[tuple[str, str, float]]:
+        """Name, labels and value of every counter."""
+        with self._database.reading() as session:
+            rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
+        return [(row.name, row.labels, row.value) for row in rows]
+
+    def depths(self) -> dict[str, int]:
+        """Jobs by status."""
+        query = select(JobRow.status, func.count()).group_by(JobRow.status)
+        with self._database.reading() as session:
+            return dict(session.execute(query).tuples().all())
+
+    def oldest_queued(self) -> float:
+        """Seconds that the oldest queued job has waited; 0 where none waits."""
+        with self._database.reading() as session:
+            oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == "queued"))
+        return 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
+
+    def running(self) -> list[JobRow]:
+        """Jobs that make steps now."""
+        with self._database.reading() as session:
+            return list(session.scalars(select(JobRow).where(JobRow.status == "running")))
+
+    def webhook_secret(self) -> str:
+        """The secret that signs webhooks, in the form of Standard Webhooks; made at first use."""
+        made = "whsec_" + base64.b64encode(secrets.token_bytes(32)).decode()
+        with self._database.writing() as session:
+            insert = upsert(session)(SecretRow).values(name="webhooks", value=made)
+            session.execute(insert.on_conflict_do_nothing())
+            return session.get_one(SecretRow, "webhooks").value
+
+    def due_deliveries(self, hold_seconds: float) -> list[DeliveryRow]:
+        """Messages to be sent now; nobody else gets them for so many seconds."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            query = select(DeliveryRow).where(DeliveryRow.next_at <= now).order_by(DeliveryRow.next_at).limit(20)
+            rows = session.scalars(query.with_for_update(skip_locked=True)).all()
+            for row in rows:
+                row.tries += 1
+                row.next_at = now + hold_seconds
+            return list(rows)
+
+    def settle_delivery(self, delivery_id: str, next_at: float | None) -> None:
+        """A message was delivered or given up (None), or is to be tried again later."""
+        with self._database.writing() as session:
+            row = session.get(DeliveryRow, delivery_id, with_for_update=True)
+            if row is None:
+                return
+            if next_at is None:
+                session.delete(row)
+            else:
+                row.next_at = next_at

@@ -1,0 +1,13 @@
+"""Run by Alembic: the migrations, on the connection that `Database.upgrade` hands in."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from service.store.tables import Base
+
+engine = context.config.attributes["engine"].execution_options(sgsst_writes=True)
+with engine.connect() as connection:
+    context.configure(connection=connection, target_metadata=Base.metadata, render_as_batch=True)
+    with context.begin_transaction():
+        context.run_migrations()
