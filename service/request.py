@@ -1,0 +1,39 @@
+"""A job of the store as what the worker is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from service.parameters import JobParameters
+from service.staging import Staged
+from worker.job import SceneRequest, StylizeRequest
+
+#: The result's name; the other files of a job are named after it.
+RESULT = "stylized.ply"
+
+
+def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:
+    """Scene and cameras."""
+    return SceneRequest(
+        staged.scene,
+        staged.cameras,
+        parameters.orbit,
+        parameters.up,
+        parameters.views,
+        parameters.resolution,
+        parameters.near,
+        parameters.drop_invalid,
+    )
+
+
+def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest:
+    """Everything; paths are relative to the folder that the job was staged in."""
+    return StylizeRequest(
+        scene_request(staged, parameters),
+        staged.style,
+        staged.photos,
+        Path("out", RESULT),
+        parameters.backbone,
+        False,
+        parameters.settings(),
+    )

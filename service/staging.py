@@ -1,0 +1,144 @@
+"""The files of a job laid out as `sgsst stylize` wants them: one folder, links to the blobs, the users' own names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from service.errors import RefusedInputError
+
+ROLES = ("scene", "style", "cameras", "photos")
+#: A COLMAP model is at most cameras, images, points3D, rigs, frames; transforms.json may have a companion.
+MAX_CAMERA_FILES = 8
+_CAMERA_SUFFIXES = {".json", ".bin", ".txt"}
+_MAX_NAME, _MAX_DEPTH = 120, 8
+
+
+@dataclass(frozen=True)
+class Staged:
+    """Where a job's files are, as paths relative to the folder: what a report names must not tell where that is."""
+
+    scene: Path
+    style: Path
+    cameras: Path | None
+    photos: Path | None
+
+
+def clean_name(role: str, name: str, number: int) -> str:
+    """The name under which an input is kept: no way out of a folder, no characters that need care.
+
+    Photos keep their folders, since cameras may name them; other files keep the last part only.
+    """
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
+    plain = [re.sub(r"[^\w .+@,=()-]+", "_", part)[-_MAX_NAME:].strip() for part in parts]
+    kept = [part if not part.startswith(".") else f"_{part[1:]}" for part in plain if part]
+    if role != "photos":
+        kept = kept[-1:]
+    fallback = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json"}.get(role, f"photo_{number}")
+    return "/".join(kept[-_MAX_DEPTH:]) or fallback
+
+
+def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool) -> None:
+    """Prove that a job has the files that it needs, and no others.
+
+    Raises:
+        RefusedInputError: otherwise.
+    """
+    found = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
+    for role in ("scene", "style"):
+        if len(found[role]) != 1:
+            what = "is missing" if not found[role] else "is there more than once"
+            raise RefusedInputError(f"The file {role!r} {what}. Send it once.", "invalid-request", input=role)
+    if not found["cameras"] and not orbit:
+        raise RefusedInputError(
+            "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit' for views around the scene.",
+            "invalid-cameras",
+            input="cameras",
+        )
+    if found["cameras"] and orbit:
+        raise RefusedInputError(
+            "There are 'cameras' and the parameter 'orbit'. Send one of them.", "invalid-cameras", input="cameras"
+        )
+    if found["photos"] and orbit:
+        raise RefusedInputError(
+            "Photos are of known cameras, which an orbit has not. Send 'cameras'.", "invalid-cameras", input="photos"
+        )
+    _check_camera_files([entry["name"] for entry in found["cameras"]])
+    names = [(entry["role"], entry["name"].lower()) for entry in inputs]
+    twice = next((name for name in names if names.count(name) > 1), None) if len(names) < 50 else _twice(names)
+    if twice:
+        raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}.", "invalid-request")
+    _check_folders(found["photos"])
+
+
+def _twice(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None:
+    seen: set[tuple[str, str]] = set()
+    for name in names:
+        if name in seen:
+            return name
+        seen.add(name)
+    return None
+
+
+def _check_folders(photos: Sequence[Mapping[str, Any]]) -> None:
+    """A photo cannot lie in a folder that is another photo."""
+    names = {entry["name"] for entry in photos}
+    for name in names:
+        above = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
+        if above:
+            raise RefusedInputError(f"The photo {above!r} is also the folder of {name!r}.", "invalid-request")
+
+
+def _check_camera_files(names: Sequence[str]) -> None:
+    if len(names) > MAX_CAMERA_FILES:
+        raise RefusedInputError(f"There are {len(names)} camera files; a COLMAP model has three.", "invalid-cameras")
+    odd = next((name for name in names if PurePosixPath(name).suffix.lower() not in _CAMERA_SUFFIXES), None)
+    if odd is not None:
+        raise RefusedInputError(
+            f"The camera file {odd!r} is none of *.json, *.bin and *.txt. Send a cameras.json, a transforms.json, or "
+            "the three files of a COLMAP model, with their own names.",
+            "invalid-cameras",
+            input="cameras",
+        )
+
+
+def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str, Path]) -> Staged:
+    """Link a job's inputs into a folder.
+
+    Args:
+        folder: which exists.
+        inputs: `role`, `name` (from `clean_name`) and `sha256` of each.
+        blobs: the files by digest.
+    """
+    single: dict[str, Path] = {}
+    cameras: list[str] = []
+    photos = False
+    for entry in inputs:
+        role, name = entry["role"], entry["name"]
+        if role in ("scene", "style"):
+            path = Path(role, name)
+            single[role] = path
+        elif role == "cameras":
+            path = Path("cameras", name)
+            cameras.append(name)
+        else:
+            path = Path("photos", name)
+            photos = True
+        link = folder / path
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(blobs[entry["sha256"]])
+    return Staged(single["scene"], single["style"], _camera_path(cameras), Path("photos") if photos else None)
+
+
+def _camera_path(names: Sequence[str]) -> Path | None:
+    """A single file, a COLMAP model's folder, or the transforms.json that a companion lies beside."""
+    jsons = [name for name in names if name.lower().endswith(".json") and name != "dataparser_transforms.json"]
+    if not names:
+        return None
+    if len(jsons) == 1:
+        return Path("cameras", jsons[0])
+    return Path("cameras", names[0]) if len(names) == 1 else Path("cameras")
