@@ -130,7 +130,9 @@ class Inspector:
                 await asyncio.to_thread(self._store.inputs.add_inspection, key, known)
         if "error" in known:
             error = known["error"]
-            raise RefusedInputError(error["message"], error["code"], **({"input": error["input"]} if error["input"] else {}))
+            raise RefusedInputError(
+                error["message"], error["code"], **({"input": error["input"]} if error["input"] else {})
+            )
         return known["found"]
 
     async def _look(

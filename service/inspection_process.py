@@ -37,7 +37,7 @@ from sgsst_core.weights import list_weights, load_weights
 from worker.job import read_cameras_of
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """An input beyond the service's own limits; code and message for the user."""
 
     def __init__(self, code: str, message: str) -> None:
@@ -52,11 +52,11 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
         `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
 
     Raises:
-        Refused, InvalidInputError: an input that cannot be used, with `part`, the role that it has.
+        RefusedError, InvalidInputError: an input that cannot be used, with `part`, the role that it has.
     """
     settings = parameters.settings()
     if not settings.steps_coarse + settings.steps_sos:
-        raise Refused("invalid-settings", "Both numbers of steps are 0, so that nothing would change. Give some.")
+        raise RefusedError("invalid-settings", "Both numbers of steps are 0, so that nothing would change. Give some.")
     _check_weights(parameters.backbone)
     found: dict[str, Any] = {}
     with _Part("scene"):
@@ -64,7 +64,9 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
         element_offsets(staged.scene, header)
         declared = header.vertex.count if "vertex" in header.names else 0
         if declared > limits["gaussians"]:
-            raise Refused("too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be.")
+            raise RefusedError(
+                "too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be."
+            )
         file = read_scene(staged.scene, drop_invalid=parameters.drop_invalid)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _Part("style"):
@@ -75,10 +77,10 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
         source = scene_request(staged, parameters)
         cameras = fit_cameras(read_cameras_of(source, file.scene), settings)
         if len(cameras) > limits["views"]:
-            raise Refused("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
+            raise RefusedError("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
         pixels = sum(camera.width * camera.height for camera in cameras)
         if pixels > limits["pixels"]:
-            raise Refused("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
+            raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
         _check_something_seen(file.scene, cameras, parameters.near)
         found |= {"views": len(cameras), "pixels": pixels}
     with _Part("photos"):
@@ -133,7 +135,7 @@ def _check_weights(backbone: str) -> None:
 def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
     width, height = image_size(path)
     if width * height > limits["image_pixels"]:
-        raise Refused(
+        raise RefusedError(
             "image-too-large", f"{path.name}: has {width} x {height} pixels; {limits['image_pixels']:,} may be."
         )
 
@@ -168,7 +170,7 @@ def _answer(request: dict[str, Any]) -> dict[str, Any]:
         paths = {role: Path(path) if path else None for role, path in request["staged"].items()}
         staged = Staged(**paths)  # type: ignore[arg-type]
         return {"found": WORK[request["work"]](staged, JobParameters(**request["parameters"]), request["limits"])}
-    except (Refused, InvalidInputError) as error:
+    except (RefusedError, InvalidInputError) as error:
         return _refusal(error.code, str(error), getattr(error, "part", None))
     except MemoryError as error:
         return _refusal("inspection-limit", "Reading it takes more memory than allowed.", getattr(error, "part", None))

@@ -64,5 +64,3 @@ class JobParameters(BaseModel):
         values = self.model_dump(exclude={"preset", *_NOT_SETTINGS})
         keep = EVERYTHING if self.keep_everything else None
         return make_settings(self.preset, **values, max_resolution=self.resolution, keep=keep)
-
-

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from service.names import RESULT
 from service.parameters import JobParameters
 from service.staging import Staged
 from worker.job import SceneRequest, StylizeRequest
-
-#: The result's name; the other files of a job are named after it.
-RESULT = "stylized.ply"
 
 
 def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:

@@ -54,7 +54,7 @@ def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool) -> None:
             raise RefusedInputError(f"The file {role!r} {what}. Send it once.", "invalid-request", input=role)
     if not found["cameras"] and not orbit:
         raise RefusedInputError(
-            "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit' for views around the scene.",
+            "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'.",
             "invalid-cameras",
             input="cameras",
         )

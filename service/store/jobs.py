@@ -413,6 +413,8 @@ class Jobs:
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
             unused = _publish(session, job, files, now)
+            hidden = ArtifactRow.name.startswith(".")  # what an unfinished job would go on from
+            session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, hidden))
             job.result, job.error = result, None
             _close_attempt(session, job, "succeeded", None, now)
             count(session, "sgsst_job_seconds_sum", amount=max(0.0, now - (job.started_at or now)))

@@ -1,0 +1,253 @@
+"""One attempt at one job, in a process of its own: `python -m service.attempt_process FOLDER`.
+
+The folder holds the staged inputs and `task.json`; results go to its `out`. What happens is told in lines of JSON on
+stdout (`Message`), what people may want to read on stderr. SIGTERM lets the step in hand finish and saves a checkpoint.
+The process dies with the dispatcher that started it, and takes what it started along.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+from service.parameters import JobParameters
+from service.staging import Staged
+from worker.processes import die_with_parent
+
+if TYPE_CHECKING:
+    from sgsst_core.loop import Progress
+    from sgsst_core.stylizer import Stylizer
+    from worker.job import Job, Prepared, Result, StylizeRequest
+
+#: Previews become rarer as a job goes on: this share of its time lies between two, so that there are never thousands.
+_PREVIEW_SHARE = 0.05
+#: Longer side of a preview, pixels.
+_PREVIEW_SIDE = 960
+
+
+class Message(TypedDict, total=False):
+    """What the process tells: `kind` and what belongs to it."""
+
+    kind: Literal["stage", "prepared", "progress", "preview", "done", "interrupted", "failed"]
+    stage: str
+    step: int
+    total: int
+    loss: float
+    seconds: float
+    seconds_left: float
+    path: str
+    result: dict[str, Any]
+    error: dict[str, Any]
+    permanent: bool
+
+
+@dataclass(frozen=True)
+class Task:
+    """`task.json`.
+
+    Attributes:
+        staged: paths of the inputs, relative to the folder.
+        parameters: of the job.
+        workers: ranks to run it on; 1 for this process alone.
+        resume: go on from the checkpoint in `out`, where it can be used.
+        checkpoint_seconds, preview_seconds: see the settings.
+    """
+
+    staged: Staged
+    parameters: JobParameters
+    workers: int
+    resume: bool
+    checkpoint_seconds: float
+    preview_seconds: float
+
+    def save(self, folder: Path) -> None:
+        """Write it for `load`."""
+        paths = {role: str(path) if path else None for role, path in vars(self.staged).items()}
+        values = {**vars(self), "staged": paths, "parameters": self.parameters.model_dump(mode="json")}
+        (folder / "task.json").write_text(json.dumps(values))
+
+    @staticmethod
+    def load(folder: Path) -> Task:
+        """Read what `save` wrote."""
+        values = json.loads((folder / "task.json").read_text())
+        staged = Staged(**{role: Path(path) if path else None for role, path in values.pop("staged").items()})
+        return Task(staged, JobParameters(**values.pop("parameters")), **values)
+
+
+class Attempt:
+    """The attempt, and what it tells."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._stopping = threading.Event()
+        self._started = self._last_preview = time.monotonic()
+
+    def run(self) -> None:
+        """Run to the end, whatever it is, and tell how it was."""
+        signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
+        tell({"kind": "stage", "stage": "reading"})
+        try:
+            result = self._on_ranks() if self._task.workers > 1 else self._alone()
+        except Exception as error:
+            tell(failure(error))
+            traceback.print_exc()
+            return
+        if result is None or result.stopped == "interrupted":
+            tell({"kind": "interrupted"})
+        else:
+            tell({"kind": "done", "result": summary(result)})
+
+    def _request(self) -> StylizeRequest:
+        from dataclasses import replace
+
+        from service.request import stylize_request
+
+        return replace(stylize_request(self._task.staged, self._task.parameters), resume=self._task.resume)
+
+    def _alone(self) -> Result:
+        from worker.job import Resume, describe, execute, prepare
+
+        job = prepare(self._request(), resume=Resume(self._task.resume, required=False), warn=log)
+        self._prepared(describe(job))
+
+        def progress(now: Progress) -> None:
+            self._progress(now)
+            self._preview(job)
+
+        return execute(
+            job,
+            progress=progress,
+            stop=self._stopping.is_set,
+            warn=log,
+            checkpoint_seconds=self._task.checkpoint_seconds,
+        )
+
+    def _on_ranks(self) -> Result | None:
+        from dataclasses import replace
+
+        from worker.attempts import Listener, WorkerOptions, stylize_on_ranks
+        from worker.job import Outputs
+
+        request = self._request()
+        # a checkpoint that is not there is no error here, as it would be for a user who asks for it
+        request = replace(request, resume=request.resume and Outputs(request.out).checkpoints.exist)
+        listener = Listener(self._prepared, self._progress, log, log, self._stopping.is_set)
+        options = WorkerOptions(checkpoint_seconds=self._task.checkpoint_seconds)
+        return stylize_on_ranks(request, self._task.workers, listener, options=options).result
+
+    def _prepared(self, prepared: Prepared) -> None:
+        for heading, line in prepared.lines:
+            log(f"{heading}: {line}")
+        tell({"kind": "prepared", "step": prepared.step, "total": prepared.total})
+
+    def _progress(self, now: Progress) -> None:
+        tell(
+            {
+                "kind": "progress",
+                "stage": now.stage,
+                "step": now.step,
+                "total": now.total,
+                "loss": now.loss,
+                "seconds": now.seconds,
+                "seconds_left": now.seconds_left,
+            }
+        )
+
+    def _preview(self, job: Job) -> None:
+        now = time.monotonic()
+        wait = max(self._task.preview_seconds, _PREVIEW_SHARE * (now - self._started))
+        if now - self._last_preview < wait:
+            return
+        try:
+            path = write_preview(job.stylizer)
+        except Exception as error:  # a picture less is no reason to lose the job
+            log(f"no preview could be made: {error}")
+        else:
+            tell({"kind": "preview", "path": str(path)})
+        self._last_preview = time.monotonic()
+
+
+def write_preview(stylizer: Stylizer) -> Path:
+    """The first evaluation view with its present colours, as a JPEG in `out/previews`."""
+    import torch
+
+    from sgsst_core.camera import resized
+    from sgsst_core.images import save_jpg
+
+    views = stylizer.views
+    index = stylizer.evaluation_views[0]
+    camera = views.cameras[index]
+    if max(camera.width, camera.height) > _PREVIEW_SIDE:
+        camera = resized(camera, _PREVIEW_SIDE)
+    path = Path("out", "previews", f"step_{stylizer.step:07d}.jpg")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with torch.no_grad():
+        image = views.rasterizer.render(views.colours(index, stylizer.sh_dc.detach()), camera)
+    save_jpg(path, image)
+    return path
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """What a job's record says about its end; the report has the rest."""
+    from sgsst_core.report import mean_loss
+
+    before, after = mean_loss(result.before), mean_loss(result.after)
+    return {
+        "stopped": result.stopped,
+        "steps": result.step,
+        "loss_before": before,
+        "loss_after": after,
+        "report_error": result.report_error,
+    }
+
+
+def failure(error: Exception) -> Message:
+    """An error as it is told: whether the same would happen again decides whether the job is tried again."""
+    from sgsst_core.errors import DivergedError, InvalidInputError, OutputError, SgsstError
+
+    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if _memory(error) else "internal"
+    message = str(error) if isinstance(error, SgsstError) or _memory(error) else f"{type(error).__name__}: {error}"
+    permanent = isinstance(error, InvalidInputError | DivergedError) and not isinstance(error, OutputError)
+    return {"kind": "failed", "error": {"code": code, "message": message}, "permanent": permanent}
+
+
+def _memory(error: Exception) -> bool:
+    text = str(error)
+    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
+
+
+def log(line: str) -> None:
+    """A line for people."""
+    print(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}", file=sys.stderr, flush=True)
+
+
+def tell(message: Message) -> None:
+    """A line for the dispatcher."""
+    _channel.write(json.dumps(message) + "\n")
+    _channel.flush()
+
+
+#: Messages go through the stdout that the process was given; what libraries print goes to stderr from then on.
+_channel = sys.stdout
+
+
+def main() -> None:
+    """Run the task of the folder that the command line names."""
+    global _channel
+    die_with_parent()
+    _channel = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    os.chdir(sys.argv[1])
+    Attempt(Task.load(Path())).run()
+
+
+if __name__ == "__main__":
+    main()
