@@ -78,7 +78,8 @@ class Task:
     def load(folder: Path) -> Task:
         """Read what `save` wrote."""
         values = json.loads((folder / "task.json").read_text())
-        staged = Staged(**{role: Path(path) if path else None for role, path in values.pop("staged").items()})
+        paths: dict[str, Any] = {role: Path(path) if path else None for role, path in values.pop("staged").items()}
+        staged = Staged(**paths)
         return Task(staged, JobParameters(**values.pop("parameters")), **values)
 
 

@@ -224,7 +224,7 @@ def _in_child(request: dict[str, Any]) -> bytes:
 
 def _read(descriptor: int, deadline: float) -> bytes | None:
     """All that comes until the other end closes; None where it is still open at the deadline."""
-    parts = []
+    parts: list[bytes] = []
     while (left := deadline - time.monotonic()) > 0:
         if select.select([descriptor], [], [], left)[0]:
             part = os.read(descriptor, 1 << 16)

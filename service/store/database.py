@@ -16,13 +16,16 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from service.store.tables import Base, CounterRow
+from service.errors import IdempotencyError
+from service.store.tables import Base, CounterRow, IdempotencyRow
 
 #: The newest migration; a database that says so needs no look at the migrations themselves.
 SCHEMA = "0001"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Seconds that a writer waits for another one's transaction. All are short.
 _BUSY_SECONDS = 30
+#: An Idempotency-Key is remembered for so long.
+IDEMPOTENCY_SECONDS = 86_400.0
 #: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
 _LOCK = 7_347_758
 
@@ -126,6 +129,25 @@ def _begin(connection: Connection) -> None:
 def new_id(prefix: str, now: float) -> str:
     """An id that sorts by time and cannot be guessed: milliseconds, then 80 random bits."""
     return f"{prefix}_{int(now * 1000):011x}{secrets.token_hex(10)}"
+
+
+def remembered(session: Session, owner: str, key: str, fingerprint: str, now: float) -> IdempotencyRow:
+    """The row of an Idempotency-Key: with a `created_id` where it was used before, for that request.
+
+    Raises:
+        IdempotencyError: it was used for another request.
+    """
+    # of two requests at once, the second waits here for the end of the first, on every database
+    insert = upsert(session)(IdempotencyRow).values(
+        owner=owner, key=key, fingerprint=fingerprint, created_id="", created_at=now
+    )
+    session.execute(insert.on_conflict_do_nothing())
+    row = session.get_one(IdempotencyRow, (owner, key), with_for_update=True)
+    if row.created_at < now - IDEMPOTENCY_SECONDS:
+        row.fingerprint, row.created_id, row.created_at = fingerprint, "", now
+    if row.fingerprint != fingerprint:
+        raise IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key.")
+    return row
 
 
 def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import delete, exists, select
 
 from service.errors import ConflictError, NotFoundError
-from service.store.database import Database, new_id, upsert
+from service.store.database import Database, new_id, remembered, upsert
 from service.store.tables import BlobRow, BlobUseRow, InspectionRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
@@ -69,13 +70,29 @@ class Inputs:
         with self._database.reading() as session:
             return set(session.scalars(select(BlobRow.location)))
 
-    def create_upload(self, owner: str, length: int, filename: str, header: str, seconds: float) -> UploadRow:
+    def create_upload(
+        self, owner: str, length: int, filename: str, header: str, seconds: float, idempotency_key: str | None = None
+    ) -> UploadRow:
         """Begin an upload that expires when nothing has been heard of it for so many seconds."""
         now = self._database.clock()
         with self._database.writing() as session:
+            memory = None
+            if idempotency_key is not None:
+                memory = remembered(
+                    session,
+                    owner,
+                    f"upload:{idempotency_key}",
+                    hashlib.sha256(f"{length} {header}".encode()).hexdigest(),
+                    now,
+                )
+                known = session.get(UploadRow, memory.created_id) if memory.created_id else None
+                if known is not None:
+                    return known
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
             session.add(row)
+            if memory is not None:
+                memory.created_id = row.id
         return row
 
     def upload(self, upload_id: str, owner: str) -> UploadRow:

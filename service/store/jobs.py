@@ -14,8 +14,8 @@ from typing import Any, Literal
 from sqlalchemy import Select, and_, case, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
-from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError
-from service.store.database import Database, count, new_id, upsert
+from service.errors import ConflictError, LeaseLostError, NotFoundError, QueueFullError
+from service.store.database import IDEMPOTENCY_SECONDS, Database, count, new_id, remembered, upsert
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,
@@ -37,8 +37,6 @@ KEPT_PROGRESS = 200
 #: A wait between attempts doubles, but not beyond this.
 _MAX_RETRY_SECONDS = 300.0
 DAY = 86_400.0
-#: An Idempotency-Key is remembered for so long.
-IDEMPOTENCY_SECONDS = DAY
 
 
 @dataclass(frozen=True)
@@ -118,9 +116,11 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            remembered = self._remembered(session, new.owner, idempotency, now)
-            if remembered is not None and remembered.created_id:
-                known = session.get(JobRow, remembered.created_id)
+            memory = None
+            if idempotency is not None:
+                memory = remembered(session, new.owner, idempotency.key, idempotency.fingerprint, now)
+            if memory is not None and memory.created_id:
+                known = session.get(JobRow, memory.created_id)
                 if known is not None:
                     return known, False
             unfinished = select(func.count()).where(JobRow.owner == new.owner, JobRow.status.in_(UNFINISHED))
@@ -146,30 +146,14 @@ class Jobs:
                 webhook=new.webhook,
             )
             session.add(job)
-            if remembered is not None:
-                remembered.created_id = job.id
+            if memory is not None:
+                memory.created_id = job.id
             session.flush()
             for sha256 in sorted({entry["sha256"] for entry in new.inputs}):
                 session.add(BlobUseRow(holder=f"job:{job.id}", sha256=sha256))
             _say(session, job, now)
             count(session, "sgsst_jobs_submitted_total")
         return job, True
-
-    @staticmethod
-    def _remembered(session: Session, owner: str, idempotency: Idempotency | None, now: float) -> IdempotencyRow | None:
-        """The row of this Idempotency-Key, new or of before; None where the request has no key."""
-        if idempotency is None:
-            return None
-        values = {"owner": owner, "key": idempotency.key, "fingerprint": idempotency.fingerprint}
-        # of two requests at once, the second waits here for the first one's end, on every database
-        insert = upsert(session)(IdempotencyRow).values(**values, created_id="", created_at=now)
-        session.execute(insert.on_conflict_do_nothing())
-        row = session.get_one(IdempotencyRow, (owner, idempotency.key), with_for_update=True)
-        if row.created_at < now - IDEMPOTENCY_SECONDS:
-            row.fingerprint, row.created_id, row.created_at = idempotency.fingerprint, "", now
-        if row.fingerprint != idempotency.fingerprint:
-            raise IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key.")
-        return row
 
     def get(self, job_id: str, owner: str | None) -> JobRow:
         """A job of this owner; of anybody for None.

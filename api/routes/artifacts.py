@@ -1,0 +1,128 @@
+"""`/v1/jobs/{id}/artifacts`: the files that a job has made."""
+
+from __future__ import annotations
+
+import re
+from pathlib import PurePosixPath
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Request, Response
+from fastapi.responses import StreamingResponse
+
+from api.context import CallerDep, ContextDep
+from api.problems import RESPONSES
+from api.routes.jobs import find
+from api.views import ArtifactList, artifact_view
+from service.artifacts import media_type
+from service.errors import NotFoundError, ServiceError
+from service.store.tables import ArtifactRow
+
+router = APIRouter(prefix="/v1/jobs", tags=["artifacts"], responses=RESPONSES)
+
+#: What a browser may show in place; a page of results may run its own script, and nothing else of this site's.
+_INLINE = ("image/", "text/html", "application/json", "text/plain")
+_SANDBOX = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+)
+
+
+class RangeError(ServiceError):
+    """A range that the file does not have."""
+
+    code, status = "range-not-satisfiable", 416
+
+
+@router.get("/{job_id}/artifacts", response_model=ArtifactList, operation_id="list_artifacts")
+def list_artifacts(job_id: str, context: ContextDep, caller: CallerDep) -> ArtifactList:
+    """All files that a job has made so far; a running job has its plan and previews."""
+    find(context, caller, job_id)
+    rows = context.store.jobs.artifacts(job_id)
+    return ArtifactList(artifacts=[artifact_view(row) for row in rows if not row.name.startswith(".")])
+
+
+_BINARY = {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
+
+
+@router.api_route(
+    "/{job_id}/artifacts/{name:path}",
+    methods=["GET"],
+    operation_id="get_artifact",
+    response_class=StreamingResponse,
+    responses={
+        200: {"description": "The file. Its ETag is the SHA-256 of its content.", **_BINARY},
+        206: {"description": "The part that `Range` asks for.", **_BINARY},
+        304: {"description": "`If-None-Match` names what is there."},
+    },
+)
+def get_artifact(
+    request: Request,
+    job_id: str,
+    name: str,
+    context: ContextDep,
+    caller: CallerDep,
+    range_: Annotated[str | None, Header(alias="Range", examples=["bytes=0-1023"])] = None,
+    if_range: Annotated[str | None, Header(alias="If-Range")] = None,
+    if_none_match: Annotated[str | None, Header(alias="If-None-Match")] = None,
+) -> Response:
+    """Download a file, whole or in ranges, to be resumed with `Range` and `If-Range`."""
+    job = find(context, caller, job_id)
+    row = None if name.startswith(".") else context.store.jobs.artifact(job_id, name)
+    if row is None:
+        raise NotFoundError(f"Job {job_id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")
+    tag = f'"{row.sha256}"'
+    headers = _headers(row, tag, job.name)
+    if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
+        return Response(status_code=304, headers=headers)
+    span = _span(range_, row.size) if range_ and if_range in (None, tag) else None
+    start, stop = span or (0, row.size)
+    headers["Content-Length"] = str(stop - start)
+    if span:
+        headers["Content-Range"] = f"bytes {start}-{stop - 1}/{row.size}"
+    status = 206 if span else 200
+    if request.method == "HEAD":
+        return Response(status_code=status, headers=headers, media_type=media_type(name))
+    body = context.artifacts.read(row.location, start, stop)
+    return StreamingResponse(body, status, headers, media_type(name))
+
+
+router.add_api_route(
+    "/{job_id}/artifacts/{name:path}", get_artifact, methods=["HEAD"], include_in_schema=False, response_model=None
+)
+
+
+def _headers(row: ArtifactRow, tag: str, job_name: str) -> dict[str, str]:
+    kind = media_type(row.name)
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", job_name).strip("._")[:60]
+    file_name = f"{plain}-{PurePosixPath(row.name).name}" if plain else PurePosixPath(row.name).name
+    inline = kind.startswith(_INLINE)
+    headers = {
+        "ETag": tag,
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "private, no-cache",
+        "X-Content-Type-Options": "nosniff",
+        "Content-Disposition": f'{"inline" if inline else "attachment"}; filename="{file_name}"',
+    }
+    if kind.startswith("text/html"):
+        headers["Content-Security-Policy"] = _SANDBOX
+    return headers
+
+
+def _span(text: str, size: int) -> tuple[int, int] | None:
+    """First byte and the one behind the last; None where the header asks for several ranges or makes no sense.
+
+    Raises:
+        RangeError: the range lies behind the end.
+    """
+    match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text.strip())
+    if match is None or match[0] == "bytes=-":
+        return None
+    first, last = match[1], match[2]
+    if not first:
+        start, stop = max(0, size - int(last)), size
+    else:
+        start, stop = int(first), min(size, int(last) + 1) if last else size
+        if last and int(last) < start:
+            return None
+    if start >= stop:
+        raise RangeError(f"The file has {size} bytes.", headers={"Content-Range": f"bytes */{size}"})
+    return start, stop

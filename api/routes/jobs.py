@@ -1,0 +1,302 @@
+"""`/v1/jobs`."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from api.context import Caller, CallerDep, Context, ContextDep, is_id
+from api.multipart import BadRequestError, Received, body_blocks, check_file, parse_json, receive
+from api.problems import RESPONSES
+from api.views import JobDetail, JobPage, JobView, PlanView, StatusName, job_detail, job_view, poll_seconds
+from service.errors import NotFoundError, RefusedInputError, TooLargeError
+from service.parameters import JobParameters
+from service.staging import check_roles, clean_name
+from service.store.jobs import Idempotency, NewJob
+from service.store.tables import JobRow
+from service.webhooks import check_url
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
+#: Bytes of a JSON body, which only names uploads.
+_MAX_JSON = 1 << 20
+
+IdempotencyHeader = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=180,
+        description="The same request with the same key creates nothing twice, for a day.",
+    ),
+]
+
+
+class JobFromUploads(BaseModel):
+    """A job whose files have been uploaded before (`POST /v1/uploads`)."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "scene": "upl_1a1fe701a104f943e9d4d8cce5b818c",
+                    "style": "upl_1a1fe701b52a0c11d0ab9f6ad0c2a54",
+                    "cameras": ["upl_1a1fe701b9e8e2a45b1c1d8c6bd8a90"],
+                    "parameters": {"preset": "preview"},
+                }
+            ]
+        },
+    )
+
+    scene: str = Field(description="Id of the upload with the 3DGS PLY.")
+    style: str = Field(description="Id of the upload with the style image.")
+    cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
+    photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
+    parameters: JobParameters = Field(default_factory=JobParameters)  # type: ignore[arg-type]
+    webhook: str | None = Field(None, max_length=2000, description="URL that is told when the job has ended.")
+
+
+_FILE = {"type": "string", "format": "binary"}
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["scene", "style"],
+                    "properties": {
+                        "scene": {**_FILE, "description": "3DGS PLY; or the id of an upload, as text."},
+                        "style": {**_FILE, "description": "Style image; or the id of an upload."},
+                        "cameras": {
+                            "type": "array",
+                            "items": _FILE,
+                            "description": "cameras.json, transforms.json, or the files of a COLMAP model.",
+                        },
+                        "photos": {"type": "array", "items": _FILE, "description": "Named as the cameras say."},
+                        "parameters": {"type": "string", "description": "JSON: see JobParameters."},
+                        "webhook": {"type": "string"},
+                    },
+                }
+            },
+            "application/json": {"schema": {"$ref": "#/components/schemas/JobFromUploads"}},
+        },
+    }
+}
+
+
+@router.post(
+    "",
+    status_code=202,
+    response_model=JobView,
+    openapi_extra=_BODY,
+    responses={
+        200: {"model": PlanView, "description": "With `dry_run`: the plan. Nothing was queued."},
+        202: {
+            "description": "The job was accepted: it will not be lost.",
+            "headers": {"Location": {"schema": {"type": "string"}, "description": "The job."}},
+            "links": {
+                name: {"operationId": operation, "parameters": {"job_id": "$response.body#/id"}}
+                for name, operation in (
+                    ("get", "get_job"),
+                    ("cancel", "cancel_job"),
+                    ("delete", "delete_job"),
+                    ("artifacts", "list_artifacts"),
+                )
+            },
+        },
+    },
+    operation_id="create_job",
+)
+async def create_job(
+    request: Request,
+    context: ContextDep,
+    caller: CallerDep,
+    idempotency_key: IdempotencyHeader = None,
+    dry_run: Annotated[bool, Query(description="Check everything and plan, but queue nothing.")] = False,
+) -> Response:
+    """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    received = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
+    files, parameters, webhook = received
+    inputs = await asyncio.to_thread(_resolve, context, caller, files)
+    check_roles(inputs, orbit=parameters.orbit is not None)
+    if webhook:
+        check_url(webhook, context.settings)
+    rows = await asyncio.to_thread(context.store.inputs.blobs, sorted({entry["sha256"] for entry in inputs}))
+    paths = {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
+    found = await context.inspector.inspect("check", inputs, paths, parameters)
+    if dry_run:
+        return await _plan(context, inputs, paths, parameters)
+    idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)
+    values = parameters.model_dump(mode="json", exclude_unset=True)
+    new = NewJob(caller.owner, parameters.name, caller.priority, values, inputs, webhook or None)
+    limit = context.settings.max_jobs_per_key
+    job, created = await asyncio.to_thread(context.store.jobs.create, new, limit=limit, idempotency=idempotency)
+    headers = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
+    if not created:
+        headers["Idempotency-Replayed"] = "true"
+    position = await asyncio.to_thread(context.store.jobs.queue_position, job)
+    del found
+    return JSONResponse(job_view(job, position).model_dump(mode="json"), 202, headers)
+
+
+Parts = tuple[Received, JobParameters, str | None]
+
+
+async def _from_form(request: Request, context: Context) -> Parts:
+    received = await receive(request, context.blobs, context.settings)
+    text = received.texts.get("parameters", "").strip() or "{}"
+    values = parse_json(text, "parameters")
+    if not isinstance(values, dict):
+        raise RefusedInputError("parameters: is not a JSON object.", "invalid-request", input="parameters")
+    parameters = JobParameters.model_validate(values)
+    parameters.settings()
+    return received, parameters, received.texts.get("webhook", "").strip() or None
+
+
+async def _from_json(request: Request, context: Context) -> Parts:
+    body = bytearray()
+    async for block in body_blocks(request, context.settings):
+        body += block
+        if len(body) > _MAX_JSON:
+            raise TooLargeError(f"A JSON body may have {_MAX_JSON:,} bytes.", limit=_MAX_JSON)
+    try:
+        text = body.decode()
+    except UnicodeDecodeError as error:
+        raise BadRequestError("The body is not UTF-8.") from error
+    job = JobFromUploads.model_validate(parse_json(text, "body"))
+    job.parameters.settings()
+    named = [("scene", job.scene), ("style", job.style)]
+    named += [("cameras", each) for each in job.cameras] + [("photos", each) for each in job.photos]
+    return Received(uploads=named), job.parameters, job.webhook
+
+
+def _resolve(context: Context, caller: Caller, received: Received) -> list[dict[str, Any]]:
+    """All files of a job, those that came with it and those that were uploaded before; they stay for now."""
+    inputs = list(received.files)
+    for number, (role, upload_id) in enumerate(received.uploads):
+        try:
+            if not is_id(upload_id):
+                raise NotFoundError(f"{upload_id[:60]!r} is no id of an upload, and {role!r} came without a file name.")
+            upload = context.store.inputs.upload(upload_id, caller.owner)
+        except NotFoundError as error:
+            raise RefusedInputError(str(error), "unknown-upload", input=role) from error
+        if upload.sha256 is None:
+            raise RefusedInputError(
+                f"Upload {upload_id} has {upload.offset:,} of {upload.length:,} bytes. Finish it first.",
+                "unfinished-upload",
+                input=role,
+            )
+        name = clean_name(role, upload.filename, number)
+        row = context.store.inputs.blob(upload.sha256)
+        if role == "scene":
+            check_file(role, name, context.blobs.path(row.location), row.size, context.settings)
+        inputs.append({"role": role, "name": name, "sha256": row.sha256, "size": row.size})
+    return inputs
+
+
+async def _plan(
+    context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, Path], parameters: JobParameters
+) -> Response:
+    found = await context.inspector.inspect("plan", inputs, paths, parameters)
+    view = PlanView(**found, workers=parameters.workers or 1)
+    return JSONResponse(view.model_dump(mode="json"))
+
+
+def _idempotency(
+    key: str | None, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters, webhook: str | None
+) -> Idempotency | None:
+    if key is None:
+        return None
+    text = json.dumps([list(inputs), parameters.model_dump(mode="json"), webhook], sort_keys=True)
+    return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
+
+
+@router.get("", response_model=JobPage, operation_id="list_jobs")
+def list_jobs(
+    context: ContextDep,
+    caller: CallerDep,
+    status: Annotated[list[StatusName] | None, Query(description="Only these; may be given several times.")] = None,
+    cursor: Annotated[str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> JobPage:
+    """Jobs of this key, the newest first."""
+    jobs = context.store.jobs
+    found = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)
+    shown = found[:limit]
+    views = [job_view(job, jobs.queue_position(job)) for job in shown]
+    return JobPage(jobs=views, next_cursor=shown[-1].id if len(found) > limit else None)
+
+
+@router.get(
+    "/{job_id}",
+    response_model=JobDetail,
+    responses={304: {"description": "Nothing has changed since the ETag of `If-None-Match`."}},
+    operation_id="get_job",
+)
+def get_job(
+    job_id: str,
+    context: ContextDep,
+    caller: CallerDep,
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> Response:
+    """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
+    job = find(context, caller, job_id)
+    return _shown(context, job, if_none_match)
+
+
+@router.post("/{job_id}/cancel", response_model=JobDetail, operation_id="cancel_job")
+def cancel_job(job_id: str, context: ContextDep, caller: CallerDep) -> Response:
+    """Cancel a job: at once where it waits, within seconds where it runs (`canceling` until then)."""
+    find(context, caller, job_id)
+    return _shown(context, context.store.jobs.cancel(job_id, caller.owner))
+
+
+@router.post("/{job_id}/retry", status_code=202, response_model=JobDetail, operation_id="retry_job")
+def retry_job(job_id: str, context: ContextDep, caller: CallerDep) -> Response:
+    """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
+    find(context, caller, job_id)
+    job = context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
+    return _shown(context, job, status=202)
+
+
+@router.delete("/{job_id}", status_code=204, operation_id="delete_job")
+def delete_job(job_id: str, context: ContextDep, caller: CallerDep) -> None:
+    """Remove a job that has ended, with its results."""
+    find(context, caller, job_id)
+    context.store.jobs.delete(job_id, caller.owner)
+    context.artifacts.remove_job(job_id)
+
+
+def find(context: Context, caller: Caller, job_id: str) -> JobRow:
+    """The caller's job of that id.
+
+    Raises:
+        NotFoundError: there is none, or it is another's.
+    """
+    if not is_id(job_id):
+        raise NotFoundError(f"There is no job {job_id[:60]}.")
+    return context.store.jobs.get(job_id, caller.owner)
+
+
+def _shown(context: Context, job: JobRow, if_none_match: str | None = None, status: int = 200) -> Response:
+    jobs = context.store.jobs
+    view = job_detail(job, jobs.queue_position(job), jobs.attempts(job.id))
+    body = view.model_dump_json().encode()
+    tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    wait = poll_seconds(job)
+    if wait is not None:
+        headers["Retry-After"] = str(wait)
+    if if_none_match is not None and tag in if_none_match:
+        return Response(status_code=304, headers=headers)
+    return Response(body, status, headers, media_type="application/json")

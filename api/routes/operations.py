@@ -1,0 +1,50 @@
+"""`/livez`, `/readyz`, `/metrics`: for those who run the service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fastapi import APIRouter, Response
+from fastapi.responses import JSONResponse, PlainTextResponse
+
+from api.context import ContextDep
+from api.views import Health
+
+router = APIRouter(tags=["operations"])
+
+
+@router.get("/livez", response_model=Health, operation_id="livez")
+async def livez() -> Health:
+    """Whether the process answers: if not, restart it."""
+    return Health(status="ok", checks={})
+
+
+@router.get(
+    "/readyz",
+    response_model=Health,
+    operation_id="readyz",
+    responses={503: {"model": Health, "description": "Something that jobs need is away; `checks` says what."}},
+)
+def readyz(context: ContextDep) -> Response:
+    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room."""
+    checks: dict[str, Callable[[], None]] = {
+        "database": context.store.database.ping,
+        "artifacts": context.artifacts.ping,
+        "disk": lambda: context.blobs.ensure_room(0),
+    }
+    found = {}
+    for name, check in checks.items():
+        try:
+            check()
+            found[name] = "ok"
+        except Exception as error:  # whatever it is, the answer is that it does not work
+            found[name] = f"{type(error).__name__}"
+    good = all(value == "ok" for value in found.values())
+    view = Health(status="ok" if good else "unavailable", checks=found)
+    return JSONResponse(view.model_dump(), 200 if good else 503)
+
+
+@router.get("/metrics", response_class=PlainTextResponse, operation_id="metrics")
+def metrics(context: ContextDep) -> Response:
+    """Prometheus metrics."""
+    return Response(context.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")

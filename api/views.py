@@ -1,0 +1,258 @@
+"""What the API answers with."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.artifacts import media_type
+from service.parameters import JobParameters
+from service.store.jobs import UNFINISHED
+from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
+
+StatusName = Literal["queued", "starting", "running", "canceling", "succeeded", "failed", "canceled", "expired"]
+
+
+class ErrorView(BaseModel):
+    """Why a job or an attempt failed."""
+
+    model_config = ConfigDict(extra="allow")
+
+    code: str
+    message: str
+
+
+class ProgressView(BaseModel):
+    """How far a job is."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "stage": "sos",
+                    "step": 120,
+                    "total": 300,
+                    "fraction": 0.4,
+                    "eta_s": 310.5,
+                    "loss": 23729174.8,
+                    "seconds": 205.1,
+                    "attempt": 1,
+                    "updated_at": "2026-11-21T14:09:30.532514Z",
+                }
+            ]
+        }
+    )
+
+    stage: str = Field(description="`reading`, `starting`, `coarse` (coarsest scale) or `sos` (all scales).")
+    step: int
+    total: int = Field(description="Steps at most; 0 while they are not known.")
+    fraction: float = Field(description="Of the steps, 0 to 1.")
+    eta_s: float | None = Field(description="Seconds left, as far as that can be told.")
+    loss: float | None
+    seconds: float | None = Field(description="Of all steps so far.")
+    attempt: int
+    updated_at: datetime
+
+
+class InputView(BaseModel):
+    """A file that a job was created from."""
+
+    role: Literal["scene", "style", "cameras", "photos"]
+    name: str
+    size: int
+    sha256: str
+
+
+class AttemptView(BaseModel):
+    """One attempt at a job."""
+
+    number: int
+    started_at: datetime
+    finished_at: datetime | None
+    outcome: Literal["succeeded", "failed", "canceled", "released", "lost"] | None = Field(
+        description="`lost`: its dispatcher was not heard of again; `released`: it shut down and put the job back."
+    )
+    error: ErrorView | None
+
+
+class Links(BaseModel):
+    """Where to go on."""
+
+    self: str
+    events: str
+    artifacts: str
+    result: str | None = Field(description="The stylized PLY, once it is there.")
+
+
+class JobView(BaseModel):
+    """A job."""
+
+    id: str = Field(examples=["job_1a1fe701a104f943e9d4d8cce5b818c"])
+    name: str
+    status: StatusName
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None = Field(description="When the results are removed, or the record of an expired job.")
+    attempt: int = Field(description="Of the attempt that runs or ran last; 0 before the first.")
+    queue_position: int | None = Field(description="1 is next; null where the job is not queued.")
+    progress: ProgressView | None
+    result: dict[str, Any] | None = Field(description="Steps, why it stopped, loss before and after.")
+    error: ErrorView | None
+    parameters: JobParameters
+    inputs: list[InputView]
+    links: Links
+
+
+class JobDetail(JobView):
+    """A job with its attempts."""
+
+    attempts: list[AttemptView]
+
+
+class JobPage(BaseModel):
+    """A page of jobs, the newest first."""
+
+    jobs: list[JobView]
+    next_cursor: str | None = Field(description="For the next page; null on the last one.")
+
+
+class ArtifactView(BaseModel):
+    """A file that a job has made."""
+
+    name: str = Field(examples=["stylized.ply"])
+    size: int
+    sha256: str
+    media_type: str
+    created_at: datetime
+    url: str
+
+
+class ArtifactList(BaseModel):
+    """All files that a job has made so far."""
+
+    artifacts: list[ArtifactView]
+
+
+class UploadView(BaseModel):
+    """A file that arrives in parts."""
+
+    id: str = Field(examples=["upl_1a1fe701a104f943e9d4d8cce5b818c"])
+    filename: str
+    length: int
+    offset: int
+    complete: bool
+    sha256: str | None
+    expires_at: datetime
+
+
+class PlanView(BaseModel):
+    """What a job would do; nothing was queued."""
+
+    gaussians: int
+    dropped: int
+    sh_degree: int
+    views: int
+    pixels: int
+    style: list[int] = Field(description="Width and height.")
+    photos: int
+    workers: int
+    estimated_seconds: float | None = Field(description="Of all steps; null where it cannot be told.")
+    plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
+
+
+class Health(BaseModel):
+    """Whether the service can do its work."""
+
+    status: Literal["ok", "unavailable"]
+    checks: dict[str, str]
+
+
+def _time(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _maybe(seconds: float | None) -> datetime | None:
+    return None if seconds is None else _time(seconds)
+
+
+def job_view(job: JobRow, queue_position: int | None) -> JobView:
+    """A job as the API shows it."""
+    return JobView(**_job_fields(job, queue_position))
+
+
+def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow]) -> JobDetail:
+    """A job with its attempts."""
+    shown = [
+        AttemptView(
+            number=row.number,
+            started_at=_time(row.started_at),
+            finished_at=_maybe(row.finished_at),
+            outcome=row.outcome,  # type: ignore[arg-type]
+            error=ErrorView(**row.error) if row.error else None,
+        )
+        for row in attempts
+    ]
+    return JobDetail(**_job_fields(job, queue_position), attempts=shown)
+
+
+def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
+    here = f"/v1/jobs/{job.id}"
+    progress = job.progress
+    return {
+        "id": job.id,
+        "name": job.name,
+        "status": job.status,
+        "created_at": _time(job.created_at),
+        "started_at": _maybe(job.started_at),
+        "finished_at": _maybe(job.finished_at),
+        "expires_at": _maybe(job.expires_at),
+        "attempt": job.attempt,
+        "queue_position": queue_position,
+        "progress": ProgressView(**{**progress, "updated_at": _time(progress["updated_at"])}) if progress else None,
+        "result": job.result,
+        "error": ErrorView(**job.error) if job.error else None,
+        "parameters": JobParameters(**job.parameters),
+        "inputs": [InputView(**entry) for entry in job.inputs],
+        "links": Links(
+            self=here,
+            events=f"{here}/events",
+            artifacts=f"{here}/artifacts",
+            result=f"{here}/artifacts/stylized.ply" if job.status == "succeeded" else None,
+        ),
+    }
+
+
+def poll_seconds(job: JobRow) -> int | None:
+    """After how many seconds it makes sense to ask again; None for a job that has ended."""
+    if job.status not in UNFINISHED:
+        return None
+    left = (job.progress or {}).get("eta_s")
+    return 2 if left is None else max(1, min(10, round(left / 10)))
+
+
+def artifact_view(row: ArtifactRow) -> ArtifactView:
+    """A result as the API shows it."""
+    return ArtifactView(
+        name=row.name,
+        size=row.size,
+        sha256=row.sha256,
+        media_type=media_type(row.name),
+        created_at=_time(row.created_at),
+        url=f"/v1/jobs/{row.job_id}/artifacts/{row.name}",
+    )
+
+
+def upload_view(row: UploadRow) -> UploadView:
+    """An upload as the API shows it."""
+    return UploadView(
+        id=row.id,
+        filename=row.filename,
+        length=row.length,
+        offset=row.offset,
+        complete=row.sha256 is not None,
+        sha256=row.sha256,
+        expires_at=_time(row.expires_at),
+    )
