@@ -23,6 +23,7 @@ from rich.progress import (
 from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
+from api import service_commands
 from api.interrupt import stop_on_signal
 from api.values import parse_background, parse_bytes
 from sgsst_core.constants import NEAR
@@ -57,6 +58,7 @@ weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_hel
 app.add_typer(weights_app, name="weights")
 bench_app = typer.Typer(help="Measurements to repeat on your own scene and machine.", no_args_is_help=True)
 app.add_typer(bench_app, name="bench")
+service_commands.add_to(app)
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
