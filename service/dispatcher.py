@@ -8,6 +8,7 @@ so neither a job nor Ray can take the dispatcher along.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import os
 import shutil
@@ -15,10 +16,8 @@ import signal
 import socket
 import threading
 import time
-from pathlib import Path
 from types import FrameType
 
-import psutil
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.artifacts import Artifacts
@@ -32,6 +31,7 @@ from service.store import Store, open_store
 from service.store.jobs import DAY, Lease
 from service.store.tables import JobRow
 from service.webhooks import Deliverer
+from worker.processes import ProcessId, home
 
 #: Seconds between two looks for what has expired.
 _HOUSEKEEPING_SECONDS = 60.0
@@ -56,8 +56,7 @@ class Dispatcher:
         self._places = settings.parallel_jobs or max(1, self._gpus)
         self._running: dict[str, RunningAttempt] = {}
         self._stop = threading.Event()
-        own = psutil.Process()
-        self.name = f"{socket.gethostname()}-{own.pid}-{int(own.create_time())}"
+        self.name = own_name()
         self._work = settings.folder / "work" / self.name
         self._renewed_at = self._kept_at = float("-inf")
         self._deliverer = Deliverer(settings, store)
@@ -68,7 +67,7 @@ class Dispatcher:
 
     def run(self) -> None:
         """Work until `stop`."""
-        _remove_leftovers(self._work.parent)
+        self._take_over_from_the_dead()
         self._work.mkdir(parents=True, exist_ok=True)
         self._deliverer.start()
         _log.info("dispatcher %s is ready: %d places, %d GPUs", self.name, self._places, self._gpus)
@@ -81,6 +80,17 @@ class Dispatcher:
                 self._stop.wait(2.0)
             self._stop.wait(self._settings.poll_seconds)
         self._shut_down()
+
+    def _take_over_from_the_dead(self) -> None:
+        """Of dispatchers that ran on this machine and are gone, nothing needs to be waited for."""
+        for name in self._store.jobs.lease_owners():
+            if is_dead(name):
+                _log.info("dispatcher %s is gone; its jobs are taken over", name)
+                self._store.jobs.end_leases(name)
+        if self._work.parent.is_dir():
+            for path in self._work.parent.iterdir():
+                if is_dead(path.name):
+                    shutil.rmtree(path, ignore_errors=True)
 
     def _round(self) -> None:
         for job_id, attempt in list(self._running.items()):
@@ -126,8 +136,12 @@ class Dispatcher:
         if not self._running:
             self._renewed_at = time.monotonic()
             return
-        found = self._store.jobs.renew([attempt.lease for attempt in self._running.values()])
-        self._renewed_at = time.monotonic()
+        leases = [attempt.lease for attempt in self._running.values()]
+        if time.monotonic() - self._renewed_at >= _RENEW_SHARE * self._settings.lease_seconds:
+            found = self._store.jobs.renew(leases)
+            self._renewed_at = time.monotonic()
+        else:
+            found = self._store.jobs.look(leases)
         for job_id, status in found.items():
             attempt = self._running[job_id]
             if status is None and attempt.alive:
@@ -160,22 +174,22 @@ class Dispatcher:
         self._blobs.collect()
 
 
-def _remove_leftovers(folder: Path) -> None:
-    """Remove the working folders of dispatchers of this machine that are gone."""
-    if not folder.is_dir():
-        return
-    for path in folder.iterdir():
-        host, _, rest = path.name.rpartition("-")
-        host, _, pid = host.rpartition("-")
-        if host == socket.gethostname() and not _lives(int(pid), int(rest)):
-            shutil.rmtree(path, ignore_errors=True)
+def own_name() -> str:
+    """Names this process for good: where it runs, its number there, and when it started."""
+    own = ProcessId.of_this()
+    return f"{socket.gethostname()[:40]}-{_home()}-{own.number}-{int(own.started)}"
 
 
-def _lives(pid: int, started: int) -> bool:
-    try:
-        return int(psutil.Process(pid).create_time()) == started
-    except psutil.Error:
+def is_dead(name: str) -> bool:
+    """Whether a dispatcher of that name ran where this process can see it, and is gone."""
+    parts = name.rsplit("-", 3)
+    if len(parts) != 4 or parts[1] != _home() or not (parts[2] + parts[3]).isdigit():
         return False
+    return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
+
+
+def _home() -> str:
+    return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]
 
 
 def main() -> None:

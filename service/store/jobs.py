@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Select, and_, case, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, Select, and_, case, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from service.errors import ConflictError, LeaseLostError, NotFoundError, QueueFullError
@@ -359,6 +359,26 @@ class Jobs:
                 found[lease.job_id] = job.status if job is not None else None  # type: ignore[assignment]
         return found
 
+    def look(self, leases: Sequence[Lease]) -> dict[str, Status | None]:
+        """As `renew`, without renewing: what has become of leased jobs."""
+        with self._database.reading() as session:
+            rows = {row.id: row for row in session.scalars(select(JobRow).where(_any_of(leases)))}
+        held = {lease.job_id: _is_held(rows.get(lease.job_id), lease) for lease in leases}
+        return {job_id: rows[job_id].status if yes else None for job_id, yes in held.items()}  # type: ignore[misc]
+
+    def lease_owners(self) -> list[str]:
+        """Names of all dispatchers that hold a lease."""
+        with self._database.reading() as session:
+            query = select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
+            return sorted({str(owner) for owner in session.scalars(query)})
+
+    def end_leases(self, dispatcher: str) -> None:
+        """Let the leases of a dispatcher run out now: it is known to be dead."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
+            session.execute(update(JobRow).where(held).values(lease_expires_at=now - 1e-3))
+
     def running(self, lease: Lease) -> None:
         """Tell that the job's inputs are read and its steps begin; a job that is being canceled stays so."""
         now = self._database.clock()
@@ -474,13 +494,7 @@ class Jobs:
 
     def _held(self, session: Session, lease: Lease) -> JobRow | None:
         job = session.get(JobRow, lease.job_id, with_for_update=True)
-        held = (
-            job is not None
-            and job.status in ACTIVE
-            and job.lease_epoch == lease.epoch
-            and job.lease_owner == lease.dispatcher
-        )
-        return job if held else None
+        return job if _is_held(job, lease) else None
 
     def _held_or_raise(self, session: Session, lease: Lease) -> JobRow:
         job = self._held(session, lease)
@@ -511,6 +525,19 @@ def _owned(session: Session, job_id: str, owner: str | None, *, lock: bool = Fal
     if job is None or (owner is not None and job.owner != owner):
         raise NotFoundError(f"There is no job {job_id}.")
     return job
+
+
+def _is_held(job: JobRow | None, lease: Lease) -> bool:
+    return (
+        job is not None
+        and job.status in ACTIVE
+        and job.lease_epoch == lease.epoch
+        and job.lease_owner == lease.dispatcher
+    )
+
+
+def _any_of(leases: Sequence[Lease]) -> ColumnElement[bool]:
+    return JobRow.id.in_([lease.job_id for lease in leases])
 
 
 def _said(job: JobRow) -> str:

@@ -1,0 +1,476 @@
+"""The store against a model of it, on SQLite and PostgreSQL, with a clock that the tests turn."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from sqlalchemy import inspect
+
+from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.database import create_all
+from service.store.inputs import GRACE_SECONDS
+from service.store.jobs import ACTIVE, FINISHED, KEPT_PROGRESS, Idempotency, Lease, NewJob, Published
+from service.store.tables import Base
+
+SHA = "a" * 64
+LEASE, RETRY, ATTEMPTS = 30.0, 5.0, 3
+
+
+class Clock:
+    """Stands still until told otherwise."""
+
+    def __init__(self) -> None:
+        self.now = 1_000_000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[str]:
+    """A PostgreSQL server of our own; skipped where none is installed."""
+    bin_folder = _postgres_programs()
+    if bin_folder is None:
+        pytest.skip("PostgreSQL's server is not installed")
+    folder = Path(tempfile.mkdtemp(prefix="sgsst-pg-"))
+    user: dict[str, Any] = {}
+    if os.geteuid() == 0:  # it refuses to run as root
+        shutil.chown(folder, "postgres")
+        user = {"user": "postgres", "group": "postgres", "extra_groups": []}
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    data = str(folder / "data")
+    options = {**user, "check": True, "stdout": subprocess.DEVNULL, "cwd": folder}
+    subprocess.run([bin_folder / "initdb", "-U", "sgsst", "-A", "trust", "-D", data], **options)
+    server = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync=off"
+    subprocess.run([bin_folder / "pg_ctl", "-D", data, "-o", server, "-l", folder / "log", "-w", "start"], **options)
+    yield f"postgresql+psycopg://sgsst@127.0.0.1:{port}"
+    subprocess.run([bin_folder / "pg_ctl", "-D", data, "-m", "immediate", "stop"], **options)
+    shutil.rmtree(folder)
+
+
+def _postgres_programs() -> Path | None:
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/pg_ctl"))
+    on_path = shutil.which("pg_ctl")
+    place = found[-1] if found else Path(on_path).resolve() if on_path else None
+    return place.parent if place else None
+
+
+def _fresh_database(server: str) -> str:
+    from sqlalchemy import create_engine, text
+
+    name = f"t{os.urandom(6).hex()}"
+    engine = create_engine(f"{server}/postgres", isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name}"))
+    engine.dispose()
+    return f"{server}/{name}"
+
+
+def _settings(folder: Path, database: str | None) -> ServiceSettings:
+    return ServiceSettings(
+        data=folder, database=database, lease_seconds=LEASE, retry_seconds=RETRY, max_attempts=ATTEMPTS
+    )
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
+    """URL of an empty database; None for SQLite's default place."""
+    return None if request.param == "sqlite" else _fresh_database(request.getfixturevalue("postgres"))
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(database: str | None, tmp_path: Path, clock: Clock) -> Iterator[Store]:
+    made = open_store(_settings(tmp_path, database), clock)
+    made.inputs.add_blob(SHA, "aa/blob", 3)
+    yield made
+    made.close()
+
+
+def new_job(owner: str = "local", priority: int = 0) -> NewJob:
+    return NewJob(owner, "", priority, {}, [{"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}])
+
+
+def queue(store: Store, owner: str = "local", priority: int = 0) -> str:
+    return store.jobs.create(new_job(owner, priority), limit=100)[0].id
+
+
+def lease(store: Store, dispatcher: str = "one") -> Lease:
+    found = store.jobs.lease(dispatcher)
+    assert found is not None
+    return found
+
+
+def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tmp_path: Path) -> None:
+    found = inspect(store.database.engine)
+    for table in Base.metadata.sorted_tables:
+        columns = {column["name"]: column["nullable"] for column in found.get_columns(table.name)}
+        assert columns == {column.name: column.nullable for column in table.columns}, table.name
+        indexes = {index["name"] for index in found.get_indexes(table.name) if not index["unique"]}
+        assert indexes == {index.name for index in table.indexes}, table.name
+    create_all(store.database.engine)  # finds them all there
+
+
+def test_sqlite_is_safe_against_power_cuts(tmp_path: Path) -> None:
+    store = open_store(_settings(tmp_path, None))
+    with store.database.reading() as session:
+        pragmas = {
+            name: session.connection().exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys")
+        }
+    assert pragmas == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
+    store.close()
+
+
+def test_the_same_idempotency_key_creates_one_job(store: Store) -> None:
+    first, created = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
+    again, created_again = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
+    assert (created, created_again, first.id) == (True, False, again.id)
+    with pytest.raises(IdempotencyError):
+        store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "e" * 64))
+    other, created = store.jobs.create(new_job("other"), limit=10, idempotency=Idempotency("k", "e" * 64))
+    assert created
+    assert other.id != first.id
+
+
+def test_of_many_requests_at_once_with_one_key_one_creates(store: Store) -> None:
+    found: list[tuple[str, bool]] = []
+
+    def create() -> None:
+        job, created = store.jobs.create(new_job(), limit=100, idempotency=Idempotency("k", "f" * 64))
+        found.append((job.id, created))
+
+    _at_once(create, 8)
+    assert len({job_id for job_id, _ in found}) == 1
+    assert sum(created for _, created in found) == 1
+
+
+def test_many_dispatchers_lease_every_job_once(store: Store) -> None:
+    expected = {queue(store) for _ in range(12)}
+    found: list[str] = []
+
+    def work() -> None:
+        while (held := store.jobs.lease(threading.current_thread().name)) is not None:
+            found.append(held.job_id)
+
+    _at_once(work, 4)
+    # with PostgreSQL a dispatcher may find nothing while another one holds the row that is next
+    while (held := store.jobs.lease("last")) is not None:
+        found.append(held.job_id)
+    assert sorted(found) == sorted(expected)
+
+
+def _at_once(work: Callable[[], None], count: int) -> None:
+    threads = [threading.Thread(target=work) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def test_priority_then_turns_then_age(store: Store, clock: Clock) -> None:
+    order = []
+    for owner, priority in (("a", 0), ("a", 0), ("a", 0), ("b", 0), ("c", 1)):
+        order.append(queue(store, owner, priority))
+        clock.now += 1
+    taken = [lease(store).job for _ in order]
+    assert [job.owner for job in taken] == ["c", "a", "b", "a", "a"]
+    assert [job.id for job in taken if job.owner == "a"] == order[:3]
+
+
+def test_a_big_job_is_not_overtaken_for_ever(store: Store, clock: Clock) -> None:
+    big = queue(store)
+    clock.now += 1
+    queue(store)
+    assert store.jobs.lease("one", lambda job: job.id != big) is None
+    assert lease(store).job_id == big
+
+
+def test_who_lost_the_lease_cannot_write(store: Store, clock: Clock) -> None:
+    queue(store)
+    late = lease(store, "late")
+    clock.now += LEASE + 1
+    new = lease(store, "new")
+    assert new.job_id == late.job_id
+    file = Published("stylized.ply", "x/1", 1, SHA)
+    for write in (
+        lambda: store.jobs.running(late),
+        lambda: store.jobs.progress(late, {"step": 1}),
+        lambda: store.jobs.publish(late, [file]),
+        lambda: store.jobs.succeed(late, [file], {}, 1.0),
+        lambda: store.jobs.fail(late, {"code": "x", "message": "x"}, permanent=False, retention=1.0),
+        lambda: store.jobs.release(late),
+        lambda: store.jobs.canceled(late, 1.0),
+    ):
+        with pytest.raises(LeaseLostError):
+            write()
+    assert store.jobs.renew([late]) == store.jobs.look([late]) == {late.job_id: None}
+    assert store.jobs.renew([new]) == store.jobs.look([new]) == {new.job_id: "starting"}
+    assert not store.jobs.artifacts(new.job_id)
+    store.jobs.succeed(new, [file], {"steps": 1}, 1.0)
+    assert [row.name for row in store.jobs.artifacts(new.job_id)] == ["stylized.ply"]
+    with pytest.raises(LeaseLostError):
+        store.jobs.succeed(new, [file], {}, 1.0)
+
+
+def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    for attempt in range(1, ATTEMPTS + 1):
+        assert lease(store).job.attempt == attempt
+        clock.now += LEASE + 1  # the dispatcher died with it
+    assert store.jobs.lease("one") is None
+    job = store.jobs.get(job_id, "local")
+    assert (job.status, (job.error or {})["code"]) == ("failed", "dispatcher-lost")
+    assert [row.outcome for row in store.jobs.attempts(job_id)] == ["lost"] * ATTEMPTS
+
+
+def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    error = {"code": "x", "message": "x"}
+    for wait in (RETRY, 2 * RETRY):
+        assert store.jobs.fail(lease(store), error, permanent=False, retention=1.0)
+        clock.now += wait - 0.1
+        assert store.jobs.lease("one") is None
+        clock.now += 0.2
+    assert not store.jobs.fail(lease(store), error, permanent=False, retention=1.0)
+    assert store.jobs.get(job_id, "local").status == "failed"
+
+
+def test_release_does_not_count_as_failure(store: Store) -> None:
+    queue(store)
+    for _ in range(2 * ATTEMPTS):
+        store.jobs.release(lease(store))
+    assert lease(store).job.failures == 0
+
+
+def test_another_owners_job_is_not_there(store: Store) -> None:
+    job_id = queue(store, "a")
+    for use in (store.jobs.get, store.jobs.cancel, store.jobs.delete):
+        with pytest.raises(NotFoundError):
+            use(job_id, "b")
+    with pytest.raises(NotFoundError):
+        store.jobs.retry(job_id, "b", limit=1)
+    assert store.jobs.page("b") == []
+
+
+def test_the_queue_of_one_key_is_bounded(store: Store) -> None:
+    for _ in range(3):
+        store.jobs.create(new_job("a"), limit=3)
+    with pytest.raises(QueueFullError):
+        store.jobs.create(new_job("a"), limit=3)
+    store.jobs.create(new_job("b"), limit=3)
+
+
+def test_old_progress_is_forgotten_but_no_status(store: Store) -> None:
+    queue(store)
+    held = lease(store)
+    for step in range(KEPT_PROGRESS + 20):
+        store.jobs.progress(held, {"step": step})
+    events = store.jobs.events(held.job_id, 0, limit=1000)
+    assert [event.data["step"] for event in events if event.kind == "progress"] == list(range(20, KEPT_PROGRESS + 20))
+    assert [event.data["status"] for event in events if event.kind == "status"] == ["queued", "starting"]
+
+
+def test_blobs_go_when_nothing_needs_them(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    clock.now += 2 * GRACE_SECONDS
+    assert store.inputs.collect() == []
+    store.jobs.cancel(job_id, "local")
+    store.jobs.delete(job_id, "local")
+    assert store.inputs.collect() == ["aa/blob"]
+    assert store.inputs.add_blob(SHA, "aa/other", 3) == "aa/other"
+    assert store.inputs.add_blob(SHA, "aa/third", 3) == "aa/other"
+    assert store.inputs.collect() == []  # just touched
+
+
+def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    store.jobs.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {}, 100.0)
+    clock.now += 101
+    assert store.jobs.expire(100.0) == [job_id]
+    assert store.jobs.get(job_id, "local").status == "expired"
+    assert store.jobs.artifacts(job_id) == []
+    clock.now += 101
+    store.jobs.expire(100.0)
+    with pytest.raises(NotFoundError):
+        store.jobs.get(job_id, "local")
+
+
+def test_revoked_keys_are_unknown(store: Store) -> None:
+    row, text = store.keys.create("me")
+    assert store.keys.find(text) is not None
+    assert store.keys.find(text + "x") is None
+    with store.database.reading() as session:
+        stored = session.connection().exec_driver_sql("SELECT sha256 FROM api_keys").scalar()
+    assert stored is not None
+    assert text not in stored
+    store.keys.revoke(row.id)
+    assert store.keys.find(text) is None
+
+
+# --- against a model -----------------------------------------------------------------------------------------------
+
+
+class StoreMachine(RuleBasedStateMachine):
+    """Any order of what users and dispatchers do; the model knows of each job its status and who may write to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp(prefix="sgsst-store-"))
+        self.clock = Clock()
+        self.store = open_store(_settings(self.folder, None), self.clock)
+        self.store.inputs.add_blob(SHA, "aa/blob", 3)
+        self.status: dict[str, str] = {}
+        self.held: dict[str, tuple[Lease, float]] = {}
+        self.old: list[Lease] = []
+        self.published: dict[str, int] = {}
+
+    def teardown(self) -> None:
+        self.store.close()
+        shutil.rmtree(self.folder)
+
+    @initialize()
+    def first(self) -> None:
+        self.create("a", 0)
+
+    @rule(owner=st.sampled_from("ab"), priority=st.integers(0, 1))
+    def create(self, owner: str, priority: int) -> None:
+        job_id = queue(self.store, owner, priority)
+        self.status[job_id] = "queued"
+
+    @rule(seconds=st.sampled_from([1.0, RETRY, LEASE / 2, LEASE + 1]))
+    def wait(self, seconds: float) -> None:
+        self.clock.now += seconds
+
+    @rule(dispatcher=st.sampled_from(["one", "two"]))
+    def take(self, dispatcher: str) -> None:
+        live = {job_id for job_id, (_, until) in self.held.items() if until >= self.clock.now}
+        found = self.store.jobs.lease(dispatcher)
+        self._see_settled()
+        if found is None:
+            return
+        assert found.job_id not in live
+        if found.job_id in self.held:
+            self.old.append(self.held.pop(found.job_id)[0])
+        self.held[found.job_id] = (found, self.clock.now + LEASE)
+        self.status[found.job_id] = "starting"
+
+    def _see_settled(self) -> None:
+        """Leases that had run out may have ended their jobs."""
+        for job_id, (held, until) in list(self.held.items()):
+            status = self.store.jobs.get(job_id, None).status
+            if until < self.clock.now and status in ("failed", "canceled"):
+                self.old.append(held)
+                del self.held[job_id]
+                self.status[job_id] = status
+
+    @precondition(lambda self: self.held)
+    @rule(data=st.data())
+    def renew(self, data: st.DataObject) -> None:
+        held, _ = self._some(data)
+        assert self.store.jobs.renew([held]) == {held.job_id: self.status[held.job_id]}
+        self.held[held.job_id] = (held, self.clock.now + LEASE)
+
+    @precondition(lambda self: self.held)
+    @rule(data=st.data(), how=st.sampled_from(["running", "succeed", "fail", "break", "release", "canceled"]))
+    def write(self, data: st.DataObject, how: str) -> None:
+        held, _ = self._some(data)
+        job_id, jobs = held.job_id, self.store.jobs
+        canceling = self.status[job_id] == "canceling"
+        if how == "running":
+            jobs.running(held)
+            self.status[job_id] = "canceling" if canceling else "running"
+            return
+        if how == "succeed":
+            jobs.succeed(held, [Published("stylized.ply", f"{held.epoch}", 1, SHA)], {}, 1e6)
+            self.published[job_id] = self.published.get(job_id, 0) + 1
+            self.status[job_id] = "succeeded"
+        elif how in ("fail", "break"):
+            again = jobs.fail(held, {"code": "x", "message": "x"}, permanent=how == "break", retention=1e6)
+            assert not (again and (how == "break" or canceling))
+            self.status[job_id] = "canceled" if canceling else "queued" if again else "failed"
+        elif how == "release":
+            jobs.release(held)
+            self.status[job_id] = "canceled" if canceling else "queued"
+        else:
+            jobs.canceled(held, 1e6)
+            self.status[job_id] = "canceled"
+        self.old.append(self.held.pop(job_id)[0])
+
+    def _some(self, data: st.DataObject) -> tuple[Lease, float]:
+        return self.held[data.draw(st.sampled_from(sorted(self.held)))]
+
+    @precondition(lambda self: self.old)
+    @rule(data=st.data())
+    def late_write(self, data: st.DataObject) -> None:
+        late = data.draw(st.sampled_from(self.old))
+        with pytest.raises(LeaseLostError):
+            self.store.jobs.succeed(late, [Published("stylized.ply", "late", 1, SHA)], {}, 1e6)
+
+    @precondition(lambda self: self.status)
+    @rule(data=st.data(), what=st.sampled_from(["cancel", "retry", "delete"]))
+    def ask(self, data: st.DataObject, what: str) -> None:
+        job_id = data.draw(st.sampled_from(sorted(self.status)))
+        before = self.status[job_id]
+        jobs = self.store.jobs
+        try:
+            if what == "cancel":
+                jobs.cancel(job_id, None)
+                self.status[job_id] = {"queued": "canceled", "canceled": "canceled"}.get(before, "canceling")
+                assert before in ("queued", *ACTIVE, "canceled")
+            elif what == "retry":
+                jobs.retry(job_id, None, limit=1000)
+                assert before in ("failed", "canceled")
+                self.status[job_id] = "queued"
+            else:
+                jobs.delete(job_id, None)
+                assert before in FINISHED
+                del self.status[job_id]
+                self.old = [lease for lease in self.old if lease.job_id != job_id]
+                self.published.pop(job_id, None)
+        except ConflictError:
+            wrong = {"cancel": ("succeeded", "failed"), "delete": ("queued", *ACTIVE)}
+            assert before in wrong.get(what, ("queued", "succeeded", *ACTIVE))
+
+    @invariant()
+    def as_the_model_says(self) -> None:
+        assert {job.id: job.status for job in self.store.jobs.page(None, limit=1000)} == self.status
+        assert all(count == 1 for count in self.published.values())
+        for job_id, status in self.status.items():
+            names = [row.name for row in self.store.jobs.artifacts(job_id)]
+            assert (names == ["stylized.ply"]) == (status == "succeeded")
+
+
+TestStoreMachine = StoreMachine.TestCase
+TestStoreMachine.settings = settings(
+    max_examples=15,
+    stateful_step_count=30,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+
+
+def test_errors_of_the_service_have_codes_and_statuses() -> None:
+    kinds = [ServiceError, *ServiceError.__subclasses__()]
+    assert all(400 <= kind.status < 600 for kind in kinds)
+    assert len({(kind.code, kind.status) for kind in kinds}) == len(kinds)
