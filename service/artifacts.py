@@ -16,7 +16,12 @@ from service.store.jobs import Published
 from sgsst_core.files import atomic_path
 
 _CHUNK = 1 << 20
-_MEDIA_TYPES = {".ply": "application/octet-stream", ".json": "application/json", ".txt": "text/plain; charset=utf-8"}
+_MEDIA_TYPES = {
+    ".ply": "application/octet-stream",
+    ".json": "application/json",
+    ".txt": "text/plain; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+}
 
 
 class Artifacts:

@@ -1,0 +1,124 @@
+"""The service as a user starts it, for tests: real processes, a folder of their own, any free port."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+
+ROOT = Path(__file__).resolve().parents[2]
+#: How long a test waits for anything before it fails; none of them measures how long it took.
+PATIENCE = 180.0
+#: Short times, so that tests see in seconds what takes minutes otherwise.
+SETTINGS = {
+    "SGSST_MIN_FREE_BYTES": "0",
+    "SGSST_LEASE_SECONDS": "5",
+    "SGSST_RETRY_SECONDS": "0.2",
+    "SGSST_POLL_SECONDS": "0.1",
+    "SGSST_CHECKPOINT_SECONDS": "1",
+    "SGSST_PREVIEW_SECONDS": "0.5",
+    "OMP_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "GOMP_SPINCOUNT": "0",
+}
+
+
+class Service:
+    """A process of `sgsst serve`, or of the API alone."""
+
+    def __init__(self, data: Path, *, alone: bool = False, **settings: str) -> None:
+        self.data = data
+        self.environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(ROOT), "SGSST_DATA": str(data), **settings}
+        self._command = [sys.executable, "-m", "api.server"] if alone else [sys.executable, "-m", "api.cli", "serve"]
+        self._alone = alone
+        self.log = data.with_name(data.name + ".log")
+        self.url = ""
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> Service:
+        """Start it, and wait until it is ready."""
+        self.environment["SGSST_PORT"] = self.environment.get("SGSST_PORT") or str(_free_port())
+        self.url = f"http://127.0.0.1:{self.environment['SGSST_PORT']}"
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(
+                self._command, env=self.environment, stdout=log, stderr=log, cwd=ROOT, start_new_session=True
+            )
+        wait_for(self.ready, "the service to be ready", self.said)
+        return self
+
+    def said(self) -> str:
+        """The end of its log."""
+        return self.log.read_text(errors="replace")[-3000:]
+
+    def ready(self) -> bool:
+        """Whether it answers."""
+        assert self._process is not None
+        assert self._process.poll() is None, f"the service has ended:\n{self.said()}"
+        try:
+            return httpx.get(f"{self.url}/readyz", timeout=5).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def client(self, key: str | None = None) -> httpx.Client:
+        """To talk to it."""
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=60)
+
+    def process(self, module: str) -> psutil.Process | None:
+        """A process below it that runs a module."""
+        assert self._process is not None
+        try:
+            family = [psutil.Process(self._process.pid), *psutil.Process(self._process.pid).children(recursive=True)]
+        except psutil.Error:
+            return None
+        for process in family:
+            try:
+                if module in process.cmdline() and process.status() != psutil.STATUS_ZOMBIE:
+                    return process
+            except psutil.Error:
+                continue
+        return None
+
+    def kill(self, module: str) -> None:
+        """SIGKILL a process below it."""
+        process = wait_for(lambda: self.process(module), f"a process {module}", self.said)
+        process.send_signal(signal.SIGKILL)
+
+    def stop(self, number: int = signal.SIGTERM) -> None:
+        """End it as a user or the system would."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(number)
+            self._process.wait(PATIENCE)
+
+    def __enter__(self) -> Service:
+        return self.start()
+
+    def __exit__(self, *ignored: object) -> None:
+        self.stop()
+
+
+def wait_for(condition: Callable[[], Any], what: str, said: Callable[[], str] = lambda: "") -> Any:
+    """The first true value of a condition; a test whose patience is over fails."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"waited in vain for {what}\n{said()}")
+
+
+def _free_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,320 @@
+"""The service from end to end: the processes of `sgsst serve`, real jobs over HTTP, and processes that are killed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.client import AsyncClient, Client
+from sgsst_core.ply import read_scene
+from sgsst_core.weights import BackboneWeights
+from tests.api.service import ROOT, Service, wait_for
+from tests.small_scenes import wall, write_files
+
+#: Long enough to be killed in, and short enough for a test.
+STEPS = 120
+PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "early_stop": False, "seed": 3}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall(sh_degree=1))
+    return {"scene": ply, "cameras": cameras, "style": style}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, vgg16_weights: BackboneWeights) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("service") / "data") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """What `sgsst stylize` makes of the same files and settings."""
+    out = tmp_path_factory.mktemp("cli") / "stylized.ply"
+    command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
+    command += ["--cameras", str(files["cameras"]), "--steps-sos", str(STEPS), "--no-early-stop", "--seed", "3"]
+    command += ["--backbone", "vgg16", "--out", str(out)]
+    subprocess.run(command, check=True, env=service.environment, cwd=ROOT, stdout=subprocess.DEVNULL)
+    return out.read_bytes()
+
+
+def submit(client: httpx.Client, files: dict[str, Path], **parameters: Any) -> str:
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    data = {"parameters": json.dumps(PARAMETERS | parameters)}
+    answer = client.post("/v1/jobs", files=body, data=data)
+    assert answer.status_code == 202, answer.text
+    assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
+    return str(answer.json()["id"])
+
+
+def job(client: httpx.Client, job_id: str) -> dict[str, Any]:
+    found: dict[str, Any] = client.get(f"/v1/jobs/{job_id}").json()
+    return found
+
+
+def wait_until(service: Service, client: httpx.Client, job_id: str, *statuses: str) -> dict[str, Any]:
+    def there() -> dict[str, Any] | None:
+        found = job(client, job_id)
+        return found if found["status"] in statuses else None
+
+    found: dict[str, Any] = wait_for(there, f"{job_id} to be {statuses}", service.said)
+    return found
+
+
+def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int, attempt: int = 1) -> None:
+    def there() -> bool:
+        progress = job(client, job_id)["progress"] or {}
+        return progress.get("attempt") == attempt and progress.get("step", 0) >= step
+
+    wait_for(there, f"step {step}", service.said)
+
+
+def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
+    """The whole stream until the service ends it."""
+    headers = {"Last-Event-ID": str(after)} if after else {}
+    found = []
+    with client.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as stream:
+        if stream.status_code == 204:
+            return []
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        for block in "".join(stream.iter_text()).split("\n\n"):
+            fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
+            if "data" in fields:
+                found.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
+    return found
+
+
+def result(client: httpx.Client, job_id: str) -> bytes:
+    return client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
+
+
+def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Path], expected: bytes) -> None:
+    with service.client() as client:
+        job_id = submit(client, files, name="my wall")
+        seen = events(client, job_id)  # comes back when the job has ended
+        kinds = [(kind, data.get("status") or data.get("name")) for _, kind, data in seen]
+        statuses = [what for kind, what in kinds if kind == "status"]
+        assert statuses == ["queued", "starting", "running", "succeeded"]
+        assert kinds.index(("artifact", "plan.json")) < kinds.index(("status", "succeeded"))
+        assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
+        steps = [data["step"] for _, kind, data in seen if kind == "progress"]
+        assert steps == sorted(steps)
+        assert steps[-1] == STEPS
+        middle = seen[len(seen) // 2][0]
+        assert events(client, job_id, after=middle) == [event for event in seen if event[0] > middle]
+        assert events(client, job_id, after=seen[-1][0]) == []
+
+        first = client.get(f"/v1/jobs/{job_id}")
+        found = first.json()
+        assert (found["status"], found["name"], found["attempt"]) == ("succeeded", "my wall", 1)
+        assert found["progress"]["fraction"] == 1
+        assert found["result"]["loss_after"] < found["result"]["loss_before"]
+        same = client.get(f"/v1/jobs/{job_id}", headers={"If-None-Match": first.headers["etag"]})
+        assert (same.status_code, same.content) == (304, b"")
+        listed = client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]
+        names = {entry["name"] for entry in listed}
+        assert {"stylized.ply", "plan.json", "report.json", "report.html", "log.txt"} <= names
+        assert not any(name.startswith(".") for name in names)
+        for entry in listed:
+            content = client.get(entry["url"])
+            assert hashlib.sha256(content.content).hexdigest() == entry["sha256"] == content.headers["etag"].strip('"')
+            assert content.headers["content-type"] == entry["media_type"]
+            assert str(service.data).encode() not in content.content, (
+                f"{entry['name']} tells where the service's data is"
+            )
+        assert result(client, job_id) == expected
+
+
+def test_the_ply_in_ranges(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
+    with service.client() as client:
+        job_id = submit(client, files)
+        wait_until(service, client, job_id, "succeeded")
+        where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
+        whole = client.get(where)
+        assert whole.headers["content-disposition"] == 'attachment; filename="stylized.ply"'
+        tag, size = whole.headers["etag"], len(whole.content)
+        parts = b""
+        for start in range(0, size, 10_000):
+            headers = {"Range": f"bytes={start}-{start + 9_999}", "If-Range": tag}
+            part = client.get(where, headers=headers)
+            assert part.status_code == 206
+            assert part.headers["content-range"] == f"bytes {start}-{min(size, start + 10_000) - 1}/{size}"
+            parts += part.content
+        assert parts == expected
+        assert client.get(where, headers={"Range": "bytes=-7"}).content == expected[-7:]
+        assert client.get(where, headers={"Range": "bytes=5-", "If-Range": '"other"'}).status_code == 200
+        beyond = client.get(where, headers={"Range": f"bytes={size}-"})
+        assert (beyond.status_code, beyond.headers["content-range"]) == (416, f"bytes */{size}")
+        assert client.get(where, headers={"If-None-Match": tag}).status_code == 304
+        head = client.head(where)
+        assert (head.headers["content-length"], head.content) == (str(size), b"")
+        assert client.get(f"/v1/jobs/{job_id}/artifacts/.checkpoint").status_code == 404
+        assert client.get(f"/v1/jobs/{job_id}/artifacts/../../sgsst.db").status_code == 404
+        path = tmp_path / "stylized.ply"
+        path.write_bytes(parts)
+        assert len(read_scene(path).scene) == len(read_scene(files["scene"]).scene)
+        assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
+        assert client.get(where).status_code == 404
+        assert not (service.data / "artifacts" / job_id).exists()
+
+
+def test_a_canceled_job_goes_on_where_it_was(service: Service, files: dict[str, Path], expected: bytes) -> None:
+    with service.client() as client:
+        job_id = submit(client, files)
+        wait_for_step(service, client, job_id, 10)
+        assert client.post(f"/v1/jobs/{job_id}/cancel").json()["status"] == "canceling"
+        assert client.delete(f"/v1/jobs/{job_id}").status_code == 409
+        found = wait_until(service, client, job_id, "canceled")
+        assert found["attempts"][0]["outcome"] == "canceled"
+        assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").status_code == 404
+        assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
+        assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 202
+        seen = events(client, job_id)
+        wait_until(service, client, job_id, "succeeded")
+        second = [data["step"] for _, kind, data in seen if kind == "progress" and data["attempt"] == 2]
+        assert min(step for step in second if step) >= 10, "it began anew"
+        assert result(client, job_id) == expected
+        assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
+        assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
+
+
+def test_a_queued_job_is_canceled_at_once(service: Service, files: dict[str, Path]) -> None:
+    with service.client() as client:
+        first, second = submit(client, files), submit(client, files)
+        assert client.post(f"/v1/jobs/{second}/cancel").json()["status"] == "canceled"
+        client.post(f"/v1/jobs/{first}/cancel")
+        wait_until(service, client, first, "canceled")
+        page = client.get("/v1/jobs", params={"limit": 1, "status": "canceled"}).json()
+        assert [entry["id"] for entry in page["jobs"]] == [second]
+        following = client.get("/v1/jobs", params={"limit": 1, "status": "canceled", "cursor": page["next_cursor"]})
+        assert [entry["id"] for entry in following.json()["jobs"]] == [first]
+
+
+def test_killed_processes_cost_time_and_nothing_else(service: Service, files: dict[str, Path], expected: bytes) -> None:
+    with service.client() as client:
+        job_id = submit(client, files)
+        wait_for_step(service, client, job_id, 5)
+        service.kill("service.attempt_process")
+        wait_for_step(service, client, job_id, 15, attempt=2)
+        service.kill("api.server")
+        wait_for(service.ready, "the API", service.said)
+        service.kill("service.dispatcher")
+        wait_for_step(service, client, job_id, 20, attempt=3)
+        found = wait_until(service, client, job_id, "succeeded", "failed")
+        assert [attempt["outcome"] for attempt in found["attempts"]] == ["failed", "lost", "succeeded"]
+        assert found["attempts"][0]["error"]["code"] == "crashed"
+        assert result(client, job_id) == expected
+        places = list((service.data / "artifacts" / job_id).rglob("stylized.ply"))
+        assert len(places) == 1, "published twice"
+
+
+def test_stopping_saves_running_jobs_and_starting_goes_on(
+    files: dict[str, Path], expected: bytes, tmp_path: Path
+) -> None:
+    with Service(tmp_path / "data") as service, service.client() as client:
+        job_id = submit(client, files)
+        wait_for_step(service, client, job_id, 10)
+        service.stop(signal.SIGINT)
+        service.start()
+        found = wait_until(service, client, job_id, "succeeded")
+        assert [attempt["outcome"] for attempt in found["attempts"]] == ["released", "succeeded"]
+        assert result(client, job_id) == expected
+    assert service.process("service.dispatcher") is None
+    assert not any((tmp_path / "data" / "work").iterdir())
+
+
+def test_a_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
+    with service.client() as client:
+        job_id = submit(client, files, workers=2, steps_sos=4)
+        found = wait_until(service, client, job_id, "succeeded", "failed")
+        log = client.get(f"/v1/jobs/{job_id}/artifacts/log.txt").text
+        assert found["status"] == "succeeded", log
+        assert found["result"]["steps"] == 4
+
+
+def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, Path]) -> None:
+    with service.client() as client:
+        before = len(client.get("/v1/jobs").json()["jobs"])
+        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+        data = {"parameters": json.dumps(PARAMETERS)}
+        answer = client.post("/v1/jobs", params={"dry_run": True}, files=body, data=data)
+        assert answer.status_code == 200, answer.text
+        plan = answer.json()
+        assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
+        assert plan["plan"]["decisions"]
+        assert plan["estimated_seconds"] > 0
+        assert len(client.get("/v1/jobs").json()["jobs"]) == before
+
+
+def test_the_api_never_loads_pytorch_or_ray(service: Service, files: dict[str, Path]) -> None:
+    with service.client() as client:
+        wait_until(service, client, submit(client, files, steps_sos=1), "succeeded")
+    process = service.process("api.server")
+    assert process is not None
+    mapped = Path(f"/proc/{process.pid}/maps").read_text()
+    assert "libtorch" not in mapped
+    assert "ray/_raylet" not in mapped
+
+
+def test_the_client_and_its_commands(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
+    def sgsst(*arguments: str) -> subprocess.CompletedProcess[str]:
+        environment = {**service.environment, "SGSST_URL": service.url}
+        command = [sys.executable, "-m", "api.cli", *arguments]
+        return subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    common = [str(files["scene"]), "--style", str(files["style"]), "--cameras", str(files["cameras"])]
+    extra = ["--steps-sos", str(STEPS), "--backbone", "vgg16", "--seed", "3", "--parameters", '{"early_stop": false}']
+    done = sgsst("submit", *common, *extra, "--out", "mine.ply")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "mine.ply").read_bytes() == expected
+    newest = json.loads(sgsst("jobs", "--json", "--limit", "1").stdout)[0]
+    assert "succeeded" in sgsst("status", newest["id"]).stdout
+    assert sgsst("watch", newest["id"], "--json").stdout.splitlines()[-1].endswith('"attempt": 1}')
+    assert sgsst("download", newest["id"], "plan.json").stdout == "plan.json\n"
+    assert json.loads((tmp_path / "plan.json").read_text())["decisions"]
+    wrong = sgsst("submit", str(files["style"]), "--style", str(files["style"]), "--orbit", "3")
+    assert (wrong.returncode, "PLY header" in wrong.stderr) == (2, True)
+    assert sgsst("status", "job_00000000000000000000").returncode == 2
+
+    with Client(service.url) as client:
+        found = client.wait(
+            client.submit(
+                *[files[name] for name in ("scene", "style")], orbit=2, resolution=32, preset="preview", steps_sos=1
+            ).id
+        )
+        assert found.status == "succeeded", found.error
+        part = tmp_path / "result.ply.part"
+        part.write_bytes(b"an older download of something else")
+        client.download(found.id, tmp_path / "result.ply")
+        assert (tmp_path / "result.ply").read_bytes()[:3] == b"ply"
+
+
+async def _async_round(url: str, files: dict[str, Path]) -> str:
+    async with AsyncClient(url) as client:
+        made = await client.submit(
+            files["scene"], files["style"], cameras=files["cameras"], backbone="vgg16", steps_sos=1
+        )
+        return (await client.wait(made.id)).status
+
+
+def test_the_asynchronous_client(service: Service, files: dict[str, Path]) -> None:
+    import asyncio
+
+    assert asyncio.run(_async_round(service.url, files)) == "succeeded"
+
+
+def test_nothing_went_wrong_unnoticed(service: Service) -> None:
+    """Runs last on the shared service: its log has no traceback."""
+    assert "Traceback" not in service.said()
+    assert os.listdir(service.data / "incoming") == []
