@@ -216,7 +216,7 @@ class Jobs:
                 job.status = "canceling"
                 _say(session, job, now)
             elif job.status in ("succeeded", "failed", "expired"):
-                raise ConflictError(f"The job has {_said(job)} and cannot be canceled.", status=job.status)
+                raise ConflictError(f"The job has {_said(job)} and cannot be canceled.", job_status=job.status)
         return job
 
     def retry(self, job_id: str, owner: str | None, *, limit: int) -> JobRow:
@@ -232,7 +232,7 @@ class Jobs:
             if job.status not in ("failed", "canceled"):
                 raise ConflictError(
                     f"The job has status {job.status}; only one that failed or was canceled can be tried again.",
-                    status=job.status,
+                    job_status=job.status,
                 )
             unfinished = select(func.count()).where(JobRow.owner == job.owner, JobRow.status.in_(UNFINISHED))
             if (session.scalar(unfinished) or 0) >= limit:
@@ -253,7 +253,7 @@ class Jobs:
             if job.status in UNFINISHED:
                 raise ConflictError(
                     f"The job has status {job.status}. Cancel it first, and delete it once it has ended.",
-                    status=job.status,
+                    job_status=job.status,
                 )
             _forget(session, job)
 
