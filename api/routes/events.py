@@ -14,6 +14,16 @@ from api.routes.jobs import find
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
 
+#: Of each event of the stream.
+_SCHEMA = {
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "pattern": "^[0-9]+$"},
+        "event": {"type": "string", "enum": ["status", "progress", "artifact"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
 _EXAMPLE = 'id: 42\nevent: progress\ndata: {"stage": "sos", "step": 120, "total": 300, "fraction": 0.4}\n\n'
 
 
@@ -24,7 +34,7 @@ _EXAMPLE = 'id: 42\nevent: progress\ndata: {"stage": "sos", "step": 120, "total"
     responses={
         200: {
             "description": "Events `status`, `progress` and `artifact`, until the job has ended.",
-            "content": {"text/event-stream": {"schema": {"type": "string"}, "example": _EXAMPLE}},
+            "content": {"text/event-stream": {"schema": _SCHEMA, "example": _EXAMPLE}},
         },
         204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not come back."},
     },

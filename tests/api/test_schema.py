@@ -79,7 +79,8 @@ def test_chains_of_requests(service: Service, key: str, tmp_path: Path) -> None:
         body = {"scene": ids["scene.ply"], "style": ids["style.png"], "cameras": [ids["cameras.json"]]}
         for _ in range(3):
             assert client.post("/v1/jobs", json=body).status_code == 202
-    loaded = schemathesis.openapi.from_url(f"{service.url}/openapi.json")
+    # streams of jobs that wait would not end
+    loaded = schemathesis.openapi.from_url(f"{service.url}/openapi.json").exclude(operation_id="watch_job")
 
     class Chains(loaded.as_state_machine()):  # type: ignore[misc]
         def get_call_kwargs(self, case: schemathesis.Case) -> dict:
