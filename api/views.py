@@ -160,6 +160,7 @@ class PlanView(BaseModel):
     photos: int
     workers: int
     estimated_seconds: float | None = Field(description="Of all steps; null where it cannot be told.")
+    memory_bytes: int | None = Field(description="At the peak, as far as that can be told.")
     plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
 
 

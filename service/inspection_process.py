@@ -101,11 +101,12 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     weights = load_weights(request.backbone)
     stylizer = Stylizer(scene, cameras, load_image(staged.style), request.settings, weights=weights)
     made = with_measuring(stylizer.plan)
-    seconds = None
+    seconds = memory = None
     if made.prediction:
+        memory = made.prediction.peak_bytes
         coarse = made.prediction.seconds_coarse or made.prediction.seconds
         seconds = made.prediction.seconds * request.settings.steps_sos + coarse * made.steps_coarse
-    return {**found, "plan": plan_json(made), "estimated_seconds": seconds}
+    return {**found, "plan": plan_json(made), "estimated_seconds": seconds, "memory_bytes": memory}
 
 
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {"check": check, "plan": plan}

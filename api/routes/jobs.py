@@ -133,7 +133,7 @@ async def create_job(
         check_url(webhook, context.settings)
     rows = await asyncio.to_thread(context.store.inputs.blobs, sorted({entry["sha256"] for entry in inputs}))
     paths = {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
-    found = await context.inspector.inspect("check", inputs, paths, parameters)
+    await context.inspector.inspect("check", inputs, paths, parameters)
     if dry_run:
         return await _plan(context, inputs, paths, parameters)
     idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)
@@ -145,7 +145,6 @@ async def create_job(
     if not created:
         headers["Idempotency-Replayed"] = "true"
     position = await asyncio.to_thread(context.store.jobs.queue_position, job)
-    del found
     return JSONResponse(job_view(job, position).model_dump(mode="json"), 202, headers)
 
 

@@ -254,6 +254,7 @@ def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, P
         assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
         assert plan["plan"]["decisions"]
         assert plan["estimated_seconds"] > 0
+        assert plan["memory_bytes"] > 0
         assert len(client.get("/v1/jobs").json()["jobs"]) == before
 
 
