@@ -7,8 +7,10 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -25,6 +27,7 @@ _VERSION = "1"
 #: Requests that wait for the inspecting process at most; more are told to come back.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
+_LEFT_SECONDS = 3600.0
 
 
 class InspectionProcess:
@@ -101,6 +104,9 @@ class Inspector:
         self._checks, self._plans = InspectionProcess(), InspectionProcess()
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
+        for left in self._folder.iterdir():  # by a process that was killed
+            if time.time() - left.stat().st_mtime > _LEFT_SECONDS:
+                shutil.rmtree(left, ignore_errors=True)
         self._limits = {
             "gaussians": settings.max_gaussians,
             "views": settings.max_views,

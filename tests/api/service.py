@@ -20,7 +20,7 @@ PATIENCE = 180.0
 #: Short times, so that tests see in seconds what takes minutes otherwise.
 SETTINGS = {
     "SGSST_MIN_FREE_BYTES": "0",
-    "SGSST_LEASE_SECONDS": "5",
+    "SGSST_LEASE_SECONDS": "20",
     "SGSST_RETRY_SECONDS": "0.2",
     "SGSST_POLL_SECONDS": "0.1",
     "SGSST_CHECKPOINT_SECONDS": "1",
