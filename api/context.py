@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from dataclasses import dataclass
 from typing import Annotated
@@ -57,8 +58,8 @@ class Caller:
     priority: int
 
 
-def get_context(request: Request) -> Context:
-    """The app's context."""
+async def get_context(request: Request) -> Context:
+    """The app's context; not a plain function, which would run on another thread."""
     found: Context = request.app.state.context
     return found
 
@@ -67,7 +68,7 @@ ContextDep = Annotated[Context, Depends(get_context)]
 _bearer = HTTPBearer(auto_error=False, description="An API key: `sgsst keys create NAME` on the service's machine.")
 
 
-def get_caller(
+async def get_caller(
     request: Request, context: ContextDep, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Caller:
     """The holder of the request's API key; everybody on this machine is the same one where no key is needed.
@@ -77,7 +78,7 @@ def get_caller(
         ForeignSiteError: no key, and the request comes from a web page that this service did not serve.
     """
     if given is not None:
-        key = context.store.keys.find(given.credentials)
+        key = await asyncio.to_thread(context.store.keys.find, given.credentials)
         if key is None:
             raise NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one.")
         return Caller(key.id, key.priority)

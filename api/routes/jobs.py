@@ -249,23 +249,24 @@ def get_job(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
-    job = find(context, caller, job_id)
-    return _shown(context, job, if_none_match)
+    check_id(job_id)
+    return _shown(context, caller, job_id, if_none_match)
 
 
 @router.post("/{job_id}/cancel", response_model=JobDetail, operation_id="cancel_job")
 def cancel_job(job_id: str, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel a job: at once where it waits, within seconds where it runs (`canceling` until then)."""
-    find(context, caller, job_id)
-    return _shown(context, context.store.jobs.cancel(job_id, caller.owner))
+    check_id(job_id)
+    context.store.jobs.cancel(job_id, caller.owner)
+    return _shown(context, caller, job_id)
 
 
 @router.post("/{job_id}/retry", status_code=202, response_model=JobDetail, operation_id="retry_job")
 def retry_job(job_id: str, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
-    find(context, caller, job_id)
-    job = context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
-    return _shown(context, job, status=202)
+    check_id(job_id)
+    context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
+    return _shown(context, caller, job_id, status=202)
 
 
 @router.delete("/{job_id}", status_code=204, operation_id="delete_job")
@@ -282,14 +283,21 @@ def find(context: Context, caller: Caller, job_id: str) -> JobRow:
     Raises:
         NotFoundError: there is none, or it is another's.
     """
-    if not is_id(job_id):
-        raise NotFoundError(f"There is no job {job_id[:60]}.")
+    check_id(job_id)
     return context.store.jobs.get(job_id, caller.owner)
 
 
-def _shown(context: Context, job: JobRow, if_none_match: str | None = None, status: int = 200) -> Response:
-    jobs = context.store.jobs
-    view = job_detail(job, jobs.queue_position(job), jobs.attempts(job.id))
+def check_id(job_id: str) -> None:
+    """Raise NotFoundError for what cannot be a job's id."""
+    if not is_id(job_id):
+        raise NotFoundError(f"There is no job {job_id[:60]}.")
+
+
+def _shown(
+    context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
+) -> Response:
+    job, position, attempts = context.store.jobs.detail(job_id, caller.owner)
+    view = job_detail(job, position, attempts)
     body = view.model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}

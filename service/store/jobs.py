@@ -170,6 +170,20 @@ class Jobs:
             found = select(AttemptRow).where(AttemptRow.job_id == job_id).order_by(AttemptRow.number)
             return list(session.scalars(found))
 
+    def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow]]:
+        """A job, its place in the queue and its attempts, as of one moment.
+
+        Raises:
+            NotFoundError: as `get`.
+        """
+        with self._database.reading() as session:
+            job = _owned(session, job_id, owner)
+            attempts: list[AttemptRow] = []
+            if job.attempt:
+                found = select(AttemptRow).where(AttemptRow.job_id == job_id).order_by(AttemptRow.number)
+                attempts = list(session.scalars(found))
+            return job, _position(session, job), attempts
+
     def page(
         self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
     ) -> list[JobRow]:
@@ -189,17 +203,8 @@ class Jobs:
 
         Turns between owners, which change with every lease, are left out.
         """
-        if job.status != "queued":
-            return None
-        ahead = or_(
-            JobRow.priority > job.priority,
-            and_(
-                JobRow.priority == job.priority,
-                or_(JobRow.queued_at < job.queued_at, and_(JobRow.queued_at == job.queued_at, JobRow.id < job.id)),
-            ),
-        )
         with self._database.reading() as session:
-            return 1 + (session.scalar(select(func.count()).where(JobRow.status == "queued", ahead)) or 0)
+            return _position(session, job)
 
     def cancel(self, job_id: str, owner: str | None) -> JobRow:
         """Cancel a job: at once where it is queued, else as soon as its dispatcher sees it.
@@ -525,6 +530,15 @@ def _owned(session: Session, job_id: str, owner: str | None, *, lock: bool = Fal
     if job is None or (owner is not None and job.owner != owner):
         raise NotFoundError(f"There is no job {job_id}.")
     return job
+
+
+def _position(session: Session, job: JobRow) -> int | None:
+    if job.status != "queued":
+        return None
+    same = and_(JobRow.priority == job.priority, JobRow.queued_at == job.queued_at, JobRow.id < job.id)
+    earlier = and_(JobRow.priority == job.priority, JobRow.queued_at < job.queued_at)
+    ahead = or_(JobRow.priority > job.priority, earlier, same)
+    return 1 + (session.scalar(select(func.count()).where(JobRow.status == "queued", ahead)) or 0)
 
 
 def _is_held(job: JobRow | None, lease: Lease) -> bool:
