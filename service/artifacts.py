@@ -86,8 +86,12 @@ class Artifacts:
                 self.remove(location)
 
     def ping(self) -> None:
-        """Prove that the place can be reached; raises what fsspec raises."""
-        self._files.exists(self._root)
+        """Prove that the place can be reached; raises OSError, or what fsspec raises."""
+        # a prefix of a bucket is nothing that could be there before something is in it
+        place = self._root if self.local else self._root.partition("/")[0]
+        self._files.invalidate_cache()
+        if not self._files.exists(place):
+            raise FileNotFoundError(f"The results' place {place!r} is not there, or cannot be reached.")
 
 
 def media_type(name: str) -> str:
