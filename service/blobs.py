@@ -10,11 +10,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from service.errors import NoSpaceError, TooLargeError
+from service.errors import NoSpaceError, NotFoundError, TooLargeError
 from service.store.inputs import Inputs
+from service.store.tables import UploadRow
 
 #: Files that no row refers to are removed at this age: a younger one's row may still be on its way.
 _ORPHAN_SECONDS = 3600.0
+_PIECE = 1 << 20
 
 
 class Receiver:
@@ -73,18 +75,47 @@ class BlobFolder:
         """A new file to write to."""
         return Receiver(self.incoming / f"{secrets.token_hex(12)}.part", limit, self.ensure_room)
 
-    def keep(self, path: Path, sha256: str, size: int) -> Path:
-        """Make a received, durable file a blob: moved to its place, or removed where its content is there already."""
+    def keep(self, path: Path, sha256: str, size: int, *, leave: bool = False) -> Path:
+        """Make a received, durable file a blob: moved to its place, or removed where its content is there already.
+
+        Args:
+            leave: let it have its old name as well.
+        """
         location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
         final = self._blobs / location
         final.parent.mkdir(exist_ok=True)
-        os.replace(path, final)
+        if leave:
+            os.link(path, final)
+        else:
+            os.replace(path, final)
         os.chmod(final, 0o440)
         flush_folder(final.parent)
         used = self._inputs.add_blob(sha256, location, size)
         if used != location:
             final.unlink()
         return self._blobs / used
+
+    def finish_upload(self, upload: UploadRow, seconds: float) -> str:
+        """Make an upload whose last byte is on the disk a blob, and tie it to that; returns the blob's SHA-256.
+
+        The upload's own file stays until the store knows of the blob: when the process dies on the way, the same can
+        be done again.
+
+        Raises:
+            NotFoundError: the file is gone.
+        """
+        path = self.upload_path(upload.id)
+        try:
+            sha256 = _digest(path)
+            self.keep(path, sha256, upload.length, leave=True)
+        except FileNotFoundError:  # unless another request has just done it
+            known = self._inputs.upload(upload.id, upload.owner).sha256
+            if known is None:
+                raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
+            return known
+        self._inputs.finish_upload(upload.id, sha256, seconds)
+        path.unlink(missing_ok=True)
+        return sha256
 
     def path(self, location: str) -> Path:
         """Where a blob's row says that its file is."""
@@ -113,6 +144,14 @@ class BlobFolder:
     def upload_path(self, upload_id: str) -> Path:
         """Where the bytes of an unfinished upload are."""
         return self.uploads / f"{upload_id}.part"
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            digest.update(piece)
+    return digest.hexdigest()
 
 
 def write_all(file: object, data: bytes) -> None:

@@ -189,14 +189,17 @@ def _resolve(context: Context, caller: Caller, received: Received) -> list[dict[
             upload = context.store.inputs.upload(upload_id, caller.owner)
         except NotFoundError as error:
             raise RefusedInputError(str(error), "unknown-upload", input=role) from error
-        if upload.sha256 is None:
+        sha256 = upload.sha256
+        if sha256 is None and upload.offset == upload.length:  # the service died before it could tell
+            sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
+        if sha256 is None:
             raise RefusedInputError(
                 f"Upload {upload_id} has {upload.offset:,} of {upload.length:,} bytes. Finish it first.",
                 "unfinished-upload",
                 input=role,
             )
         name = clean_name(role, upload.filename, number)
-        row = context.store.inputs.blob(upload.sha256)
+        row = context.store.inputs.blob(sha256)
         if role == "scene":
             check_file(role, name, context.blobs.path(row.location), row.size, context.settings)
         inputs.append({"role": role, "name": name, "sha256": row.sha256, "size": row.size})

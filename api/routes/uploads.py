@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from email.utils import format_datetime
-from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Request, Response
@@ -35,7 +34,6 @@ _ALGORITHMS = ("sha256", "sha1", "md5")
 _MAX_OPEN = 1000
 #: Bytes after which an upload's state is saved, so that a crash costs no more than these.
 _SAVE_BYTES = 64 << 20
-_PIECE = 1 << 20
 #: Uploads that a request is writing to now: a second one has to wait for its turn.
 _busy: set[str] = set()
 
@@ -178,7 +176,9 @@ async def append_upload(
         if offset != row.offset:
             raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {row.offset}.", offset=row.offset)
         expires = row.expires_at
-        if row.sha256 is None:
+        if row.sha256 is None and row.offset == row.length:  # the service died before it could tell
+            await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
+        elif row.sha256 is None:
             expires = await _append(request, context, row, wanted)
     row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
     return Response(
@@ -232,8 +232,11 @@ class _Writer:
 
     def __init__(self, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> None:
         self._context, self._row, self._wanted = context, row, wanted
-        self._path = context.blobs.upload_path(row.id)
-        self._file = self._path.open("r+b" if self._path.exists() else "w+b", buffering=0)
+        path = context.blobs.upload_path(row.id)
+        there = path.stat().st_size if path.exists() else 0
+        if there < row.offset:  # zeros would take the place of what is missing
+            raise NotFoundError(f"The bytes of upload {row.id} are gone. Begin a new one.")
+        self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
         self._file.truncate(row.offset)  # a crash may have left more, of which nothing is known
         self._file.seek(row.offset)
         self._digest = hashlib.new(wanted[0]) if wanted else None
@@ -266,21 +269,11 @@ class _Writer:
             raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
         expires = self.save()
         if self._offset == self._row.length:
-            sha256 = _digest(self._path)
-            self._context.blobs.keep(self._path, sha256, self._row.length)
-            self._context.store.inputs.finish_upload(self._row.id, sha256, self._seconds)
+            self._context.blobs.finish_upload(self._row, self._seconds)
         return expires
 
     def close(self) -> None:
         self._file.close()
-
-
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            digest.update(piece)
-    return digest.hexdigest()
 
 
 def _find(context: Context, owner: str, upload_id: str) -> UploadRow:
