@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,25 +72,43 @@ class Service:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         return httpx.Client(base_url=self.url, headers=headers, timeout=60)
 
-    def process(self, module: str) -> psutil.Process | None:
-        """A process below it that runs a module."""
+    def processes(self, module: str) -> list[psutil.Process]:
+        """Those below it that run a module, or have such a title."""
         assert self._process is not None
         try:
             family = [psutil.Process(self._process.pid), *psutil.Process(self._process.pid).children(recursive=True)]
         except psutil.Error:
-            return None
+            return []
+        found = []
         for process in family:
             try:
-                if module in process.cmdline() and process.status() != psutil.STATUS_ZOMBIE:
-                    return process
+                named = any(part.startswith(module) for part in process.cmdline())
+                if named and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
             except psutil.Error:
                 continue
-        return None
+        return found
+
+    def process(self, module: str) -> psutil.Process | None:
+        """The first one of `processes`."""
+        return next(iter(self.processes(module)), None)
 
     def kill(self, module: str) -> None:
         """SIGKILL a process below it."""
         process = wait_for(lambda: self.process(module), f"a process {module}", self.said)
         process.send_signal(signal.SIGKILL)
+
+    def survivors(self) -> list[psutil.Process]:
+        """Whatever lives of it and of all that it has started, in whatever session."""
+        found = []
+        for process in psutil.process_iter():
+            try:
+                mine = process.environ().get("SGSST_DATA") == str(self.data)
+                if mine and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+            except psutil.Error:
+                continue
+        return found
 
     def stop(self, number: int = signal.SIGTERM) -> None:
         """End it as a user or the system would."""
@@ -105,14 +123,31 @@ class Service:
         self.stop()
 
 
-def wait_for(condition: Callable[[], Any], what: str, said: Callable[[], str] = lambda: "") -> Any:
+def undisturbed(files: Mapping[str, Path], parameters: Mapping[str, Any], folder: Path) -> Path:
+    """What `sgsst stylize` makes of the files on one rank: its PLY."""
+    out = folder / "stylized.ply"
+    command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
+    command += ["--cameras", str(files["cameras"]), "--out", str(out)]
+    for name, value in parameters.items():
+        option = name.replace("_", "-")
+        command += (
+            [f"--{option}" if value else f"--no-{option}"] if isinstance(value, bool) else [f"--{option}", str(value)]
+        )
+    environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(ROOT)}
+    subprocess.run(command, check=True, env=environment, cwd=ROOT, stdout=subprocess.DEVNULL)
+    return out
+
+
+def wait_for(
+    condition: Callable[[], Any], what: str, said: Callable[[], str] = lambda: "", *, every: float = 0.1
+) -> Any:
     """The first true value of a condition; a test whose patience is over fails."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         found = condition()
         if found:
             return found
-        time.sleep(0.1)
+        time.sleep(every)
     raise AssertionError(f"waited in vain for {what}\n{said()}")
 
 

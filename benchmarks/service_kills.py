@@ -1,0 +1,296 @@
+"""SIGKILL of the service's processes at random moments, a hundred times, while it works through a queue of small jobs.
+
+python -m benchmarks.service_kills [--kills 100] [--rank-kills 6] [--seed 0]
+
+`sgsst serve` runs with its defaults but for what `SETTINGS` says. A job that was accepted and does not end as succeeded
+counts as lost; one whose result was told of twice, or lies on the disk twice, as published twice; one whose PLY is not
+byte for byte that of `sgsst stylize` with the same seed as different. A job on two ranks adds in another order: its
+colours are compared with one rank's instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import json
+import random
+import secrets
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from benchmarks.machine import write_result
+from sgsst_core.ply import read_scene
+from tests.api.service import Service, undisturbed
+from tests.small_scenes import wall, write_files
+
+PARAMETERS = {"preset": "standard", "steps_sos": 60, "backbone": "vgg16", "early_stop": False}
+SEEDS = (1, 2)
+#: Attempts end by our hand here: neither a reason to give a job up nor to wait ever longer.
+SETTINGS = {
+    "SGSST_LEASE_SECONDS": "30",
+    "SGSST_MAX_ATTEMPTS": "1000000",
+    "SGSST_RETRY_SECONDS": "0",
+    "SGSST_CHECKPOINT_SECONDS": "1",
+    "SGSST_POLL_SECONDS": "0.5",
+}
+API, DISPATCHER, ATTEMPT, RANK = "api.server", "service.dispatcher", "service.attempt_process", "ray::RankProcess"
+EVERYTHING = "sgsst serve"
+#: Mean seconds between two kills of one kind.
+EVERY = {API: 9.0, DISPATCHER: 30.0, ATTEMPT: 30.0, EVERYTHING: 120.0}
+#: Jobs that are kept waiting or running.
+_QUEUE = 2
+_FINISHED = ("succeeded", "failed", "canceled", "expired")
+_PATIENCE = 600.0
+
+
+@dataclass
+class Run:
+    """The service under fire, and what is counted."""
+
+    service: Service
+    files: dict[str, Path]
+    accepted: dict[str, int] = field(default_factory=dict)
+    kills: Counter[str] = field(default_factory=Counter)
+    resent: int = 0
+    api_back: list[float] = field(default_factory=list)
+    running_again: list[float] = field(default_factory=list)
+    everything_back: list[float] = field(default_factory=list)
+
+    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """A request, sent again while the API is away."""
+        deadline = time.monotonic() + _PATIENCE
+        while True:
+            try:
+                return httpx.request(method, f"{self.service.url}{path}", timeout=60, **options)
+            except httpx.TransportError:
+                self.resent += 1
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.02)
+
+    def submit(self, seed: int, **parameters: Any) -> str:
+        """An accepted job's id."""
+        body = {role: (path.name, path.read_bytes()) for role, path in self.files.items()}
+        data = {"parameters": json.dumps({**PARAMETERS, "seed": seed, **parameters})}
+        headers = {"Idempotency-Key": secrets.token_hex(8)}
+        answer = self.call("POST", "/v1/jobs", files=body, data=data, headers=headers)
+        if answer.status_code != 202:
+            raise RuntimeError(f"a good job was refused: {answer.text}")
+        job_id = str(answer.json()["id"])
+        self.accepted[job_id] = seed
+        return job_id
+
+    def jobs(self) -> list[dict[str, Any]]:
+        """All jobs that the service knows."""
+        found: list[dict[str, Any]] = self.call("GET", "/v1/jobs", params={"limit": 200}).json()["jobs"]
+        return found
+
+    def active(self) -> dict[str, Any] | None:
+        """The job that is being worked on."""
+        return next((job for job in self.jobs() if job["status"] in ("starting", "running")), None)
+
+    def fill(self) -> None:
+        """Keep the queue full."""
+        waiting = sum(job["status"] not in _FINISHED for job in self.jobs())
+        for _ in range(_QUEUE - waiting):
+            self.submit(SEEDS[len(self.accepted) % len(SEEDS)])
+
+    def strike(self, target: str, chance: random.Random) -> None:
+        """One kill, and what has to be measured after it."""
+        if target == EVERYTHING:
+            started = time.monotonic()
+            self.service.stop(signal.SIGKILL)
+            self.service.start()
+            self.everything_back.append(time.monotonic() - started)
+        else:
+            before = self.active() if target == DISPATCHER else None
+            if not self.kill(target, chance):
+                return
+            struck = time.monotonic()
+            if target == API:
+                self.call("GET", "/v1/jobs", params={"limit": 1})
+                self.api_back.append(time.monotonic() - struck)
+            elif before is not None and chance.random() < 0.6:  # else the next kill may come before the job runs
+                self._measure(before, struck)
+        self.kills[target] += 1
+
+    def _measure(self, before: Mapping[str, Any], struck: float) -> None:
+        """Wait until an interrupted job makes steps again."""
+        while time.monotonic() - struck < _PATIENCE:
+            job = self.call("GET", f"/v1/jobs/{before['id']}").json()
+            if job["status"] in _FINISHED:
+                return  # it was over when the dispatcher died
+            if job["attempt"] > before["attempt"] and job["status"] == "running":
+                self.running_again.append(time.monotonic() - struck)
+                return
+            time.sleep(0.1)
+
+    def kill(self, target: str, chance: random.Random) -> bool:
+        """SIGKILL a process of a kind; False where there is none for a while."""
+        deadline = time.monotonic() + 30
+        while time.monotonic() < deadline:
+            found = self.service.processes(target)
+            if found:
+                with contextlib.suppress(Exception):
+                    chance.choice(found).send_signal(signal.SIGKILL)
+                    return True
+            time.sleep(0.01)
+        return False
+
+
+def attack(run: Run, kills: int, chance: random.Random) -> None:
+    """Kill at random moments until it was enough."""
+    due = {target: time.monotonic() + chance.expovariate(1 / mean) for target, mean in EVERY.items()}
+    while sum(run.kills.values()) < kills:
+        run.fill()
+        target = min(due, key=lambda name: due[name])
+        time.sleep(max(0.0, due[target] - time.monotonic()))
+        run.strike(target, chance)
+        due[target] = time.monotonic() + chance.expovariate(1 / EVERY[target])
+        done = sum(run.kills.values())
+        if done % 10 == 0:
+            print(f"{done} kills, {len(run.accepted)} jobs accepted", flush=True)
+
+
+def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
+    """A job on two ranks, of which one is killed again and again; its id."""
+    if not kills:
+        return None
+    job_id = run.submit(SEEDS[0], workers=2, steps_sos=200)
+    reached = 0
+    while run.kills[RANK] < kills:
+        job = run.call("GET", f"/v1/jobs/{job_id}").json()
+        if job["status"] in _FINISHED:
+            break
+        step = (job["progress"] or {}).get("step") or 0
+        if step > reached:
+            reached = step
+            time.sleep(chance.uniform(0, 2))
+            run.kills[RANK] += run.kill(RANK, chance)
+        time.sleep(0.1)
+    return job_id
+
+
+def wait_for_all(run: Run) -> dict[str, dict[str, Any]]:
+    """Every accepted job at its end, or as it is when patience is over; those that are gone are left out."""
+    deadline = time.monotonic() + _PATIENCE
+    found: dict[str, dict[str, Any]] = {}
+    while time.monotonic() < deadline:
+        for job_id in run.accepted:
+            if found.get(job_id, {}).get("status") not in _FINISHED:
+                answer = run.call("GET", f"/v1/jobs/{job_id}")
+                if answer.status_code == 200:
+                    found[job_id] = answer.json()
+        if all(found.get(job_id, {}).get("status") in _FINISHED for job_id in run.accepted):
+            break
+        time.sleep(0.5)
+    return found
+
+
+def published(run: Run, job_id: str) -> int:
+    """How often a job's result was told of, or how often it is on the disk if that is more."""
+    text = run.call("GET", f"/v1/jobs/{job_id}/events").text
+    told = text.count('"name": "stylized.ply"')
+    ended = text.count('"status": "succeeded"')
+    places = len(list((run.service.data / "artifacts" / job_id).rglob("stylized.ply")))
+    return max(told, ended, places)
+
+
+def sha256(run: Run, job_id: str) -> str:
+    """Digest of a downloaded result."""
+    return hashlib.sha256(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content).hexdigest()
+
+
+def distance(run: Run, job_id: str, one_rank: Path) -> float:
+    """Of a two-rank job's colours from one rank's, relative to how far these have moved."""
+    path = run.service.data / "two.ply"
+    path.write_bytes(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    two, one, before = (read_scene(each).scene.sh_dc for each in (path, one_rank, run.files["scene"]))
+    return float((two - one).norm() / (one - before).norm())
+
+
+def spread(values: list[float]) -> dict[str, float | int | None]:
+    """Count, median and largest."""
+    ordered = sorted(values)
+    return {
+        "measured": len(ordered),
+        "median": round(statistics.median(ordered), 2) if ordered else None,
+        "largest": round(ordered[-1], 2) if ordered else None,
+    }
+
+
+def main() -> None:
+    """Kill, count, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--rank-kills", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    chance = random.Random(arguments.seed)
+    with tempfile.TemporaryDirectory(prefix="sgsst-kills-") as name:
+        folder = Path(name)
+        figures = measure(folder, arguments.kills, arguments.rank_kills, chance)
+    path = write_result("service_kills", {"seed": arguments.seed, **figures})
+    print(json.dumps(figures, indent=2))
+    print(path)
+    sys.exit(1 if figures["lost"] or figures["published_twice"] or figures["different"] else 0)
+
+
+def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) -> dict[str, Any]:
+    """All figures."""
+    (folder / "inputs").mkdir()
+    ply, cameras, style = write_files(folder / "inputs", wall())
+    files = {"scene": ply, "cameras": cameras, "style": style}
+    expected = {}
+    for number, seed in enumerate(SEEDS):
+        (folder / f"expected_{number}").mkdir()
+        made = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{number}")
+        expected[seed] = hashlib.sha256(made.read_bytes()).hexdigest()
+    started = time.monotonic()
+    with Service(folder / "data", **SETTINGS) as service:
+        run = Run(service, files)
+        attack(run, kills, chance)
+        attacked = time.monotonic() - started
+        on_ranks = attack_ranks(run, rank_kills, chance)
+        found = wait_for_all(run)
+        ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
+        known = {job["id"] for job in run.jobs()}
+        attempts = Counter(each["outcome"] for job in found.values() for each in job["attempts"])
+        alike = [job_id for job_id in ended if job_id != on_ranks]
+        figures: dict[str, Any] = {
+            "kills": dict(run.kills),
+            "kills_in_all": sum(run.kills.values()),
+            "seconds": round(attacked, 1),
+            "jobs_accepted": len(run.accepted),
+            "lost": len(run.accepted) - len(ended),
+            "created_twice": len(known - set(run.accepted)),
+            "published_twice": sum(published(run, job_id) != 1 for job_id in ended),
+            "different": sum(sha256(run, job_id) != expected[run.accepted[job_id]] for job_id in alike),
+            "attempts": dict(attempts),
+            "most_attempts_of_a_job": max(len(job["attempts"]) for job in found.values()),
+            "requests_sent_again": run.resent,
+            "seconds_until_the_api_answers": spread(run.api_back),
+            "seconds_until_a_job_runs_again_after_a_dispatchers_death": spread(run.running_again),
+            "seconds_until_everything_is_ready_again": spread(run.everything_back),
+            "not_succeeded": [job.get("error") for job in found.values() if job["status"] != "succeeded"],
+        }
+        if on_ranks in ended:
+            (folder / "two").mkdir()
+            one = undisturbed(files, {**PARAMETERS, "seed": SEEDS[0], "steps_sos": 200}, folder / "two")
+            figures["two_ranks_from_one"] = distance(run, on_ranks, one)
+        return figures
+
+
+if __name__ == "__main__":
+    main()
