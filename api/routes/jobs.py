@@ -21,7 +21,7 @@ from service.errors import NotFoundError, RefusedInputError, TooLargeError
 from service.parameters import JobParameters
 from service.staging import check_roles, clean_name
 from service.store.jobs import Idempotency, NewJob
-from service.store.tables import JobRow
+from service.store.tables import JobRow, UploadRow
 from service.webhooks import check_url
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
@@ -182,28 +182,39 @@ async def _from_json(request: Request, context: Context) -> Parts:
 def _resolve(context: Context, caller: Caller, received: Received) -> list[dict[str, Any]]:
     """All files of a job, those that came with it and those that were uploaded before; they stay for now."""
     inputs = list(received.files)
-    for number, (role, upload_id) in enumerate(received.uploads):
-        try:
-            if not is_id(upload_id):
-                raise NotFoundError(f"{upload_id[:60]!r} is no id of an upload, and {role!r} came without a file name.")
-            upload = context.store.inputs.upload(upload_id, caller.owner)
-        except NotFoundError as error:
-            raise RefusedInputError(str(error), "unknown-upload", input=role) from error
-        sha256 = upload.sha256
-        if sha256 is None and upload.offset == upload.length:  # the service died before it could tell
-            sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
-        if sha256 is None:
+    ids = [upload_id for _, upload_id in received.uploads if is_id(upload_id)]
+    uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
+    digests = []
+    for role, upload_id in received.uploads:
+        upload = uploads.get(upload_id)
+        if upload is None:
             raise RefusedInputError(
-                f"Upload {upload_id} has {upload.offset:,} of {upload.length:,} bytes. Finish it first.",
-                "unfinished-upload",
+                f"{upload_id[:60]!r} is no id of an upload that can be used, and {role!r} came without a file name.",
+                "unknown-upload",
                 input=role,
             )
-        name = clean_name(role, upload.filename, number)
-        row = context.store.inputs.blob(sha256)
+        digests.append(_content(context, upload, role))
+    rows = context.store.inputs.hold(digests) if digests else {}
+    for number, ((role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
+        row, name = rows[sha256], clean_name(role, uploads[upload_id].filename, number)
         if role == "scene":
             check_file(role, name, context.blobs.path(row.location), row.size, context.settings)
         inputs.append({"role": role, "name": name, "sha256": row.sha256, "size": row.size})
     return inputs
+
+
+def _content(context: Context, upload: UploadRow, role: str) -> str:
+    """SHA-256 of an upload, which must be finished."""
+    sha256 = upload.sha256
+    if sha256 is None and upload.offset == upload.length:  # the service died before it could tell
+        sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
+    if sha256 is None:
+        raise RefusedInputError(
+            f"Upload {upload.id} has {upload.offset:,} of {upload.length:,} bytes. Finish it first.",
+            "unfinished-upload",
+            input=role,
+        )
+    return sha256
 
 
 async def _plan(

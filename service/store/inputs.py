@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import delete, exists, select
+from sqlalchemy import delete, exists, select, update
 
 from service.errors import ConflictError, NotFoundError
 from service.store.database import Database, new_id, remembered, upsert
@@ -14,6 +14,8 @@ from service.store.tables import BlobRow, BlobUseRow, InspectionRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
 GRACE_SECONDS = 3600.0
+#: Of that time: what was touched since is not touched again.
+_HOLD_SHARE = 0.1
 #: What checking an input found is kept for so long.
 _INSPECTION_SECONDS = 30 * 86_400.0
 
@@ -32,18 +34,26 @@ class Inputs:
             session.execute(insert.on_conflict_do_update(index_elements=["sha256"], set_={"touched_at": now}))
             return session.get_one(BlobRow, sha256, populate_existing=True).location
 
-    def blob(self, sha256: str) -> BlobRow:
-        """A blob, which stays for a while from now on.
+    def hold(self, digests: Sequence[str]) -> dict[str, BlobRow]:
+        """Blobs by their digest, which all stay for a while from now on.
 
         Raises:
-            NotFoundError: it is gone.
+            NotFoundError: one is gone.
         """
-        with self._database.writing() as session:
-            row = session.get(BlobRow, sha256, with_for_update=True)
-            if row is None:
-                raise NotFoundError(f"There is no file with SHA-256 {sha256}.")
-            row.touched_at = self._database.clock()
-            return row
+        found = self.blobs(digests)
+        # what was touched a moment ago stays long enough: submissions of one scene after another need not write it
+        recent = self._database.clock() - _HOLD_SHARE * GRACE_SECONDS
+        if any(sha256 not in found or found[sha256].touched_at < recent for sha256 in digests):
+            with self._database.writing() as session:
+                now = self._database.clock()
+                for start in range(0, len(digests), 500):
+                    mine = BlobRow.sha256.in_(digests[start : start + 500])
+                    session.execute(update(BlobRow).where(mine).values(touched_at=now))
+            found = self.blobs(digests)
+        missing = next((sha256 for sha256 in digests if sha256 not in found), None)
+        if missing is not None:
+            raise NotFoundError(f"There is no file with SHA-256 {missing}.")
+        return found
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Blobs by their digest, for a job that holds them."""
@@ -106,6 +116,17 @@ class Inputs:
         if row is None or row.owner != owner or row.expires_at < self._database.clock():
             raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
         return row
+
+    def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
+        """Uploads of this owner by their id; those that are not there or have expired are left out."""
+        now = self._database.clock()
+        found: dict[str, UploadRow] = {}
+        with self._database.reading() as session:
+            for start in range(0, len(upload_ids), 500):
+                part = select(UploadRow).where(UploadRow.id.in_(upload_ids[start : start + 500]))
+                rows = session.scalars(part.where(UploadRow.owner == owner, UploadRow.expires_at >= now))
+                found |= {row.id: row for row in rows}
+        return found
 
     def advance_upload(self, upload_id: str, offset: int, seconds: float) -> float:
         """Record how much of an upload is on the disk for good; returns when it expires now."""

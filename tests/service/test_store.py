@@ -303,6 +303,18 @@ def test_blobs_go_when_nothing_needs_them(store: Store, clock: Clock) -> None:
     assert store.inputs.collect() == []  # just touched
 
 
+def test_held_blobs_stay(store: Store, clock: Clock) -> None:
+    for wait in (0.0, 0.05 * GRACE_SECONDS, 0.5 * GRACE_SECONDS):
+        clock.now += wait
+        assert store.inputs.hold([SHA])[SHA].location == "aa/blob"
+        clock.now += 0.85 * GRACE_SECONDS
+        assert store.inputs.collect() == []
+    clock.now += GRACE_SECONDS
+    assert store.inputs.collect() == ["aa/blob"]
+    with pytest.raises(NotFoundError):
+        store.inputs.hold([SHA])
+
+
 def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     store.jobs.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {}, 100.0)
