@@ -59,11 +59,10 @@ async def upload(client: httpx.AsyncClient, path: Path) -> str:
 
 
 async def submissions(
-    client: httpx.AsyncClient, body: dict[str, Any], seconds: float
-) -> tuple[dict[str, Any], list[str]]:
-    """Jobs by reference to uploads, by some clients at once, as fast as they are accepted."""
+    client: httpx.AsyncClient, body: dict[str, Any], seconds: float, made: list[str]
+) -> dict[str, Any]:
+    """Jobs by reference to uploads, by some clients at once, as fast as they are accepted; their ids go into `made`."""
     took: list[float] = []
-    made: list[str] = []
     refused = 0
     end = time.perf_counter() + seconds
 
@@ -82,8 +81,7 @@ async def submissions(
     started = time.perf_counter()
     await asyncio.gather(*(submit(number) for number in range(_SUBMITTERS)))
     elapsed = time.perf_counter() - started
-    figures = {"per_second": round(len(made) / elapsed, 1), "accepted": len(made), "refused": refused, **spread(took)}
-    return figures, made
+    return {"per_second": round(len(made) / elapsed, 1), "accepted": len(made), "refused": refused, **spread(took)}
 
 
 async def at_a_rate(
@@ -110,7 +108,22 @@ async def at_a_rate(
 
     await asyncio.gather(*(one(number) for number in range(int(rate * seconds))))
     elapsed = time.perf_counter() - start
-    return {"rate": rate, "answered_per_second": round(len(took) / elapsed, 1), "failed": failed, **spread(took)}
+    return {
+        "rate": rate,
+        "requests": len(took),
+        "answered_per_second": round(len(took) / elapsed, 1),
+        "failed": failed,
+        **spread(took),
+    }
+
+
+async def with_processor(api: psutil.Process, work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
+    """Figures with the API's own processor time for each request, which other work on the machine does not change."""
+    before = api.cpu_times()
+    figures = await work
+    after = api.cpu_times()
+    used = after.user + after.system - before.user - before.system
+    return {**figures, "api_cpu_ms_each": round(1000 * used / max(1, figures[count]), 2)}
 
 
 async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.Process) -> dict[str, Any]:
@@ -222,19 +235,22 @@ async def measure(
         async def status(number: int) -> httpx.Response:
             return await client.get(f"/v1/jobs/{running}")
 
-        figures["status"] = await at_a_rate(status, 200, arguments.seconds)
+        figures["status"] = await with_processor(api, at_a_rate(status, 200, arguments.seconds), "requests")
         print(figures["status"], flush=True)
         figures["watchers"] = await watch(service.url, running, arguments.watchers, arguments.seconds, api)
         print(figures["watchers"], flush=True)
         figures["upload"] = await large_upload(client, large, api)
         print(figures["upload"], flush=True)
-        figures["submissions"], made = await submissions(client, body, arguments.seconds)
+        made: list[str] = []
+        submitting = submissions(client, body, arguments.seconds, made)
+        figures["submissions"] = await with_processor(api, submitting, "accepted")
         print(figures["submissions"], flush=True)
 
         async def any_status(number: int) -> httpx.Response:
             return await client.get(f"/v1/jobs/{made[number % len(made)]}")
 
-        figures["status_of_queued_jobs"] = await at_a_rate(any_status, 200, arguments.seconds / 2)
+        asking = at_a_rate(any_status, 200, arguments.seconds / 2)
+        figures["status_of_queued_jobs"] = await with_processor(api, asking, "requests")
         print(figures["status_of_queued_jobs"], flush=True)
         figures["job_still_running"] = (await client.get(f"/v1/jobs/{running}")).json()["status"] == "running"
     figures["api_memory_mb"] = round(api.memory_info().rss / 1e6, 1)
