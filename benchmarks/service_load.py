@@ -231,6 +231,9 @@ async def measure(
         await _until_it_runs(client, running)
         figures: dict[str, Any] = {"job_steps_per_second_alone": await _speed(client, running, arguments.seconds / 2)}
         print(figures, flush=True)
+        # first, as what watchers leave free in the API's heap would hide its growth
+        figures["upload"] = await large_upload(client, large, api)
+        print(figures["upload"], flush=True)
 
         async def status(number: int) -> httpx.Response:
             return await client.get(f"/v1/jobs/{running}")
@@ -239,8 +242,6 @@ async def measure(
         print(figures["status"], flush=True)
         figures["watchers"] = await watch(service.url, running, arguments.watchers, arguments.seconds, api)
         print(figures["watchers"], flush=True)
-        figures["upload"] = await large_upload(client, large, api)
-        print(figures["upload"], flush=True)
         made: list[str] = []
         submitting = submissions(client, body, arguments.seconds, made)
         figures["submissions"] = await with_processor(api, submitting, "accepted")
