@@ -116,7 +116,7 @@ def read_header(path: Path) -> PlyHeader:
 
 def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
     byte_order: str | None = None
-    elements: list[PlyElement] = []
+    elements: list[tuple[str, int, tuple[int, int], dict[str, PlyProperty]]] = []
     position = 0
     for number, line in enumerate(raw.split(newline), start=1):
         words = [word.decode("latin-1") for word in line.split()]
@@ -130,17 +130,23 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
             # 18 digits are more than any file holds, and keep int() away from its limit on long strings
             case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and byte_order is not None:
                 stop = position + len(line.rstrip())
-                elements.append(PlyElement(name, int(count), (stop - len(count), stop)))
+                elements.append((name, int(count), (stop - len(count), stop), {}))
             case ["property", *definition] if elements and (prop := _property(definition)):
-                elements[-1] = _with_property(path, elements[-1], prop)
+                owner, _, _, properties = elements[-1]
+                if prop.name in properties:
+                    raise SceneError(
+                        f"{path}: the PLY header declares {owner}.{prop.name} twice. Export the scene again."
+                    )
+                properties[prop.name] = prop
             case _:
                 shown = line[:80].decode("latin-1")
                 raise SceneError(f"{path}: line {number} of the PLY header makes no sense: {shown!r}. Export it again.")
         position += len(line) + len(newline)
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
-    _check_elements(path, elements)
-    return PlyHeader(byte_order, raw, tuple(elements))
+    found = tuple(PlyElement(name, count, span, tuple(props.values())) for name, count, span, props in elements)
+    _check_elements(path, found)
+    return PlyHeader(byte_order, raw, found)
 
 
 def _property(definition: list[str]) -> PlyProperty | None:
@@ -152,17 +158,12 @@ def _property(definition: list[str]) -> PlyProperty | None:
     return None
 
 
-def _with_property(path: Path, element: PlyElement, prop: PlyProperty) -> PlyElement:
-    if any(prop.name == other.name for other in element.properties):
-        raise SceneError(f"{path}: the PLY header declares {element.name}.{prop.name} twice. Export the scene again.")
-    return PlyElement(element.name, element.count, element.count_span, (*element.properties, prop))
-
-
-def _check_elements(path: Path, elements: list[PlyElement]) -> None:
-    names = [element.name for element in elements]
+def _check_elements(path: Path, elements: tuple[PlyElement, ...]) -> None:
+    names: set[str] = set()
     for element in elements:
-        if names.count(element.name) > 1:
+        if element.name in names:
             raise SceneError(f"{path}: the PLY header declares element {element.name!r} twice. Export the scene again.")
+        names.add(element.name)
         if element.count and not element.properties:
             raise SceneError(f"{path}: element {element.name!r} of the PLY header has no property. Export it again.")
 
