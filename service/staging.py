@@ -14,7 +14,7 @@ ROLES = ("scene", "style", "cameras", "photos")
 #: A COLMAP model is at most cameras, images, points3D, rigs, frames; transforms.json may have a companion.
 MAX_CAMERA_FILES = 8
 _CAMERA_SUFFIXES = {".json", ".bin", ".txt"}
-_MAX_NAME, _MAX_DEPTH = 120, 8
+_MAX_NAME, _MAX_DEPTH = 120, 8  # bytes of a part of a path: file systems take 255, and suffixes are still to come
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,16 @@ def clean_name(role: str, name: str, number: int) -> str:
     Photos keep their folders, since cameras may name them; other files keep the last part only.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
-    plain = [re.sub(r"[^\w .+@,=()-]+", "_", part)[-_MAX_NAME:].strip() for part in parts]
+    plain = [_shortened(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
     kept = [part if not part.startswith(".") else f"_{part[1:]}" for part in plain if part]
     if role != "photos":
         kept = kept[-1:]
     fallback = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json"}.get(role, f"photo_{number}")
     return "/".join(kept[-_MAX_DEPTH:]) or fallback
+
+
+def _shortened(part: str) -> str:
+    return part.encode()[-_MAX_NAME:].decode(errors="ignore")
 
 
 def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool) -> None:
