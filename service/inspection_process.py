@@ -75,6 +75,8 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
         found["style"] = [image.shape[1], image.shape[0]]
     with _Part("cameras"):
         source = scene_request(staged, parameters)
+        if source.cameras is not None:
+            _check_sizes(source.cameras)
         cameras = fit_cameras(read_cameras_of(source, file.scene), settings)
         if len(cameras) > limits["views"]:
             raise RefusedError("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
@@ -139,6 +141,20 @@ def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
         raise RefusedError(
             "image-too-large", f"{path.name}: has {width} x {height} pixels; {limits['image_pixels']:,} may be."
         )
+
+
+def _check_sizes(path: Path) -> None:
+    """Refuse frames of a transforms.json that leave their size to an image: its path may lead anywhere on this machine,
+    and the answer would tell what is there."""
+    for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
+        try:
+            content = json.loads(file.read_text(encoding="utf-8-sig"))
+        except (ValueError, RecursionError):
+            continue  # the reader says what is wrong with it
+        frames = content.get("frames") if isinstance(content, dict) else None
+        for index, frame in enumerate(frames if isinstance(frames, list) else []):
+            if isinstance(frame, dict) and not {"w", "h"} <= {**content, **frame}.keys():
+                raise CameraError(f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'.")
 
 
 def _check_something_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
