@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,10 @@ MAX_RESOLUTION = 16384
 #: Parameters that are no settings of the method, but of what is read or of the job.
 _NOT_SETTINGS = {"name", "orbit", "up", "views", "resolution", "drop_invalid", "backbone", "workers", "keep_everything"}
 
+#: A name is shown in terminals, and kept by databases that know no zero bytes.
+_NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
+_Share = Annotated[float, Field(ge=0, le=1)]
+
 
 class JobParameters(BaseModel):
     """Parameters of a job; what is left out is the preset's, as for `sgsst stylize`."""
@@ -24,7 +28,7 @@ class JobParameters(BaseModel):
         json_schema_extra={"examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}]},
     )
 
-    name: str = Field("", max_length=200, description="For people; not unique.")
+    name: str = Field("", max_length=200, pattern=_NO_CONTROLS, description="For people; not unique.")
     preset: PresetName = Field("standard", description="Where the settings below start from.")
     orbit: int | None = Field(None, ge=1, le=2000, description="Instead of camera files: views around the scene.")
     up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field("-y", description="Axis that points up, for `orbit`.")
@@ -35,20 +39,24 @@ class JobParameters(BaseModel):
     learning_rate: float | None = Field(None, gt=0, le=100, description="Adam's, then constant.")
     content_weight: float | None = Field(None, ge=0, le=1e12, description="Weight of the content term.")
     position_weights: PositionWeights | None = Field(None, description="Weigh positions by coverage.")
-    background: tuple[float, float, float] | None = Field(None, description="RGB in 0..1 behind the Gaussians.")
+    background: tuple[_Share, _Share, _Share] | None = Field(None, description="RGB in 0..1 behind the Gaussians.")
     near: float = Field(NEAR, gt=0, allow_inf_nan=False, description="Near plane, in the scene's units.")
     drop_invalid: bool = Field(False, description="Leave Gaussians with NaN or infinite values out.")
     seed: int = Field(0, ge=0, lt=2**63, description="Of the order of views.")
     precision: Precision = Field("float32", description="Of the feature network.")
     backbone: Literal["auto", "vgg19", "vgg16"] = Field("auto", description="Feature network.")
     memory_limit: int | None = Field(None, gt=0, le=2**50, description="Bytes to plan with.")
-    max_seconds: float | None = Field(None, gt=0, description="Stop after so long and take what is there.")
+    max_seconds: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="Stop after so long and take what is there."
+    )
     target_loss: float | None = Field(None, gt=0, lt=1, description="Stop at this share of the loss at the start.")
     early_stop: bool | None = Field(None, description="Stop when the loss has stopped falling.")
     warm_start: bool | None = Field(None, description="Begin with the style's mean colour and spread.")
     revive: bool | None = Field(None, description="Let colours that fell below black come back.")
     coarsest_side: int | None = Field(None, ge=16, le=MAX_RESOLUTION, description="Shorter side of the coarsest scale.")
-    prune_weight: float | None = Field(None, ge=0, description="Leave out Gaussians that show in fewer pixels.")
+    prune_weight: float | None = Field(
+        None, ge=0, allow_inf_nan=False, description="Leave out Gaussians that show in fewer pixels."
+    )
     similar_views: float | None = Field(None, ge=0, lt=1, description="Leave out views that another one shows.")
     kept_weights: KeptWeights | None = Field(None, description="How blend weights are kept between steps.")
     unseen: Literal["neighbours", "keep"] | None = Field(None, description="Colours of Gaussians that no view sees.")
