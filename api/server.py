@@ -8,6 +8,7 @@ import sys
 import uvicorn
 
 from api.app import create_app
+from api.connection import Connection
 from service.logs import set_up
 from service.settings import ServiceSettings
 
@@ -24,8 +25,11 @@ def main() -> None:
     settings = ServiceSettings()
     set_up(settings.log_format)
     descriptor = int(sys.argv[2]) if sys.argv[1:2] == ["--fd"] else None
+    Connection.head_seconds = settings.receive_seconds
     uvicorn.run(
         create_app(settings),
+        http=Connection,
+        ws="none",
         host=settings.host,
         port=settings.port,
         fd=descriptor,

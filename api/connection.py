@@ -1,0 +1,86 @@
+"""HTTP connections that do not wait, nor take in, for ever: uvicorn's own protocol bounds neither time nor size of a
+request's head."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+#: Bytes of a request's line and headers, counted in the pieces in which they come.
+MAX_HEAD_BYTES = 1 << 17
+_TOO_LARGE = (
+    b'{"type":"about:blank","title":"Request Header Fields Too Large","status":431,"code":"head-too-large",'
+    b'"detail":"The request\'s line and headers are too long."}'
+)
+
+
+class Connection(HttpToolsProtocol):
+    """A connection that is closed when a request's head has begun and takes too long, or is too long.
+
+    Attributes:
+        head_seconds: from the connection, or a head's first byte, to the head's end.
+    """
+
+    head_seconds = 60.0
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._in_head, self._head_bytes = True, 0
+        self._head_timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """The time of the first head begins."""
+        super().connection_made(transport)
+        self._start()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Nothing is waited for any more."""
+        self._stop()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes in, as long as a head that they belong to may still grow."""
+        super().data_received(data)
+        if not self._in_head or self.transport.is_closing():
+            return
+        self._head_bytes += len(data)
+        if self._head_bytes > MAX_HEAD_BYTES:
+            self._refuse()
+        elif self._head_timer is None:
+            self._start()
+
+    def on_headers_complete(self) -> None:
+        """The head is whole."""
+        self._in_head, self._head_bytes = False, 0
+        self._stop()
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """What comes from now on is the next head."""
+        self._in_head = True
+        super().on_message_complete()
+
+    def _start(self) -> None:
+        self._head_timer = self.loop.call_later(self.head_seconds, self._late)
+
+    def _stop(self) -> None:
+        if self._head_timer is not None:
+            self._head_timer.cancel()
+            self._head_timer = None
+
+    def _late(self) -> None:
+        self._head_timer = None
+        if self.cycle is not None and not self.cycle.response_complete:
+            self._start()  # an answer is still on its way to the same client
+        elif not self.transport.is_closing():
+            self.transport.close()
+
+    def _refuse(self) -> None:
+        head = (
+            "HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/problem+json\r\n"
+            f"content-length: {len(_TOO_LARGE)}\r\nconnection: close\r\n\r\n"
+        )
+        self.transport.write(head.encode() + _TOO_LARGE)
+        self.transport.close()
