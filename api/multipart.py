@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,8 +26,12 @@ from sgsst_core.ply_header import read_header
 #: Bytes of a text field, which is JSON of parameters or an id.
 _MAX_TEXT = 1 << 16
 _TEXT_FIELDS = ("parameters", "webhook")
+#: Bytes of all headers of one part: its role and its file's name.
+_MAX_HEAD = 1 << 14
 #: What comes is gathered to blocks of this size: each is one step to another thread and back.
 _BLOCK = 1 << 18
+#: Bytes per second at which a body comes at least, once it has come for longer than it may stand still.
+_LEAST_RATE = 1000
 #: After a refusal, so much more is read and thrown away: a client that still sends would not see the answer otherwise.
 _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
@@ -35,6 +40,12 @@ class BadRequestError(ServiceError):
     """The body is not what its headers say."""
 
     code, status = "malformed-body", 400
+
+
+class MediaTypeError(ServiceError):
+    """Not a media type, or an encoding, that is read here."""
+
+    code, status = "unsupported-media-type", 415
 
 
 class TooSlowError(ServiceError):
@@ -62,22 +73,30 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
     """The body in blocks.
 
     Raises:
-        TooLargeError, TooSlowError, BadRequestError: it is too long, stands still, or was cut off.
+        MediaTypeError, TooLargeError, TooSlowError, BadRequestError: it is compressed, too long, stands still or hardly
+            moves, or was cut off.
     """
     limit = settings.max_request_bytes
+    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
+        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
     declared = request.headers.get("content-length", "")
     if declared.isdigit() and int(declared) > limit:
         raise TooLargeError(f"The request has {int(declared):,} bytes; {limit:,} may be. Use uploads.", limit=limit)
     total = 0
     block = bytearray()
     stream = aiter(request.stream())
+    started = time.monotonic()
     while True:
+        # who sends a byte now and then does not stand still, but would hold the connection for ever
+        allowed = settings.receive_seconds + total / _LEAST_RATE - (time.monotonic() - started)
         try:
-            part = await asyncio.wait_for(anext(stream), settings.receive_seconds)
+            part = await asyncio.wait_for(anext(stream), max(0.0, min(allowed, settings.receive_seconds)))
         except StopAsyncIteration:
             break
         except TimeoutError as error:
-            raise TooSlowError(f"Nothing has come for {settings.receive_seconds:g} s.") from error
+            raise TooSlowError(
+                f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second."
+            ) from error
         except ClientDisconnect as error:
             raise BadRequestError("The request was cut off.") from error
         total += len(part)
@@ -99,8 +118,10 @@ async def receive(request: Request, blobs: BlobFolder, settings: ServiceSettings
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
-    if kind != b"multipart/form-data" or not boundary:
-        raise BadRequestError("The body must be multipart/form-data with a boundary, or application/json.")
+    if kind != b"multipart/form-data":
+        raise MediaTypeError("The body must be multipart/form-data or application/json.")
+    if not boundary:
+        raise BadRequestError("The Content-Type multipart/form-data must name a boundary.")
     form = _Form(boundary, blobs, settings)
     blocks = body_blocks(request, settings)
     try:
@@ -138,6 +159,7 @@ class _Form:
         self.received = Received()
         self._blobs, self._settings = blobs, settings
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
+        self._head_bytes = self._parts = 0
         self._headers: dict[bytes, bytes] = {}
         self._role = self._name = ""
         self._file: Receiver | None = None
@@ -146,8 +168,8 @@ class _Form:
         self._closed: list[Receiver] = []
         callbacks: dict[str, Callable[..., None]] = {
             "on_part_begin": self._begin,
-            "on_header_field": lambda data, start, end: self._header[0].extend(data[start:end]),
-            "on_header_value": lambda data, start, end: self._header[1].extend(data[start:end]),
+            "on_header_field": lambda data, start, end: self._head(0, data[start:end]),
+            "on_header_value": lambda data, start, end: self._head(1, data[start:end]),
             "on_header_end": self._header_end,
             "on_headers_finished": self._open,
             "on_part_data": self._data,
@@ -178,8 +200,18 @@ class _Form:
             self._file = None
 
     def _begin(self) -> None:
+        self._parts += 1
+        if self._parts > self._settings.max_photos + MAX_CAMERA_FILES + 2 + len(_TEXT_FIELDS):
+            raise RefusedInputError(f"There are more than {self._parts - 1} fields.", "too-many-files")
         self._headers = {}
+        self._head_bytes = 0
         self._clear_header()
+
+    def _head(self, which: int, data: bytes) -> None:
+        self._head_bytes += len(data)
+        if self._head_bytes > _MAX_HEAD:
+            raise BadRequestError(f"The headers of a part have more than {_MAX_HEAD} bytes.")
+        self._header[which].extend(data)
 
     def _clear_header(self) -> None:
         self._header[0].clear()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import binascii
 import contextlib
 import hashlib
 import os
@@ -16,7 +15,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Request, Response
 
 from api.context import CallerDep, Context, ContextDep, is_id
-from api.multipart import BadRequestError, body_blocks
+from api.multipart import BadRequestError, MediaTypeError, body_blocks
 from api.problems import RESPONSES
 from api.routes.jobs import IdempotencyHeader
 from api.views import UploadView, upload_view
@@ -42,12 +41,6 @@ class WrongVersionError(ServiceError):
     """Another version of the protocol."""
 
     code, status = "unsupported-tus-version", 412
-
-
-class MediaTypeError(ServiceError):
-    """Not the media type that the protocol prescribes."""
-
-    code, status = "unsupported-media-type", 415
 
 
 class ChecksumError(ServiceError):
@@ -289,7 +282,7 @@ def _file_name(metadata: str) -> str:
         if key in ("filename", "name"):
             try:
                 return base64.b64decode(value, validate=True).decode()
-            except (binascii.Error, UnicodeDecodeError) as error:
+            except ValueError as error:  # also for letters that are not ASCII
                 raise BadRequestError(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
     return ""
 
@@ -300,7 +293,7 @@ def _checksum(header: str) -> tuple[str, bytes]:
         raise BadRequestError(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(_ALGORITHMS)}.")
     try:
         return name, base64.b64decode(value, validate=True)
-    except binascii.Error as error:
+    except ValueError as error:  # also for letters that are not ASCII
         raise BadRequestError("Upload-Checksum: the digest is not base64.") from error
 
 

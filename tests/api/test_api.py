@@ -233,11 +233,9 @@ def test_a_body_that_comes_too_slowly(service: Service) -> None:
     assert b" 408 " in raw(service, head, b"--x\r\n", close=False).splitlines()[0]
 
 
-@pytest.mark.parametrize(
-    "kind", ["text/plain", "multipart/form-data", "multipart/form-data; boundary=" + "x" * 500, ""]
-)
+@pytest.mark.parametrize("kind", ["text/plain", ""])
 def test_other_media_types(client: httpx.Client, kind: str) -> None:
-    refused(client.post("/v1/jobs", content=b"x", headers={"content-type": kind}), 400, "malformed-body")
+    refused(client.post("/v1/jobs", content=b"x", headers={"content-type": kind}), 415, "unsupported-media-type")
 
 
 def test_a_request_that_is_too_long(service: Service, client: httpx.Client) -> None:
