@@ -27,7 +27,7 @@ class Connection(HttpToolsProtocol):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._in_head, self._head_bytes = True, 0
+        self._in_head, self._head_bytes, self._turns = True, 0, 0
         self._head_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -42,9 +42,10 @@ class Connection(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Take bytes in, as long as a head that they belong to may still grow."""
+        turns = self._turns
         super().data_received(data)
-        if not self._in_head or self.transport.is_closing():
-            return
+        if not self._in_head or self._turns != turns or self.transport.is_closing():
+            return  # all or some of it was no part of a head that is still open
         self._head_bytes += len(data)
         if self._head_bytes > MAX_HEAD_BYTES:
             self._refuse()
@@ -54,12 +55,14 @@ class Connection(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """The head is whole."""
         self._in_head, self._head_bytes = False, 0
+        self._turns += 1
         self._stop()
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
         """What comes from now on is the next head."""
         self._in_head = True
+        self._turns += 1
         super().on_message_complete()
 
     def _start(self) -> None:
