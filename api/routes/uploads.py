@@ -173,6 +173,9 @@ async def append_upload(
             await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
         elif row.sha256 is None:
             expires = await _append(request, context, row, wanted)
+        else:
+            async for _ in body_blocks(request, context.settings):
+                raise TooLargeError(f"More bytes come than the {row.length:,} of Upload-Length.", limit=row.length)
     row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
     return Response(
         status_code=204,
