@@ -32,7 +32,7 @@ class JobParameters(BaseModel):
     preset: PresetName = Field("standard", description="Where the settings below start from.")
     orbit: int | None = Field(None, ge=1, le=2000, description="Instead of camera files: views around the scene.")
     up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field("-y", description="Axis that points up, for `orbit`.")
-    views: int | None = Field(None, ge=1, description="Take so many of the cameras, spread evenly.")
+    views: int | None = Field(None, ge=1, le=1_000_000, description="Take so many of the cameras, spread evenly.")
     resolution: int | None = Field(None, ge=1, le=MAX_RESOLUTION, description="Pixels of every view's longer side.")
     steps_coarse: int | None = Field(None, ge=0, le=10_000_000, description="Steps on the coarsest scale.")
     steps_sos: int | None = Field(None, ge=0, le=10_000_000, description="Steps on all scales.")
