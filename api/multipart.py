@@ -94,10 +94,14 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
         except StopAsyncIteration:
             break
         except TimeoutError as error:
+            if block:
+                yield bytes(block)  # an upload keeps what has come
             raise TooSlowError(
                 f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second."
             ) from error
         except ClientDisconnect as error:
+            if block:
+                yield bytes(block)
             raise BadRequestError("The request was cut off.") from error
         total += len(part)
         if total > limit:
