@@ -64,11 +64,22 @@ def test_every_operation(document: schemathesis.schemas.BaseSchema, key: str, la
     operation = next(found for each in document.get_all_operations() if (found := each.ok()).label == label)
 
     @given(case=operation.as_strategy())
-    @settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @settings(max_examples=20, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
     def check(case: schemathesis.Case) -> None:
         case.call_and_validate(checks=_checks(), timeout=60, headers={"Authorization": f"Bearer {key}"})
 
     check()
+
+
+#: The same chains at every run.
+BOUNDS = settings(
+    max_examples=12,
+    stateful_step_count=6,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
 
 
 def test_chains_of_requests(service: Service, key: str, tmp_path: Path) -> None:
@@ -89,8 +100,7 @@ def test_chains_of_requests(service: Service, key: str, tmp_path: Path) -> None:
         def validate_response(self, response: Response, case: schemathesis.Case, **ignored: object) -> None:
             case.validate_response(response, checks=_checks())
 
-    health = list(HealthCheck)
-    Chains.run(settings=settings(max_examples=12, stateful_step_count=6, deadline=None, suppress_health_check=health))
+    Chains.run(settings=BOUNDS)
 
 
 def _upload(client: httpx.Client, path: Path) -> str:
