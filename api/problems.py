@@ -106,7 +106,8 @@ async def _invalid_input(request: Request, error: Exception) -> JSONResponse:
 async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError | ValidationError)
     errors = [
-        {"at": ".".join(str(part) for part in entry["loc"])[:_SHOWN], "message": entry["msg"]} for entry in error.errors()[:20]
+        {"at": ".".join(str(part) for part in entry["loc"])[:_SHOWN], "message": entry["msg"]}
+        for entry in error.errors()[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}
     return problem(422, "invalid-request", f"{first['at']}: {first['message']}", errors=errors)
