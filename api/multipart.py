@@ -97,7 +97,8 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
             if block:
                 yield bytes(block)  # an upload keeps what has come
             raise TooSlowError(
-                f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second."
+                f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second.",
+                headers={"Connection": "close"},  # the rest of the body may never come
             ) from error
         except ClientDisconnect as error:
             if block:
