@@ -36,6 +36,8 @@ from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_sos": 60, "backbone": "vgg16", "early_stop": False}
 SEEDS = (1, 2)
+#: Of the job on two ranks: enough for all of their deaths.
+RANK_STEPS = 200
 #: Attempts end by our hand here: neither a reason to give a job up nor to wait ever longer.
 SETTINGS = {
     "SGSST_LEASE_SECONDS": "30",
@@ -167,7 +169,7 @@ def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
     """A job on two ranks, of which one is killed again and again; its id."""
     if not kills:
         return None
-    job_id = run.submit(SEEDS[0], workers=2, steps_sos=200)
+    job_id = run.submit(SEEDS[0], workers=2, steps_sos=RANK_STEPS)
     reached = 0
     while run.kills[RANK] < kills:
         job = run.call("GET", f"/v1/jobs/{job_id}").json()
@@ -257,6 +259,9 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
         (folder / f"expected_{number}").mkdir()
         made = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{number}")
         expected[seed] = hashlib.sha256(made.read_bytes()).hexdigest()
+    (folder / "long").mkdir()
+    long = {**PARAMETERS, "seed": SEEDS[0], "steps_sos": RANK_STEPS}
+    one_rank = undisturbed(files, long, folder / "long") if rank_kills else None
     started = time.monotonic()
     with Service(folder / "data", **SETTINGS) as service:
         run = Run(service, files)
@@ -285,10 +290,8 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
             "seconds_until_everything_is_ready_again": spread(run.everything_back),
             "not_succeeded": [job.get("error") for job in found.values() if job["status"] != "succeeded"],
         }
-        if on_ranks in ended:
-            (folder / "two").mkdir()
-            one = undisturbed(files, {**PARAMETERS, "seed": SEEDS[0], "steps_sos": 200}, folder / "two")
-            figures["two_ranks_from_one"] = distance(run, on_ranks, one)
+        if one_rank is not None and on_ranks in ended:
+            figures["two_ranks_from_one"] = distance(run, on_ranks, one_rank)
         return figures
 
 
