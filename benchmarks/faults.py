@@ -29,7 +29,7 @@ import psutil
 from benchmarks.machine import write_result
 from sgsst_core.loop import Progress
 from sgsst_core.stylizer import mean_loss
-from tests.worker.faults import Fault, FaultyRank, Place, fired, shared_memory, small_request
+from tests.worker.faults import Fault, FaultyRank, Place, fired, folders, shared_memory, small_request
 from worker.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.cluster import Cluster
 from worker.job import StylizeRequest
@@ -139,20 +139,19 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     delay = chance.uniform(0, 5)
     time.sleep(delay)
     family = psutil.Process(process.pid).children(recursive=True)
-    shared = shared_memory(family)
+    shared, used = shared_memory(family), folders(family)
     process.send_signal(signal.SIGKILL)
     started = time.monotonic()
     process.wait()
     _, alive = psutil.wait_procs(family, timeout=30)
     seconds = time.monotonic() - started
     time.sleep(2)  # the folder goes last
-    left = [str(path) for path in Path(tempfile.gettempdir()).glob("sgsst-ray-*")]
     saved = request.out.with_name("s.checkpoint.safetensors").exists()
     again = subprocess.run([*command, *(["--resume"] if saved else [])], capture_output=True, text=True)
     return {
         "seconds_after_schedule": round(delay, 2),
         "processes_left": len(alive),
-        "folders_left": left,
+        "folders_left": sorted(str(path) for path in used if path.exists()),
         "shared_memory_left": sorted(str(path) for path in shared if path.exists()),
         "seconds_until_all_gone": round(seconds, 2),
         "saved": saved,

@@ -111,6 +111,15 @@ def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
     return found
 
 
+def folders(processes: Iterable[psutil.Process]) -> set[Path]:
+    """Ray's folders that processes name in their commands."""
+    words = []
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            words += process.cmdline()
+    return {Path("/", *Path(word).parts[1:3]) for word in words if word.startswith("/tmp/sgsst-ray-")}
+
+
 def _file(request: StylizeRequest) -> Path:
     return request.out.with_suffix(".fault")
 

@@ -19,7 +19,7 @@ import pytest
 from sgsst_core.errors import SceneError
 from sgsst_core.loop import Progress
 from sgsst_core.stylizer import mean_loss
-from tests.worker.faults import Fault, FaultyRank, fired, shared_memory, small_request
+from tests.worker.faults import Fault, FaultyRank, fired, folders, shared_memory, small_request
 from worker.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.cluster import Cluster
 from worker.job import Prepared, StylizeRequest, execute, prepare
@@ -210,12 +210,6 @@ def start(arguments: list[str]) -> subprocess.Popen[str]:
 def left_of(process: psutil.Process) -> list[psutil.Process]:
     """A process's children and theirs, with Ray's folder in their command or open files."""
     return [child for child in process.children(recursive=True) if child.is_running()]
-
-
-def folders(processes: list[psutil.Process]) -> set[Path]:
-    """Ray's folders that processes name in their commands."""
-    words = [word for process in processes for word in process.cmdline()]
-    return {Path("/", *Path(word).parts[1:3]) for word in words if word.startswith("/tmp/sgsst-ray-")}
 
 
 def test_a_killed_driver_leaves_nothing_behind(tmp_path: Path) -> None:
