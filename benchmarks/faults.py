@@ -29,7 +29,7 @@ import psutil
 from benchmarks.machine import write_result
 from sgsst_core.loop import Progress
 from sgsst_core.stylizer import mean_loss
-from tests.worker.faults import Fault, FaultyRank, Place, fired, folders, shared_memory, small_request
+from tests.worker.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
 from worker.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.cluster import Cluster
 from worker.job import StylizeRequest
@@ -115,12 +115,14 @@ class Chaos:
         if line.startswith("Going on"):
             self.found[-1]["seconds_to_running"] = round(time.time() - self.found[-1].pop("at"), 2)
             return
-        assert self._current is not None
         if isinstance(self._current, Fault):
             at = fired(self._request)
-            assert at is not None
-            self._at = at + self._current.delay
+            self._at = None if at is None else at + self._current.delay
+        if self._current is None or self._at is None:  # a busy machine: a rank that was only slow to answer
+            self.found.append({"fault": {"what": "none"}, "at": time.time()})
+            return
         self.found.append({"fault": asdict(self._current), "at": self._at})
+        forget(self._request)
         self._arm()
 
 

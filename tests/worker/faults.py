@@ -92,6 +92,11 @@ def fired(request: StylizeRequest) -> float | None:
     return path.stat().st_mtime if path.exists() else None
 
 
+def forget(request: StylizeRequest) -> None:
+    """As if nothing had happened yet."""
+    _fired(request).unlink(missing_ok=True)
+
+
 def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
     """A job of tiny views in which every rank takes part."""
     inputs = folder / "inputs"
