@@ -90,6 +90,7 @@ class Chaos:
         if self._current is not None:
             self._faults.append(self._current)
         for entry, attempt in zip(self.found, ended.attempts, strict=True):
+            entry.pop("at", None)  # of one that was followed by the next before anything ran again
             entry |= {
                 "reason": attempt.reason,
                 "steps_lost": attempt.last_step - attempt.saved_step,
@@ -190,7 +191,7 @@ def main() -> None:
                 same = request.out.read_bytes() == content
                 jobs.append({"faults": len(chaos.found), "loss_relative_error": difference, "same_file": same})
                 print(json.dumps(jobs[-1]), flush=True)
-    killed = [entry for entry in found if entry["fault"].get("what") == "SIGKILL"]
+    killed = [entry for entry in found if entry["fault"].get("what") == "SIGKILL" and "seconds_to_running" in entry]
     seconds = sorted(entry["seconds_to_running"] for entry in killed)
     figures = {
         "job": {"steps": STEPS, "ranks": 2, "view": "64x48", "checkpoint_seconds": CHECKPOINT_SECONDS},
