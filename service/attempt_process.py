@@ -24,13 +24,10 @@ from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
     from sgsst_core.loop import Progress
-    from sgsst_core.stylizer import Stylizer
-    from worker.job import Job, Prepared, Result, StylizeRequest
+    from worker.job import Prepared, Result, StylizeRequest
 
-#: Previews become rarer as a job goes on: this share of its time lies between two, so that there are never thousands.
-_PREVIEW_SHARE = 0.05
-#: Longer side of a preview, pixels.
-_PREVIEW_SIDE = 960
+#: Of previews, in the attempt's folder.
+_PREVIEWS = Path("out", "previews")
 
 
 class Message(TypedDict, total=False):
@@ -89,7 +86,6 @@ class Attempt:
     def __init__(self, task: Task) -> None:
         self._task = task
         self._stopping = threading.Event()
-        self._started = self._last_preview = time.monotonic()
 
     def run(self) -> None:
         """Run to the end, whatever it is, and tell how it was."""
@@ -115,19 +111,17 @@ class Attempt:
 
     def _alone(self) -> Result:
         from worker.job import Resume, describe, execute, prepare
+        from worker.previews import Previews
 
         job = prepare(self._request(), resume=Resume(self._task.resume, required=False), warn=log)
         self._prepared(describe(job))
 
-        def progress(now: Progress) -> None:
-            self._progress(now)
-            self._preview(job)
-
         return execute(
             job,
-            progress=progress,
+            progress=self._progress,
             stop=self._stopping.is_set,
             warn=log,
+            preview=Previews(_PREVIEWS, self._task.preview_seconds, self._preview, log),
             checkpoint_seconds=self._task.checkpoint_seconds,
         )
 
@@ -140,8 +134,12 @@ class Attempt:
         request = self._request()
         # a checkpoint that is not there is no error here, as it would be for a user who asks for it
         request = replace(request, resume=request.resume and Outputs(request.out).checkpoints.exist)
-        listener = Listener(self._prepared, self._progress, log, log, self._stopping.is_set)
-        options = WorkerOptions(checkpoint_seconds=self._task.checkpoint_seconds)
+        listener = Listener(self._prepared, self._progress, log, log, self._stopping.is_set, self._preview)
+        options = WorkerOptions(
+            checkpoint_seconds=self._task.checkpoint_seconds,
+            preview_folder=_PREVIEWS,
+            preview_seconds=self._task.preview_seconds,
+        )
         return stylize_on_ranks(request, self._task.workers, listener, options=options).result
 
     def _prepared(self, prepared: Prepared) -> None:
@@ -162,38 +160,8 @@ class Attempt:
             }
         )
 
-    def _preview(self, job: Job) -> None:
-        now = time.monotonic()
-        wait = max(self._task.preview_seconds, _PREVIEW_SHARE * (now - self._started))
-        if now - self._last_preview < wait:
-            return
-        try:
-            path = write_preview(job.stylizer)
-        except Exception as error:  # a picture less is no reason to lose the job
-            log(f"no preview could be made: {error}")
-        else:
-            tell({"kind": "preview", "path": str(path)})
-        self._last_preview = time.monotonic()
-
-
-def write_preview(stylizer: Stylizer) -> Path:
-    """The first evaluation view with its present colours, as a JPEG in `out/previews`."""
-    import torch
-
-    from sgsst_core.camera import resized
-    from sgsst_core.images import save_jpg
-
-    views = stylizer.views
-    index = stylizer.evaluation_views[0]
-    camera = views.cameras[index]
-    if max(camera.width, camera.height) > _PREVIEW_SIDE:
-        camera = resized(camera, _PREVIEW_SIDE)
-    path = Path("out", "previews", f"step_{stylizer.step:07d}.jpg")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad():
-        image = views.rasterizer.render(views.colours(index, stylizer.sh_dc.detach()), camera)
-    save_jpg(path, image)
-    return path
+    def _preview(self, path: Path) -> None:
+        tell({"kind": "preview", "path": str(path)})
 
 
 def summary(result: Result) -> dict[str, Any]:

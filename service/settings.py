@@ -77,7 +77,6 @@ class ServiceSettings(BaseSettings):
     preview_seconds: float = Field(20, gt=0)
     stop_seconds: float = Field(20, gt=0)
     poll_seconds: float = Field(0.5, gt=0)
-    metrics_port: int | None = None
 
     webhooks: bool = False
     webhook_private_addresses: bool = False

@@ -45,11 +45,15 @@ class WorkerOptions:
     Attributes:
         rank_timeout: seconds without an answer after which a rank counts as lost.
         checkpoint_seconds: between checkpoints.
+        preview_folder: of pictures of the running job, as rank 0's machine sees it; None for none.
+        preview_seconds: between two pictures, at least.
         actor: what runs a rank.
     """
 
     rank_timeout: float = 120.0
     checkpoint_seconds: float = 60.0
+    preview_folder: Path | None = None
+    preview_seconds: float = 20.0
     actor: type[RankProcess] = RankProcess
 
 
@@ -63,6 +67,7 @@ class Listener:
         happened: what became of ranks and attempts, in a sentence.
         warn: what is worth knowing although the job goes on.
         stop: asked a few times a second; True ends the job as "interrupted".
+        preview: path of each picture of the running job.
     """
 
     prepared: Callable[[Prepared], None] = lambda prepared: None
@@ -70,6 +75,7 @@ class Listener:
     happened: Callable[[str], None] = lambda line: None
     warn: Callable[[str], None] = lambda line: None
     stop: Callable[[], bool] = lambda: False
+    preview: Callable[[Path], None] = lambda path: None
 
 
 @dataclass
@@ -197,7 +203,7 @@ class _Job:
         self._last_step = 0
         self._saved: int | None = None
         self._prepared = False
-        self._warned = 0
+        self._warned = self._previewed = 0
         self._useless = 0  # attempts in a row without progress
         self._safe_at = self._lost_at = time.monotonic()
 
@@ -231,7 +237,7 @@ class _Job:
 
     def _attempt(self) -> Result | None:
         """Start ranks and watch them to their end; None where they had to be stopped by force."""
-        self._first_step, self._last_step, self._warned = None, 0, 0
+        self._first_step, self._last_step, self._warned, self._previewed = None, 0, 0, 0
         if not self._cluster.alive():
             self._cluster.close()
             self._cluster.open()
@@ -294,6 +300,8 @@ class _Job:
             resume=self._resume(),
             run=self._run,
             checkpoint_seconds=self._options.checkpoint_seconds,
+            preview_folder=self._options.preview_folder,
+            preview_seconds=self._options.preview_seconds,
             workers={"asked": self._workers, "attempts": [asdict(attempt) for attempt in self._attempts]},
             seconds_lost=time.monotonic() - self._safe_at,
             seconds_since_loss=time.monotonic() - self._lost_at,
@@ -339,6 +347,9 @@ class _Job:
         for line in status.warnings[self._warned :]:
             self._listener.warn(line)
         self._warned = len(status.warnings)
+        for path in status.previews[self._previewed :]:
+            self._listener.preview(path)
+        self._previewed = len(status.previews)
         if status.prepared is not None and self._first_step is None:
             self._first_step = self._last_step = status.prepared.step
             self._total = status.prepared.total

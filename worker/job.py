@@ -345,7 +345,7 @@ def execute(
 
     Checkpoints are written every `checkpoint_seconds` and where the job ends early. One that cannot be written is a
     warning as long as the job itself goes on. Every rank that takes part calls this; the callbacks are used on the
-    first one alone: `saved` is told the step of each checkpoint.
+    first one alone: `saved` is told the step of each checkpoint, `preview` is called after every step (see `Previews`).
 
     Raises:
         OutputError: the PLY, or the checkpoint of an interrupted job, cannot be written.
@@ -379,6 +379,7 @@ def execute(
     if first:
         callbacks.progress, callbacks.stop = progress, stop
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
+        callbacks.preview_seconds = 0.0  # when it is time for one, it knows itself
     stopped = run(stylizer, callbacks)
     if stopped == "interrupted":
         if unsaved:

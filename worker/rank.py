@@ -59,6 +59,7 @@ class Task:
         resume: whether to go on from a checkpoint.
         run: identifies the run of the program.
         checkpoint_seconds: between checkpoints.
+        preview_folder, preview_seconds: see `attempts.WorkerOptions`.
         workers: for the report: what has happened so far.
         seconds_lost, seconds_since_loss: of the last attempt (see `attempts.Attempt`), until this task was made.
     """
@@ -73,6 +74,8 @@ class Task:
     resume: Resume
     run: str
     checkpoint_seconds: float
+    preview_folder: Path | None
+    preview_seconds: float
     workers: dict[str, Any]
     seconds_lost: float
     seconds_since_loss: float
@@ -106,6 +109,7 @@ class Status:
         progress: of the last step; rank 0 alone.
         saved: step of the last checkpoint that this rank has written.
         warnings: all so far.
+        previews: paths of all pictures so far.
         outcome: once it has ended.
     """
 
@@ -113,6 +117,7 @@ class Status:
     progress: Progress | None = None
     saved: int | None = None
     warnings: tuple[str, ...] = ()
+    previews: tuple[Path, ...] = ()
     outcome: Outcome | None = None
 
 
@@ -182,6 +187,7 @@ class RankProcess:
 
     def _job(self, task: Task, collectives: Collectives) -> Result:
         from worker.job import describe, execute, prepare
+        from worker.previews import Previews
 
         started = time.monotonic()
         job = prepare(task.request, collectives=collectives, resume=task.resume, warn=self._warn)
@@ -202,10 +208,16 @@ class RankProcess:
             progress=progress,
             stop=self._stop.is_set,
             warn=self._warn,
+            preview=Previews(task.preview_folder, task.preview_seconds, self._show, self._warn)
+            if task.preview_folder
+            else None,
             saved=lambda step: self._tell(saved=step),
             checkpoint_seconds=task.checkpoint_seconds,
             run_id=task.run,
         )
+
+    def _show(self, path: Path) -> None:
+        self._tell(previews=(*self._status.previews, path))
 
     def _warn(self, line: str) -> None:
         self._tell(warnings=(*self._status.warnings, line))

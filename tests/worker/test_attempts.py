@@ -15,6 +15,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from PIL import Image
 
 from sgsst_core.errors import SceneError
 from sgsst_core.loop import Progress
@@ -57,6 +58,7 @@ class Heard:
     steps: list[int] = field(default_factory=list)
     happened: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    previews: list[Path] = field(default_factory=list)
 
     def listener(self) -> Listener:
         def progress(current: Progress) -> None:
@@ -65,7 +67,9 @@ class Heard:
         def stop() -> bool:
             return self.stop_at is not None and bool(self.steps) and self.steps[-1] >= self.stop_at
 
-        return Listener(self.prepared.append, progress, self.happened.append, self.warnings.append, stop)
+        return Listener(
+            self.prepared.append, progress, self.happened.append, self.warnings.append, stop, self.previews.append
+        )
 
 
 def run(
@@ -74,7 +78,13 @@ def run(
     """A job on ranks to which something may happen; checkpoints after nearly every step."""
     if fault is not None:
         fault.write(request)
-    options = WorkerOptions(rank_timeout=5.0, checkpoint_seconds=0.2, actor=FaultyRank)
+    options = WorkerOptions(
+        rank_timeout=5.0,
+        checkpoint_seconds=0.2,
+        preview_folder=request.out.with_name("previews"),
+        preview_seconds=0.1,
+        actor=FaultyRank,
+    )
     return stylize_on_ranks(request, workers, (heard or Heard()).listener(), options=options, cluster=cluster)
 
 
@@ -95,6 +105,10 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     report = json.loads(request.out.with_name("s.report.json").read_text())
     assert report["workers"]["used"] == 2
     assert len(report["workers"]["ranks"]) == 2
+    assert heard.previews
+    for path in heard.previews:
+        with Image.open(path) as picture:
+            assert picture.format == "JPEG"
     return loss_of(ended), request.out.read_bytes()
 
 

@@ -1,0 +1,65 @@
+"""Pictures of a running job."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from sgsst_core.camera import resized
+from sgsst_core.images import save_jpg
+from sgsst_core.stylizer import Stylizer
+
+#: Previews become rarer as a job goes on: this share of its time lies between two, so that there are never thousands.
+_SHARE = 0.05
+#: Longer side, pixels.
+_SIDE = 960
+
+
+class Previews:
+    """Writes the first evaluation view with its present colours now and then; for `loop.Callbacks.preview`.
+
+    Args:
+        folder: of the JPEGs, `step_0000123.jpg` and so on; made at the first of them.
+        seconds: between two, at least.
+        written: told the path of each.
+        warn: told why one is missing: a picture less is no reason to lose the job.
+    """
+
+    def __init__(
+        self, folder: Path, seconds: float, written: Callable[[Path], None], warn: Callable[[str], None]
+    ) -> None:
+        self._folder = folder
+        self._seconds = seconds
+        self._written = written
+        self._warn = warn
+        self._started = self._last = time.monotonic()
+
+    def __call__(self, stylizer: Stylizer) -> None:
+        """Write one, if it is time."""
+        now = time.monotonic()
+        if now - self._last < max(self._seconds, _SHARE * (now - self._started)):
+            return
+        try:
+            path = self._write(stylizer)
+        except Exception as error:
+            self._warn(f"no preview could be made: {error}")
+        else:
+            self._written(path)
+        self._last = time.monotonic()
+
+    def _write(self, stylizer: Stylizer) -> Path:
+        views = stylizer.views
+        index = stylizer.evaluation_views[0]
+        camera = views.cameras[index]
+        if max(camera.width, camera.height) > _SIDE:
+            camera = resized(camera, _SIDE)
+        path = self._folder / f"step_{stylizer.step:07d}.jpg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with torch.no_grad():
+            # The rasterizer's own render: other ranks take no part in it.
+            image = views.rasterizer.render(views.colours(index, stylizer.sh_dc.detach()), camera)
+        save_jpg(path, image)
+        return path
