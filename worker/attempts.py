@@ -237,7 +237,8 @@ class _Job:
 
     def _attempt(self) -> Result | None:
         """Start ranks and watch them to their end; None where they had to be stopped by force."""
-        self._first_step, self._last_step, self._warned, self._previewed = None, 0, 0, 0
+        self._first_step, self._last_step = None, self._saved or 0
+        self._warned = self._previewed = 0
         if not self._cluster.alive():
             self._cluster.close()
             self._cluster.open()
