@@ -149,10 +149,11 @@ def test_a_request_that_the_api_dies_in_can_be_sent_again(service: Service, file
         httpx.post(f"{service.url}/v1/jobs/{answer.json()['id']}/cancel", timeout=30)
 
 
-def test_a_killed_rank_costs_time_only(service: Service, files: dict[str, Path], expected: Path) -> None:
+def test_killed_ranks_cost_time_only(service: Service, files: dict[str, Path], expected: Path) -> None:
     job_id = submit(service, files, "ranks", workers=2).json()["id"]
     at_step(service, job_id, 3, attempt=1)
-    service.kill("ray::RankProcess")
+    for process in service.processes("ray::RankProcess"):  # the plan may do without one: whichever takes part is killed
+        process.kill()
     found = ended(service, job_id)
     assert found["result"]["steps"] == STEPS
     log = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text
