@@ -11,7 +11,7 @@ import torch
 
 from sgsst_core import stylize
 from sgsst_core.camera import resized
-from sgsst_core.checkpoint import load_checkpoint, save_checkpoint
+from sgsst_core.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.errors import CameraError
 from sgsst_core.loop import Callbacks, Progress, run
 from sgsst_core.scene import Scene
@@ -56,9 +56,10 @@ def test_a_resumed_run_ends_with_the_same_bits(vgg16_weights: BackboneWeights, s
     for _ in range(4):
         stopped.run_step()
     assert stopped.state().queue
-    save_checkpoint(tmp_path / "c.safetensors", stopped.state(), "job")
+    kept = Checkpoint(stopped.state(), stopped.plan, 1, stopped.start(), "run", versions())
+    save_checkpoint(tmp_path / "c.safetensors", kept, "job")
     resumed = make(vgg16_weights, scene, steps_sos=8)
-    resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job"))
+    resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
     assert run(resumed) == "finished"
     expected, found = whole.state(), resumed.state()
     for name in ("sh_dc", "first_moment", "second_moment", "generator"):
