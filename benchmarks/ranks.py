@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
+import resource
 import socket
 import statistics
 from dataclasses import replace
@@ -112,11 +113,14 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         for name, stylizer in (("together", together), ("alone", alone)):
             collectives.gather(None)  # nobody else computes while one rank is alone
             if stylizer is not None:
-                before = stylizer.seconds
+                before, used = stylizer.seconds, resource.getrusage(resource.RUSAGE_SELF)
                 record = stylizer.run_step()
                 if turn:
-                    steps[name].append({**record.parts, "total": stylizer.seconds - before})
+                    seconds = {"total": stylizer.seconds - before, **processor_seconds(used)}
+                    steps[name].append({**record.parts, **seconds})
     waiting = collectives.gather([step["communication"] / step["total"] for step in steps["together"]])
+    kernel = collectives.gather([step["processor_system"] for step in steps["together"]])
+    peak = collectives.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
     if alone is None:
         return {}
     loss = alone.loss
@@ -131,9 +135,21 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "ratio_of_fastest": fastest(steps["alone"]) / fastest(steps["together"]),
         "bound_by_halos": max(loads(one, halo)) / max(loads(shared, halo)),
         "waiting_share_by_rank": [statistics.median(share) for share in waiting],
+        "system_seconds_by_rank": [statistics.median(seconds) for seconds in kernel],
+        "peak_gb_by_rank": peak,
         "steps": steps,
         "pieces": [[piece.scale, *piece.size] for piece in pieces],
         "halo": halo,
+    }
+
+
+def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:
+    """What the process has taken since then, in its own code and in the system's (page faults, exchanges)."""
+    now = resource.getrusage(resource.RUSAGE_SELF)
+    return {
+        "processor_user": now.ru_utime - before.ru_utime,
+        "processor_system": now.ru_stime - before.ru_stime,
+        "page_faults": float(now.ru_minflt - before.ru_minflt),
     }
 
 
