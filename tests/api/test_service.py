@@ -108,6 +108,8 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         assert statuses == ["queued", "starting", "running", "succeeded"]
         assert kinds.index(("artifact", "plan.json")) < kinds.index(("status", "succeeded"))
         assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
+        last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
+        assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
         steps = [data["step"] for _, kind, data in seen if kind == "progress"]
         assert steps == sorted(steps)
         assert steps[-1] == STEPS
