@@ -455,7 +455,7 @@ class _Job:
             RanksFailedError: nothing is gained by another attempt.
         """
         self._lost_at = time.monotonic()
-        again = self._attempts and (lost.reason, self._last_step) == (
+        again = bool(self._attempts) and (lost.reason, self._last_step) == (
             self._attempts[-1].reason,
             self._attempts[-1].last_step,
         )

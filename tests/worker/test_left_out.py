@@ -41,11 +41,13 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
 
     monkeypatch.setattr(ray, "init", with_gpus)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")  # which faulty ranks import before they are told their threads
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
     Fault(0, "optimiser", 10, "SIGKILL").write(request)
     given_back: list[str] = []
+    happened: list[str] = []
     ranks_alive: list[int] = []
 
     def left_out(gpus: Sequence[str]) -> None:
@@ -58,10 +60,11 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
             ranks_alive.append(sum("FaultyRank" in title for title in titles))
 
     options = WorkerOptions(checkpoint_seconds=0.2, actor=FaultyRank)
-    listener = Listener(progress=progress, left_out=left_out)
+    listener = Listener(progress=progress, left_out=left_out, happened=happened.append)
     ended = stylize_on_ranks(request, 2, listener, options=options)
     assert fired(request) is not None
-    assert [attempt.ranks for attempt in ended.attempts] == [2]
+    assert [attempt.ranks for attempt in ended.attempts] == [2], happened
+    assert "with 1 worker," in happened[-1]
     assert ended.step == STEPS
     assert ranks_alive
     assert max(ranks_alive) == 1
