@@ -12,8 +12,11 @@ from pathlib import Path
 import pytest
 
 from service.artifacts import Artifacts
+from service.blobs import BlobFolder
 from service.dispatcher import Dispatcher, is_dead, own_name
 from service.machine import Machine
+from service.packing import Grant, Room
+from service.running import RunningAttempt
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import Lease, NewJob
@@ -61,6 +64,21 @@ def test_it_is_known_while_it_is_at_work(settings: ServiceSettings, store: Store
         found = wait_for(store.operations.dispatchers, "the dispatcher to be known")
         assert [(row.name, row.places, row.free) for row in found] == [(dispatcher.name, 2, 2)]
     assert store.operations.dispatchers() == []
+
+
+def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+    held = leased(store, "one")
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
+    artifacts = Artifacts(settings.artifacts_url)
+    grant = Grant(3, ("5", "6", "7"))
+    attempt = RunningAttempt(held, grant, tmp_path, store, blobs, artifacts, settings, cluster=False)
+    room = Room(Machine(grant.gpus, 2, 10**10), None)
+    assert room.free([attempt.grant]) == 0
+    for gpu in ("7", "5"):
+        attempt._hear({"kind": "left-out", "gpus": [gpu]})
+    assert attempt.grant == Grant(1, ("6",))
+    following = room.grant(held.job, [attempt.grant], 1)
+    assert following == Grant(2, ("5", "7"))
 
 
 def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
