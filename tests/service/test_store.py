@@ -323,9 +323,12 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
     assert sorted(store.jobs.unswept(10)) == [(second, 2), (third, 0)]
     store.jobs.swept(second, 1)  # of an earlier lease
     assert sorted(store.jobs.unswept(10)) == [(second, 2), (third, 0)]
-    store.jobs.retry(third, "local", limit=10)
     store.jobs.swept(second, 2)
+    store.jobs.swept(third, 0)
     assert store.jobs.unswept(10) == []
+    store.jobs.retry(third, "local", limit=10)
+    store.jobs.succeed(lease(store), [], {}, 1000.0)
+    assert store.jobs.unswept(10) == [(third, 1)], "it has run again since"
 
 
 def test_dispatchers_are_alive_as_long_as_they_are_heard_of(store: Store, clock: Clock) -> None:
