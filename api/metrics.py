@@ -65,12 +65,13 @@ class _StoreCollector(Collector):
             "sgsst_queue_oldest_seconds", "Seconds that the oldest queued job has waited.", operations.oldest_queued()
         )
         yield from self._counters()
-        rate = GaugeMetricFamily("sgsst_iterations_per_second", "Of running jobs, since they began.", labels=["job"])
-        for job in operations.running():
-            progress = job.progress or {}
-            if progress.get("seconds"):
-                rate.add_metric([job.id], progress["step"] / progress["seconds"])
-        yield rate
+        rates = [step / seconds for step, seconds in operations.steps_and_seconds()]
+        yield GaugeMetricFamily("sgsst_iterations_per_second", "Of all running jobs together.", sum(rates))
+        alive = operations.dispatchers()
+        yield GaugeMetricFamily("sgsst_dispatchers", "Dispatchers that are alive.", len(alive))
+        places, free = sum(row.places for row in alive), sum(row.free for row in alive)
+        yield GaugeMetricFamily("sgsst_places", "GPUs, or places for jobs where there are none.", places)
+        yield GaugeMetricFamily("sgsst_places_free", "Those that no job has.", free)
 
     def _counters(self) -> Iterable[Metric]:
         families: dict[str, CounterMetricFamily] = {}

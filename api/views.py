@@ -158,7 +158,7 @@ class PlanView(BaseModel):
     pixels: int
     style: list[int] = Field(description="Width and height.")
     photos: int
-    workers: int
+    workers: int | None = Field(description="As asked for; null where the service decides when the job starts.")
     estimated_seconds: float | None = Field(description="Of all steps; null where it cannot be told.")
     memory_bytes: int | None = Field(description="At the peak, as far as that can be told.")
     plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
@@ -167,7 +167,9 @@ class PlanView(BaseModel):
 class Health(BaseModel):
     """Whether the service can do its work."""
 
-    status: Literal["ok", "unavailable"]
+    status: Literal["ok", "waiting", "unavailable"] = Field(
+        description="`waiting`: jobs are taken in, but nobody is there to run them yet."
+    )
     checks: dict[str, str]
 
 

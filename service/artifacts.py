@@ -77,12 +77,18 @@ class Artifacts:
         except FileNotFoundError:
             return
 
-    def sweep(self, job_id: str, kept: set[str]) -> None:
-        """Remove a job's files that no row refers to: those of attempts that were cut off."""
+    def sweep(self, job_id: str, epoch: int, kept: set[str]) -> None:
+        """Remove a job's files that no row refers to: those of attempts that were cut off.
+
+        Args:
+            epoch: of the last lease whose files are looked at; a later one's may still be without their rows.
+            kept: locations that rows refer to.
+        """
         top = f"{self._root}/{job_id}"
         for path in self._files.find(top):
-            location = f"{job_id}/{path.rsplit(f'/{job_id}/', 1)[-1]}"
-            if location not in kept:
+            below = path.rsplit(f"/{job_id}/", 1)[-1]
+            location = f"{job_id}/{below}"
+            if location not in kept and int(below.partition("/")[0]) <= epoch:
                 self.remove(location)
 
     def ping(self) -> None:

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -33,7 +34,7 @@ _PREVIEWS = Path("out", "previews")
 class Message(TypedDict, total=False):
     """What the process tells: `kind` and what belongs to it."""
 
-    kind: Literal["stage", "prepared", "progress", "preview", "done", "interrupted", "failed"]
+    kind: Literal["stage", "prepared", "left-out", "progress", "preview", "done", "interrupted", "failed"]
     stage: str
     step: int
     total: int
@@ -41,6 +42,7 @@ class Message(TypedDict, total=False):
     seconds: float
     seconds_left: float
     path: str
+    gpus: list[str]
     result: dict[str, Any]
     error: dict[str, Any]
     permanent: bool
@@ -53,7 +55,8 @@ class Task:
     Attributes:
         staged: paths of the inputs, relative to the folder.
         parameters: of the job.
-        workers: ranks to run it on; 1 for this process alone.
+        workers: ranks to run it on at most; 1 for this process alone.
+        cluster: run even one rank on the Ray cluster.
         resume: go on from the checkpoint in `out`, where it can be used.
         checkpoint_seconds, preview_seconds: see the settings.
     """
@@ -61,6 +64,7 @@ class Task:
     staged: Staged
     parameters: JobParameters
     workers: int
+    cluster: bool
     resume: bool
     checkpoint_seconds: float
     preview_seconds: float
@@ -92,7 +96,7 @@ class Attempt:
         signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
         tell({"kind": "stage", "stage": "reading"})
         try:
-            result = self._on_ranks() if self._task.workers > 1 else self._alone()
+            result = self._on_ranks() if self._task.workers > 1 or self._task.cluster else self._alone()
         except Exception as error:
             tell(failure(error))
             traceback.print_exc()
@@ -134,7 +138,9 @@ class Attempt:
         request = self._request()
         # a checkpoint that is not there is no error here, as it would be for a user who asks for it
         request = replace(request, resume=request.resume and Outputs(request.out).checkpoints.exist)
-        listener = Listener(self._prepared, self._progress, log, log, self._stopping.is_set, self._preview)
+        listener = Listener(
+            self._prepared, self._progress, log, log, self._stopping.is_set, self._preview, self._left_out
+        )
         options = WorkerOptions(
             checkpoint_seconds=self._task.checkpoint_seconds,
             preview_folder=_PREVIEWS,
@@ -159,6 +165,9 @@ class Attempt:
                 "seconds_left": now.seconds_left,
             }
         )
+
+    def _left_out(self, gpus: Sequence[str]) -> None:
+        tell({"kind": "left-out", "gpus": list(gpus)})
 
     def _preview(self, path: Path) -> None:
         tell({"kind": "preview", "path": str(path)})

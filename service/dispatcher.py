@@ -24,8 +24,9 @@ from service.artifacts import Artifacts
 from service.blobs import BlobFolder
 from service.errors import LeaseLostError
 from service.logs import set_up
-from service.machine import count_gpus
-from service.running import RunningAttempt
+from service.machine import Machine
+from service.packing import Grant, Room
+from service.running import RunningAttempt, sweep
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import DAY, Lease
@@ -33,8 +34,10 @@ from service.store.tables import JobRow
 from service.webhooks import Deliverer
 from worker.processes import ProcessId, home
 
-#: Seconds between two looks for what has expired.
+#: Seconds between two looks for what has expired or was left behind.
 _HOUSEKEEPING_SECONDS = 60.0
+#: Jobs that are swept at a time: leases are not renewed meanwhile.
+_SWEEPS = 20
 #: Of a lease's time that passes before it is renewed.
 _RENEW_SHARE = 1 / 3
 
@@ -42,23 +45,23 @@ _log = logging.getLogger(__name__)
 
 
 class Dispatcher:
-    """Runs jobs until it is told to stop.
+    """Runs jobs until it is told to stop, side by side as long as there is room (`service.packing`).
 
-    Jobs run side by side as long as there is room: on GPUs, each rank takes one; without any, each job takes one of
-    `parallel_jobs` places, and its ranks share the cores.
+    Args:
+        machine: what there is to run them on; None finds out.
     """
 
-    def __init__(self, settings: ServiceSettings, store: Store) -> None:
+    def __init__(self, settings: ServiceSettings, store: Store, machine: Machine | None = None) -> None:
         self._settings, self._store = settings, store
         self._artifacts = Artifacts(settings.artifacts_url)
         self._blobs = BlobFolder(settings.folder, store.inputs, settings.min_free_bytes)
-        self._gpus = count_gpus()
-        self._places = settings.parallel_jobs or max(1, self._gpus)
+        self._machine = machine or Machine.find(settings)
+        self._room = Room(self._machine, settings.parallel_jobs)
         self._running: dict[str, RunningAttempt] = {}
         self._stop = threading.Event()
         self.name = own_name()
         self._work = settings.folder / "work" / self.name
-        self._renewed_at = self._kept_at = float("-inf")
+        self._renewed_at = self._kept_at = self._beat_at = float("-inf")
         self._deliverer = Deliverer(settings, store)
 
     def stop(self) -> None:
@@ -70,7 +73,8 @@ class Dispatcher:
         self._take_over_from_the_dead()
         self._work.mkdir(parents=True, exist_ok=True)
         self._deliverer.start()
-        _log.info("dispatcher %s is ready: %d places, %d GPUs", self.name, self._places, self._gpus)
+        what = "GPUs" if self._machine.gpus else "places"
+        _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
         while not self._stop.is_set():
             try:
                 self._round()
@@ -83,10 +87,12 @@ class Dispatcher:
 
     def _take_over_from_the_dead(self) -> None:
         """Of dispatchers that ran on this machine and are gone, nothing needs to be waited for."""
-        for name in self._store.jobs.lease_owners():
+        known = {row.name for row in self._store.operations.dispatchers()}
+        for name in sorted(known.union(self._store.jobs.lease_owners())):
             if is_dead(name):
                 _log.info("dispatcher %s is gone; its jobs are taken over", name)
                 self._store.jobs.end_leases(name)
+                self._store.operations.gone(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():
                 if is_dead(path.name):
@@ -97,39 +103,52 @@ class Dispatcher:
             if not attempt.alive:
                 del self._running[job_id]
         self._renew()
-        while not self._stop.is_set() and (lease := self._store.jobs.lease(self.name, self._fits)) is not None:
-            self._start(lease)
+        self._beat()
+        while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
+            self._start(*found)
         if time.monotonic() - self._kept_at > _HOUSEKEEPING_SECONDS:
-            self._keep_house()
             self._kept_at = time.monotonic()
+            self._keep_house()
 
     # --- room ------------------------------------------------------------------------------------------------------
 
-    def _free_devices(self) -> list[int]:
-        taken = {index for attempt in self._running.values() for index in attempt.devices}
-        return [index for index in range(self._gpus) if index not in taken]
+    def _held(self) -> list[Grant]:
+        return [attempt.grant for attempt in self._running.values()]
 
-    def _ranks(self, job: JobRow) -> int:
-        """How many ranks a job gets: as many as it asks for and the machine has; one unless it asks."""
-        asked = int(job.parameters.get("workers") or 1)
-        return max(1, min(asked, self._gpus)) if self._gpus and not os.environ.get("RAY_ADDRESS") else asked
+    def next_job(self, held: list[Grant]) -> tuple[Lease, Grant] | None:
+        """Lease the next job of the queue, and decide what it gets; None where there is none, or no room for it.
 
-    def _fits(self, job: JobRow) -> bool:
-        if len(self._running) >= self._places:
-            return False
-        return not self._gpus or len(self._free_devices()) >= min(self._ranks(job), self._gpus)
+        Args:
+            held: what running jobs have.
+        """
+        if not (waiting := self._store.jobs.waiting()):
+            return None
+        share = -(-waiting // max(1, len(self._store.operations.dispatchers())))  # others take their part of the queue
+        grant: Grant | None = None
 
-    def _start(self, lease: Lease) -> None:
-        ranks = self._ranks(lease.job)
-        devices = self._free_devices()[:ranks]
+        def fits(job: JobRow) -> bool:
+            nonlocal grant
+            grant = self._room.grant(job, held, share)
+            return grant is not None
+
+        lease = self._store.jobs.lease(self.name, fits)
+        return (lease, grant) if lease is not None and grant is not None else None
+
+    def _start(self, lease: Lease, grant: Grant) -> None:
         folder = self._work / f"{lease.job_id}-{lease.epoch}"
         attempt = RunningAttempt(
-            lease, ranks, devices, folder, self._store, self._blobs, self._artifacts, self._settings
+            lease, grant, folder, self._store, self._blobs, self._artifacts, self._settings, self._machine.cluster
         )
         self._running[lease.job_id] = attempt
         attempt.start()
 
     # --- leases ----------------------------------------------------------------------------------------------------
+
+    def _beat(self) -> None:
+        """Let everybody know that this dispatcher is alive."""
+        if time.monotonic() - self._beat_at >= _RENEW_SHARE * self._settings.lease_seconds:
+            self._store.operations.beat(self.name, self._room.size, self._room.free(self._held()))
+            self._beat_at = time.monotonic()
 
     def _renew(self) -> None:
         """Hold the leases of all running attempts, and see which of their jobs are to be canceled or are lost."""
@@ -159,6 +178,8 @@ class Dispatcher:
         _log.info("shutting down: %d running jobs save their state", len(self._running))
         for attempt in self._running.values():
             attempt.release()
+        with contextlib.suppress(SQLAlchemyError):
+            self._store.operations.gone(self.name)
         while any(attempt.alive for attempt in self._running.values()):
             with contextlib.suppress(SQLAlchemyError, LeaseLostError):
                 self._renew()
@@ -169,9 +190,14 @@ class Dispatcher:
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
     def _keep_house(self) -> None:
-        for job_id in self._store.jobs.expire(self._settings.retention_days * DAY):
-            self._artifacts.remove_job(job_id)
-        self._blobs.collect()
+        try:
+            for job_id in self._store.jobs.expire(self._settings.retention_days * DAY):
+                self._artifacts.remove_job(job_id)
+            for job_id, epoch in self._store.jobs.unswept(_SWEEPS):
+                sweep(self._store.jobs, self._artifacts, job_id, epoch)
+            self._blobs.collect()
+        except Exception:  # stores of files raise what they like; running jobs are not to suffer
+            _log.exception("not everything that is no longer needed could be removed; this is tried again")
 
 
 def own_name() -> str:

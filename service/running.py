@@ -13,25 +13,30 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from safetensors import SafetensorError, safe_open
 
 from service.artifacts import Artifacts
 from service.attempt_process import Message, Task
 from service.blobs import BlobFolder
 from service.errors import LeaseLostError
 from service.names import CHECKPOINT, RESULT
+from service.packing import Grant
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.staging import stage
 from service.store import Store
-from service.store.jobs import DAY, Lease, Published
+from service.store.jobs import DAY, Jobs, Lease, Published
 
 #: Progress is written this often at most: more would be writes that nobody sees.
 _PROGRESS_SECONDS = 1.0
 #: A job that is canceled has so long to end its step.
 _CANCEL_SECONDS = 8.0
+#: Variables that say how many threads a process computes with; what the operator sets goes first.
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: The end of a crashed process' log that its error carries.
 _LOG_TAIL = 2000
 
@@ -44,18 +49,18 @@ class RunningAttempt:
     def __init__(
         self,
         lease: Lease,
-        workers: int,
-        devices: Sequence[int],
+        grant: Grant,
         folder: Path,
         store: Store,
         blobs: BlobFolder,
         artifacts: Artifacts,
         settings: ServiceSettings,
+        cluster: bool,
     ) -> None:
         self.lease = lease
-        self.devices = list(devices)
-        self.slots = max(1, len(self.devices))
-        self._workers = workers
+        #: What the attempt has of the machine; it becomes less when the plan does not need everything.
+        self.grant = grant
+        self._cluster = cluster
         self._folder = folder
         self._store, self._blobs, self._artifacts, self._settings = store, blobs, artifacts, settings
         self._messages: queue.Queue[Message | None] = queue.Queue()
@@ -64,7 +69,7 @@ class RunningAttempt:
         self._deadline: float | None = None
         self._stopped = False
         self._published: dict[str, tuple[int, int]] = {}
-        self._progress_at = 0.0
+        self._progress_at = self._log_at = 0.0
         self._pending: dict[str, Any] | None = None
         self._thread = threading.Thread(target=self._run, name=lease.job_id, daemon=True)
 
@@ -117,7 +122,7 @@ class RunningAttempt:
         assert process is not None
         if self._wish == "abandon":
             return
-        self._publish(self._finished_files())
+        self._publish(self._unfinished_files() | self._grown_log(now=True))
         if last is not None and last["kind"] == "done":
             self._succeed(last["result"])
         elif self._wish == "cancel":
@@ -146,13 +151,17 @@ class RunningAttempt:
         if checkpoint is not None:
             self._artifacts.fetch(checkpoint.location, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
         parameters = JobParameters(**job.parameters)
+        if self.grant.memory is not None:
+            parameters = parameters.model_copy(update={"memory_limit": self.grant.memory})
         seconds = self._settings.checkpoint_seconds, self._settings.preview_seconds
-        Task(staged, parameters, self._workers, checkpoint is not None, *seconds).save(self._folder)
+        ranks = self.grant.ranks
+        Task(staged, parameters, ranks, self._cluster, checkpoint is not None, *seconds).save(self._folder)
 
     def _launch(self) -> None:
-        devices = ",".join(str(index) for index in self.devices)
         # a process without GPUs of its own must not see any
-        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": devices}
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "" if self._cluster else ",".join(self.grant.gpus)}
+        if self.grant.threads is not None:
+            environment = dict.fromkeys(_THREADS, str(self.grant.threads)) | environment
         with (self._folder / "log.txt").open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "service.attempt_process", str(self._folder)],
@@ -191,7 +200,7 @@ class RunningAttempt:
                 self._kill()
                 return None
             self._write_progress()
-            self._publish(self._unfinished_files())
+            self._publish(self._unfinished_files() | self._grown_log())
             self._see_to_wish()
         assert self._process is not None
         self._process.wait()
@@ -199,6 +208,8 @@ class RunningAttempt:
         return last
 
     def _hear(self, message: Message) -> None:
+        if message["kind"] == "left-out":
+            self._give_back(message["gpus"])
         if message["kind"] == "prepared":
             self._store.jobs.running(self.lease)
         if message["kind"] in ("stage", "prepared", "progress"):
@@ -213,6 +224,12 @@ class RunningAttempt:
                 "seconds": message.get("seconds"),
                 "attempt": self.lease.job.attempt,
             }
+
+    def _give_back(self, gpus: list[str]) -> None:
+        """Leave GPUs that the plan does without to other jobs."""
+        kept = tuple(gpu for gpu in self.grant.gpus if gpu not in gpus)
+        self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
+        _log.info("needs %d GPUs and gives %d back", len(kept), len(gpus), extra=self._extra)
 
     def _write_progress(self, *, now: bool = False) -> None:
         moment = time.monotonic()
@@ -255,9 +272,16 @@ class RunningAttempt:
             files |= {f"previews/{path.name}": path for path in previews.glob("step_*.jpg")}
         return files
 
-    def _finished_files(self) -> dict[str, Path]:
-        """Files that are told apart from half-written ones only once the process has ended."""
-        return {**self._unfinished_files(), "log.txt": self._folder / "log.txt"}
+    def _grown_log(self, *, now: bool = False) -> dict[str, Path]:
+        """A copy of the log as far as it is, once in a while: the process goes on writing to the log itself."""
+        log, copy = self._folder / "log.txt", self._folder / "log-so-far.txt"
+        moment = time.monotonic()
+        if not now and moment - self._log_at < self._settings.preview_seconds:
+            return {}
+        self._log_at = moment
+        if now or log.stat().st_size != (copy.stat().st_size if copy.exists() else 0):
+            shutil.copyfile(log, copy)
+        return {"log.txt": copy}
 
     def _publish(self, files: dict[str, Path]) -> None:
         """Publish those files that are new or have changed."""
@@ -277,7 +301,8 @@ class RunningAttempt:
     def _put(self, name: str, path: Path) -> Published | None:
         """Copy a file to the results; None where it has just been replaced or removed."""
         try:
-            return self._artifacts.put(self.lease.job_id, self.lease.epoch, name, path)
+            step = _saved_step(path) if name == CHECKPOINT else None
+            return replace(self._artifacts.put(self.lease.job_id, self.lease.epoch, name, path), step=step)
         except FileNotFoundError:
             return None
 
@@ -306,8 +331,7 @@ class RunningAttempt:
             self._sweep()
 
     def _sweep(self) -> None:
-        rows = self._store.jobs.artifacts(self.lease.job_id)
-        self._artifacts.sweep(self.lease.job_id, {row.location for row in rows})
+        sweep(self._store.jobs, self._artifacts, self.lease.job_id, self.lease.epoch)
 
     def _crash(self, code: int) -> dict[str, Any]:
         """What to say of a process that ended without a word."""
@@ -329,3 +353,26 @@ class RunningAttempt:
     @property
     def _extra(self) -> dict[str, Any]:
         return {"job": self.lease.job_id, "attempt": self.lease.job.attempt}
+
+
+def sweep(jobs: Jobs, artifacts: Artifacts, job_id: str, epoch: int) -> None:
+    """Remove what attempts at a job that has ended have left behind.
+
+    Args:
+        epoch: of the job's last lease.
+    """
+    artifacts.sweep(job_id, epoch, {row.location for row in jobs.artifacts(job_id)})
+    jobs.swept(job_id, epoch)
+
+
+def _saved_step(checkpoint: Path) -> int | None:
+    """The step that a checkpoint was saved at; None for one that is damaged, which the next attempt will find out.
+
+    Raises:
+        FileNotFoundError: it has just been removed.
+    """
+    try:
+        with safe_open(checkpoint, "np") as file:
+            return int(file.metadata()["step"])
+    except (SafetensorError, TypeError, KeyError):
+        return None

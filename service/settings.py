@@ -33,10 +33,12 @@ class ServiceSettings(BaseSettings):
         upload_hours: after which an unfinished upload, or a finished one that no job uses, expires.
         retention_days: after which a finished job's results expire; the job's record stays as long again.
         lease_seconds: after which another dispatcher takes a job over that has not been heard of.
-        max_attempts: of a job, before it fails for good.
+        max_attempts: of a job in a row that come no further, before it fails for good.
         retry_seconds: wait before the second attempt; doubles with each.
         parallel_jobs: jobs side by side; None: one for each GPU, or one.
-        checkpoint_seconds, preview_seconds: how often a running job saves its state, and a picture of it.
+        cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may give to jobs.
+        checkpoint_seconds: how often a running job saves its state.
+        preview_seconds: how often it shows a picture of it, and its log where that has grown.
         stop_seconds: what a job may take to stop before it is killed.
         webhooks: whether jobs may name a URL that is told when they end.
         webhook_private_addresses: whether such URLs may lead to private networks.
@@ -73,6 +75,7 @@ class ServiceSettings(BaseSettings):
     max_attempts: int = Field(3, gt=0)
     retry_seconds: float = Field(5, ge=0)
     parallel_jobs: int | None = Field(None, gt=0)
+    cluster_gpus: int = Field(0, ge=0)
     checkpoint_seconds: float = Field(60, gt=0)
     preview_seconds: float = Field(20, gt=0)
     stop_seconds: float = Field(20, gt=0)

@@ -7,9 +7,10 @@ the next attempt goes on with as many as there is room for. Errors that would co
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,6 +69,7 @@ class Listener:
         warn: what is worth knowing although the job goes on.
         stop: asked a few times a second; True ends the job as "interrupted".
         preview: path of each picture of the running job.
+        left_out: GPUs of this machine that the job has let go of, because the plan does without them.
     """
 
     prepared: Callable[[Prepared], None] = lambda prepared: None
@@ -76,6 +78,7 @@ class Listener:
     warn: Callable[[str], None] = lambda line: None
     stop: Callable[[], bool] = lambda: False
     preview: Callable[[Path], None] = lambda path: None
+    left_out: Callable[[Sequence[str]], None] = lambda gpus: None
 
 
 @dataclass
@@ -190,7 +193,7 @@ class _Job:
         self, request: StylizeRequest, workers: int, listener: Listener, options: WorkerOptions, cluster: Cluster
     ) -> None:
         self._request = request
-        self._workers = workers
+        self._asked = self._workers = workers
         self._listener = listener
         self._options = options
         self._cluster = cluster
@@ -205,6 +208,7 @@ class _Job:
         self._prepared = False
         self._warned = self._previewed = 0
         self._useless = 0  # attempts in a row without progress
+        self._let_go = False  # of GPUs that Ray still takes for its own
         self._safe_at = self._lost_at = time.monotonic()
 
     def run(self) -> RanksResult:
@@ -239,9 +243,10 @@ class _Job:
         """Start ranks and watch them to their end; None where they had to be stopped by force."""
         self._first_step, self._last_step = None, self._saved or 0
         self._warned = self._previewed = 0
-        if not self._cluster.alive():
+        if self._let_go or not self._cluster.alive():
             self._cluster.close()
             self._cluster.open()
+            self._let_go = False
         self._start()
         deadline: float | None = None
         ended: float | None = None
@@ -303,7 +308,7 @@ class _Job:
             checkpoint_seconds=self._options.checkpoint_seconds,
             preview_folder=self._options.preview_folder,
             preview_seconds=self._options.preview_seconds,
-            workers={"asked": self._workers, "attempts": [asdict(attempt) for attempt in self._attempts]},
+            workers={"asked": self._asked, "attempts": [asdict(attempt) for attempt in self._attempts]},
             seconds_lost=time.monotonic() - self._safe_at,
             seconds_since_loss=time.monotonic() - self._lost_at,
         )
@@ -335,12 +340,31 @@ class _Job:
             try:
                 rank.status = ray.get(question, timeout=START_SECONDS)
                 rank.answered = time.monotonic()
+                if rank.left_out:
+                    self._leave_out(rank)
             except ray.exceptions.ActorUnavailableError:  # perhaps only for now: the time-out decides
                 continue
             except ray.exceptions.ActorDiedError as error:
                 raise _Lost(f"{self._name(rank)} was lost: {_reason_of_death(error)}", None) from error
             except ray.exceptions.RayActorError as error:
                 raise _Lost(f"{self._name(rank)} was lost: {_first_line(error)}", None) from error
+
+    def _leave_out(self, rank: _Rank) -> None:
+        """End a rank that the plan does without, and let go of its GPU, where that is this machine's.
+
+        On a cluster its place stays reserved until the attempt ends: Ray gives places back together only.
+        """
+        import ray
+
+        assert rank.place is not None
+        if not self._cluster.local or not rank.place.gpus:
+            return
+        ray.kill(rank.actor, no_restart=True)
+        kill([rank.place.process])  # what it held of the GPU is free when it is gone
+        kept = [gpu for other in self._ranks if other.place and not other.left_out for gpu in other.place.gpus]
+        self._workers, self._let_go = len(kept), True
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)  # for the next attempt
+        self._listener.left_out(rank.place.gpus)
 
     def _show(self) -> None:
         """Pass on what rank 0 has to tell."""
@@ -431,7 +455,7 @@ class _Job:
             RanksFailedError: nothing is gained by another attempt.
         """
         self._lost_at = time.monotonic()
-        again = self._attempts and (lost.reason, self._last_step) == (
+        again = bool(self._attempts) and (lost.reason, self._last_step) == (
             self._attempts[-1].reason,
             self._attempts[-1].last_step,
         )

@@ -37,12 +37,14 @@ class Place:
         address: of the node, as others reach it.
         host: the machine's name.
         process: to end it.
+        gpus: that it was given, as CUDA_VISIBLE_DEVICES names them.
     """
 
     node: str
     address: str
     host: str
     process: ProcessId
+    gpus: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ class RankProcess:
         import ray
 
         node = ray.get_runtime_context().get_node_id()
-        return Place(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this())
+        gpus = tuple(str(name) for name in ray.get_gpu_ids())
+        return Place(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this(), gpus)
 
     def free_port(self) -> int:
         """A port on which nobody listens."""

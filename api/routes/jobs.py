@@ -221,7 +221,7 @@ async def _plan(
     context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, Path], parameters: JobParameters
 ) -> Response:
     found = await context.inspector.inspect("plan", inputs, paths, parameters)
-    view = PlanView(**found, workers=parameters.workers or 1)
+    view = PlanView(**found, workers=parameters.workers)
     return JSONResponse(view.model_dump(mode="json"))
 
 

@@ -26,7 +26,11 @@ async def livez() -> Health:
     responses={503: {"model": Health, "description": "Something that jobs need is away; `checks` says what."}},
 )
 def readyz(context: ContextDep) -> Response:
-    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room."""
+    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room.
+
+    Without a dispatcher they still can be, and wait in the queue: the answer is 200, its status `waiting` and its check
+    `dispatchers` "none". Otherwise this check tells how many are alive.
+    """
     checks: dict[str, Callable[[], None]] = {
         "database": context.store.database.ping,
         "artifacts": context.artifacts.ping,
@@ -39,9 +43,11 @@ def readyz(context: ContextDep) -> Response:
             found[name] = "ok"
         except Exception as error:  # whatever it is, the answer is that it does not work
             found[name] = f"{type(error).__name__}"
-    good = all(value == "ok" for value in found.values())
-    view = Health(status="ok" if good else "unavailable", checks=found)
-    return JSONResponse(view.model_dump(), 200 if good else 503)
+    if not all(value == "ok" for value in found.values()):
+        return JSONResponse(Health(status="unavailable", checks=found).model_dump(), 503)
+    alive = len(context.store.operations.dispatchers())
+    view = Health(status="ok" if alive else "waiting", checks={**found, "dispatchers": str(alive or "none")})
+    return JSONResponse(view.model_dump())
 
 
 @router.get("/metrics", response_class=PlainTextResponse, operation_id="metrics")

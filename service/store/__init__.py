@@ -19,7 +19,7 @@ class Store:
         self.jobs = Jobs(self.database, settings.lease_seconds, settings.max_attempts, settings.retry_seconds)
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
-        self.operations = Operations(self.database)
+        self.operations = Operations(self.database, settings.lease_seconds)
 
     def close(self) -> None:
         """Close all connections."""

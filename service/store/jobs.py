@@ -79,12 +79,13 @@ class Lease:
 
 @dataclass(frozen=True)
 class Published:
-    """A file that was put to its place, for the row that makes it visible."""
+    """A file that was put to its place, for the row that makes it visible; `step` is a checkpoint's."""
 
     name: str
     location: str
     size: int
     sha256: str
+    step: int | None = None
 
 
 class Jobs:
@@ -243,6 +244,7 @@ class Jobs:
             if (session.scalar(unfinished) or 0) >= limit:
                 raise QueueFullError(f"There are {limit} unfinished jobs of this key already.", limit=limit)
             job.status, job.queued_at, job.not_before, job.failures = "queued", now, now, 0
+            job.swept = False
             job.finished_at = job.expires_at = job.error = job.progress = None
             _say(session, job, now)
         return job
@@ -310,12 +312,16 @@ class Jobs:
                     return None
                 return self._take(session, job, dispatcher, now)
 
+    def waiting(self) -> int:
+        """How many jobs could be leased now."""
+        with self._database.reading() as session:
+            query = select(func.count()).select_from(JobRow).where(_ready(self._database.clock()))
+            return session.scalar(query) or 0
+
     @staticmethod
     def _next(now: float) -> Select[JobRow]:
-        ready = and_(JobRow.status == "queued", JobRow.not_before <= now)
-        expired = and_(JobRow.status.in_(ACTIVE), JobRow.lease_expires_at < now)
         turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
-        query = select(JobRow).outerjoin(TurnRow, TurnRow.owner == JobRow.owner).where(or_(ready, expired))
+        query = select(JobRow).outerjoin(TurnRow, TurnRow.owner == JobRow.owner).where(_ready(now))
         order = (JobRow.priority.desc(), turn, JobRow.queued_at, JobRow.id)
         return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
 
@@ -327,9 +333,9 @@ class Jobs:
         if job.status == "canceling":
             self._end(session, job, "canceled", now)
             return True
-        job.failures += 1
+        _count_failure(job)
         if job.failures >= self._max_attempts:
-            job.error = error | {"message": f"{error['message']} This happened at {job.failures} attempts."}
+            job.error = error | {"message": f"{error['message']} This was attempt {job.attempt}."}
             self._end(session, job, "failed", now)
             return True
         return False
@@ -434,6 +440,8 @@ class Jobs:
     def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool, retention: float) -> bool:
         """End an attempt that failed: the job is queued again after a wait, or failed for good.
 
+        It fails for good after so many attempts in a row that saved no later step than those before.
+
         Args:
             permanent: another attempt would fail the same way.
 
@@ -447,12 +455,12 @@ class Jobs:
             if job.status == "canceling":
                 self._end(session, job, "canceled", now, retention)
                 return False
-            job.failures += 1
+            _count_failure(job)
             job.error = error
             if permanent or job.failures >= self._max_attempts:
                 self._end(session, job, "failed", now, retention)
                 return False
-            wait = min(self._retry_seconds * 2 ** (job.failures - 1), _MAX_RETRY_SECONDS)
+            wait = min(self._retry_seconds * 2 ** max(job.failures - 1, 0), _MAX_RETRY_SECONDS)
             self._requeue(session, job, now, now + wait)
             return True
 
@@ -495,6 +503,18 @@ class Jobs:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
             return [job.id for job in due]
 
+    def unswept(self, limit: int) -> list[tuple[str, int]]:
+        """Jobs that have ended and may have left files that no row refers to, each with its last lease's epoch."""
+        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
+        with self._database.reading() as session:
+            return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
+
+    def swept(self, job_id: str, epoch: int) -> None:
+        """Note that no such files are left; a job that was queued again since is left alone."""
+        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
+        with self._database.writing() as session:
+            session.execute(update(JobRow).where(same).values(swept=True))
+
     # --- shared ----------------------------------------------------------------------------------------------------
 
     def _held(self, session: Session, lease: Lease) -> JobRow | None:
@@ -530,6 +550,21 @@ def _owned(session: Session, job_id: str, owner: str | None, *, lock: bool = Fal
     if job is None or (owner is not None and job.owner != owner):
         raise NotFoundError(f"There is no job {job_id}.")
     return job
+
+
+def _ready(now: float) -> ColumnElement[bool]:
+    """Queued and to be started, or held by a dispatcher that was not heard of again."""
+    queued = and_(JobRow.status == "queued", JobRow.not_before <= now)
+    expired = and_(JobRow.status.in_(ACTIVE), JobRow.lease_expires_at < now)
+    return or_(queued, expired)
+
+
+def _count_failure(job: JobRow) -> None:
+    """A failure counts where nothing has been saved since the last one: a long job outlives many accidents, and one
+    that breaks at the same step each time does not."""
+    progress = (job.saved_step or 0) > (job.failed_step or 0)
+    job.failures = 0 if progress else job.failures + 1
+    job.failed_step = job.saved_step
 
 
 def _position(session: Session, job: JobRow) -> int | None:
@@ -568,6 +603,8 @@ def _say(session: Session, job: JobRow, now: float) -> None:
 def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
     unused = []
     for file in files:
+        if file.step is not None:
+            job.saved_step = max(job.saved_step or 0, file.step)
         row = session.get(ArtifactRow, (job.id, file.name))
         if row is None:
             row = ArtifactRow(job_id=job.id, name=file.name)

@@ -1,4 +1,4 @@
-"""API keys, counters, secrets and webhook messages in the store."""
+"""API keys, dispatchers, counters, secrets and webhook messages in the store."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import base64
 import hashlib
 import secrets
 
-from sqlalchemy import func, select
+from sqlalchemy import delete, func, select
 
 from service.errors import NotFoundError
 from service.store.database import Database, new_id, upsert
-from service.store.tables import CounterRow, DeliveryRow, JobRow, KeyRow, SecretRow
+from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow, KeyRow, SecretRow
 
 #: What every key starts with, so that secret scanners can find one that got lost.
 KEY_PREFIX = "sgsst_"
+#: A dispatcher that was not heard of for so long is not coming back.
+_FORGET_SECONDS = 86_400.0
 
 
 def digest(key: str) -> str:
@@ -64,8 +66,30 @@ class Keys:
 class Operations:
     """What monitoring and webhooks need."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, lease_seconds: float) -> None:
         self._database = database
+        self._lease_seconds = lease_seconds
+
+    def beat(self, name: str, places: int, free: int) -> None:
+        """A dispatcher is alive, and has so much room; those that were not heard of for long are forgotten."""
+        now = self._database.clock()
+        values = {"seen_at": now, "places": places, "free": free}
+        with self._database.writing() as session:
+            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
+            insert = upsert(session)(DispatcherRow).values(name=name, **values)
+            session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))
+
+    def gone(self, name: str) -> None:
+        """A dispatcher has ended."""
+        with self._database.writing() as session:
+            session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
+
+    def dispatchers(self) -> list[DispatcherRow]:
+        """Those that are alive: heard of within a lease's time."""
+        since = self._database.clock() - self._lease_seconds
+        with self._database.reading() as session:
+            query = select(DispatcherRow).where(DispatcherRow.seen_at >= since).order_by(DispatcherRow.name)
+            return list(session.scalars(query))
 
     def counters(self) -> list[tuple[str, str, float]]:
         """Name, labels and value of every counter."""
@@ -85,10 +109,11 @@ class Operations:
             oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == "queued"))
         return 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
 
-    def running(self) -> list[JobRow]:
-        """Jobs that make steps now."""
+    def steps_and_seconds(self) -> list[tuple[int, float]]:
+        """Steps that each running job has made, and the seconds that they took."""
         with self._database.reading() as session:
-            return list(session.scalars(select(JobRow).where(JobRow.status == "running")))
+            found = session.scalars(select(JobRow.progress).where(JobRow.status == "running")).all()
+        return [(progress["step"], progress["seconds"]) for progress in found if progress and progress.get("seconds")]
 
     def webhook_secret(self) -> str:
         """The secret that signs webhooks, in the form of Standard Webhooks; made at first use."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Float, ForeignKey, Index, Integer, MetaData, String, Text
+from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 #: SQLite counts rows up by itself only for INTEGER, PostgreSQL needs BIGINT to count far enough.
@@ -26,7 +26,12 @@ class Base(DeclarativeBase):
 
 
 class JobRow(Base):
-    """A job. `lease_epoch` counts how often it was leased; every write of a dispatcher names the epoch it holds."""
+    """A job.
+
+    `lease_epoch` counts how often it was leased; every write of a dispatcher names the epoch it holds. `failures`
+    counts failed attempts in a row without progress: `saved_step` is the farthest of a checkpoint, `failed_step` what
+    it was at the last failure. `swept`: the job has ended, and no file is left that no row refers to.
+    """
 
     __tablename__ = "jobs"
 
@@ -45,6 +50,9 @@ class JobRow(Base):
     expires_at: Mapped[float | None] = mapped_column(Float)
     attempt: Mapped[int] = mapped_column(Integer, default=0)
     failures: Mapped[int] = mapped_column(Integer, default=0)
+    saved_step: Mapped[int | None] = mapped_column(Integer)
+    failed_step: Mapped[int | None] = mapped_column(Integer)
+    swept: Mapped[bool] = mapped_column(Boolean, default=False, server_default=false())
     progress: Mapped[dict[str, Any] | None]
     result: Mapped[dict[str, Any] | None]
     error: Mapped[dict[str, Any] | None]
@@ -57,6 +65,7 @@ class JobRow(Base):
         Index("ix_jobs_queue", "status", "not_before"),
         Index("ix_jobs_owner_id", "owner", "id"),
         Index("ix_jobs_expires_at", "expires_at"),
+        Index("ix_jobs_swept", "swept", "status"),
     )
 
 
@@ -73,6 +82,17 @@ class AttemptRow(Base):
     finished_at: Mapped[float | None] = mapped_column(Float)
     outcome: Mapped[str | None] = mapped_column(String(20))
     error: Mapped[dict[str, Any] | None]
+
+
+class DispatcherRow(Base):
+    """A dispatcher that is at work, when it was last heard of, and what room it has: GPUs, or places for jobs."""
+
+    __tablename__ = "dispatchers"
+
+    name: Mapped[str] = mapped_column(String(120), primary_key=True)
+    seen_at: Mapped[float] = mapped_column(Float)
+    places: Mapped[int] = mapped_column(Integer)
+    free: Mapped[int] = mapped_column(Integer)
 
 
 class TurnRow(Base):

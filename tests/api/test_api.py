@@ -7,6 +7,7 @@ import hashlib
 import json
 import socket
 import struct
+import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -447,6 +448,54 @@ def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     refused(client.get("/v1/jobs", params={"limit": 0}), 422, "invalid-request")
     refused(client.get("/v1/jobs", params={"cursor": "x"}), 422, "invalid-request")
     refused(client.get("/v1/jobs", params={"status": "x"}), 422, "invalid-request")
+
+
+def test_readiness_tells_whether_somebody_is_there_to_run_jobs(service: Service, client: httpx.Client) -> None:
+    answer = client.get("/readyz")
+    assert (answer.status_code, answer.json()["status"]) == (200, "waiting")
+    assert answer.json()["checks"] == {"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "none"}
+    store = open_store(ServiceSettings(data=service.data))
+    store.operations.beat("one", 8, 3)
+    answer = client.get("/readyz")
+    assert (answer.json()["status"], answer.json()["checks"]["dispatchers"]) == ("ok", "1")
+    metrics = client.get("/metrics").text.splitlines()
+    assert {"sgsst_dispatchers 1.0", "sgsst_places 8.0", "sgsst_places_free 3.0"} <= set(metrics)
+    store.operations.gone("one")
+    assert client.get("/readyz").json()["status"] == "waiting"
+    assert "sgsst_dispatchers 0.0" in client.get("/metrics").text
+    store.close()
+
+
+def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, bytes]) -> None:
+    with Service(tmp_path / "data", alone=True) as service, service.client() as client:
+        for _ in range(3):
+            client.post("/v1/jobs", files=form(files))
+        now = time.time()
+        store = open_store(ServiceSettings(data=service.data), lambda: now)
+        held = store.jobs.lease("lost")
+        assert held is not None
+        now += 1000
+        held = store.jobs.lease("one")
+        assert held is not None
+        store.jobs.fail(held, {"code": "x", "message": "x"}, permanent=True, retention=1000.0)
+        for step, seconds in ((30, 10.0), (8, 4.0)):
+            held = store.jobs.lease("one")
+            assert held is not None
+            store.jobs.running(held)
+            store.jobs.progress(held, {"step": step, "seconds": seconds, "total": 100})
+        text = client.get("/metrics").text
+        found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+        assert found["sgsst_lease_expirations_total"] == "1.0"
+        assert found["sgsst_attempts_total"] == "4.0"
+        assert found['sgsst_attempts_ended_total{outcome="lost"}'] == "1.0"
+        assert found['sgsst_attempts_ended_total{outcome="failed"}'] == "1.0"
+        assert found['sgsst_jobs_finished_total{status="failed"}'] == "1.0"
+        assert found['sgsst_jobs{status="running"}'] == "2.0"
+        assert found["sgsst_queue_wait_seconds_count_total"] == "4.0"
+        assert float(found["sgsst_queue_wait_seconds_sum_total"]) >= 2000
+        assert found["sgsst_iterations_per_second"] == "5.0"
+        assert "job_" not in text, "metrics name no job"
+        store.close()
 
 
 def test_metrics_and_documentation(client: httpx.Client) -> None:

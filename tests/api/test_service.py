@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psutil
 import pytest
 
 from api.client import AsyncClient, Client
@@ -108,6 +109,8 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         assert statuses == ["queued", "starting", "running", "succeeded"]
         assert kinds.index(("artifact", "plan.json")) < kinds.index(("status", "succeeded"))
         assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
+        last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
+        assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
         steps = [data["step"] for _, kind, data in seen if kind == "progress"]
         assert steps == sorted(steps)
         assert steps[-1] == STEPS
@@ -241,6 +244,27 @@ def test_a_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
         log = client.get(f"/v1/jobs/{job_id}/artifacts/log.txt").text
         assert found["status"] == "succeeded", log
         assert found["result"]["steps"] == 4
+
+
+def test_jobs_side_by_side_share_cores_and_memory(files: dict[str, Path], tmp_path: Path) -> None:
+    with Service(tmp_path / "data", SGSST_PARALLEL_JOBS="2") as service, service.client() as client:
+        jobs = [submit(client, files, name=name) for name in ("one", "two", "three")]
+        for job_id in jobs[:2]:
+            wait_for_step(service, client, job_id, 1)
+        assert [job(client, job_id)["status"] for job_id in jobs] == ["running", "running", "queued"]
+        tasks = [json.loads(path.read_text()) for path in service.data.glob("work/*/*/task.json")]
+        limits = [task["parameters"]["memory_limit"] for task in tasks]
+        assert len(limits) == 2
+        assert 0 < sum(limits) <= 0.8 * psutil.virtual_memory().total
+        threads = [process.environ()["MKL_NUM_THREADS"] for process in service.processes("service.attempt_process")]
+        assert set(threads) == {str(max(1, (os.cpu_count() or 1) // 2))}
+        wait_for(lambda: "sgsst_places_free 0.0" in client.get("/metrics").text, "no place to be free", service.said)
+        ready = client.get("/readyz").json()
+        assert (ready["status"], ready["checks"]["dispatchers"]) == ("ok", "1")
+        for job_id in jobs:
+            client.post(f"/v1/jobs/{job_id}/cancel")
+        for job_id in jobs:
+            wait_until(service, client, job_id, "canceled")
 
 
 def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, Path]) -> None:

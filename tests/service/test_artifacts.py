@@ -30,9 +30,10 @@ def test_a_file_comes_back_whole_and_in_parts(artifacts: Artifacts, tmp_path: Pa
 def test_what_no_row_refers_to_is_swept(artifacts: Artifacts, tmp_path: Path) -> None:
     source = tmp_path / "plan.json"
     source.write_bytes(b"{}")
-    old, new = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2))
+    old, new, later = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2, 10))
     other = artifacts.put("job_2", 1, "plan.json", source)
-    artifacts.sweep("job_1", {new.location})
+    artifacts.sweep("job_1", 2, {new.location})
+    assert b"".join(artifacts.read(later.location, 0, 2)) == b"{}", "of a lease whose rows are still to come"
     assert b"".join(artifacts.read(new.location, 0, 2)) == b"{}"
     with pytest.raises(FileNotFoundError):
         list(artifacts.read(old.location, 0, 2))

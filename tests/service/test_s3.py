@@ -90,7 +90,7 @@ def test_files_that_no_row_refers_to_are_swept(artifacts: Artifacts, tmp_path: P
     source = write(tmp_path, 10)
     kept, lost = (artifacts.put("job_1", epoch, "stylized.ply", source) for epoch in (2, 1))
     other = artifacts.put("job_10", 1, "stylized.ply", source)
-    artifacts.sweep("job_1", {kept.location})
+    artifacts.sweep("job_1", 9, {kept.location})
     assert b"".join(artifacts.read(kept.location, 0, 10)) == source.read_bytes()
     with pytest.raises(FileNotFoundError):
         list(artifacts.read(lost.location, 0, 10))
@@ -108,11 +108,11 @@ def test_another_process_sees_what_was_put_since_it_looked(
     """fsspec keeps listings of folders; what one process puts, another one has to find nevertheless."""
     source = write(tmp_path, 10)
     first = artifacts.put("job_1", 1, "plan.json", source)
-    artifacts.sweep("job_1", {first.location})
+    artifacts.sweep("job_1", 9, {first.location})
     late = f"{environment['AWS_ENDPOINT_URL']}/results/{prefix}/job_1/2/x/late"
     assert httpx.put(late, content=b"0123456789").status_code == 200
     assert b"".join(artifacts.read("job_1/2/x/late", 0, 10)) == b"0123456789"
-    artifacts.sweep("job_1", {first.location})
+    artifacts.sweep("job_1", 9, {first.location})
     assert httpx.head(late).status_code == 404
 
 

@@ -21,7 +21,7 @@ from sqlalchemy import inspect
 from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.database import create_all
+from service.store.database import MIGRATIONS, create_all
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import ACTIVE, FINISHED, KEPT_PROGRESS, Idempotency, Lease, NewJob, Published
 from service.store.tables import Base
@@ -254,6 +254,120 @@ def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> No
         clock.now += 0.2
     assert not store.jobs.fail(lease(store), error, permanent=False, retention=1.0)
     assert store.jobs.get(job_id, "local").status == "failed"
+
+
+def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False) -> bool:
+    """An attempt that saves a step and fails; whether the job is tried again."""
+    clock.now += 1000
+    held = lease(store)
+    if saved is not None:
+        store.jobs.publish(held, [Published(".checkpoint", f"x/{held.epoch}", 1, SHA, step=saved)])
+    if not lost:
+        return store.jobs.fail(held, {"code": "x", "message": "x"}, permanent=False, retention=1.0)
+    clock.now += LEASE + 1
+    again = store.jobs.lease("two")
+    if again is not None:
+        store.jobs.release(again)
+    return again is not None
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_long_job_outlives_accidents_between_which_it_comes_on(store: Store, clock: Clock, lost: bool) -> None:
+    queue(store)
+    for step in range(10, 100, 10):
+        assert fail_at(store, clock, step, lost=lost)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_job_that_always_breaks_at_the_same_step_is_given_up(store: Store, clock: Clock, lost: bool) -> None:
+    job_id = queue(store)
+    assert fail_at(store, clock, None, lost=lost)
+    assert fail_at(store, clock, 90, lost=lost), "this one came on"
+    # each attempt publishes the checkpoint that it begins with once more, or an older one where it begins anew
+    assert fail_at(store, clock, 90, lost=lost)
+    assert fail_at(store, clock, 10, lost=lost)
+    assert not fail_at(store, clock, 90, lost=lost)
+    assert store.jobs.get(job_id, "local").status == "failed"
+    store.jobs.retry(job_id, "local", limit=1)
+    assert [fail_at(store, clock, 90, lost=lost) for _ in range(ATTEMPTS)] == [True, True, False]
+
+
+def test_what_was_saved_before_a_shutdown_is_progress_too(store: Store, clock: Clock) -> None:
+    queue(store)
+    assert [fail_at(store, clock, None) for _ in range(ATTEMPTS - 1)] == [True, True]
+    clock.now += 1000
+    held = lease(store)
+    store.jobs.publish(held, [Published(".checkpoint", "x", 1, SHA, step=5)])
+    store.jobs.release(held)
+    assert [fail_at(store, clock, None) for _ in range(ATTEMPTS + 1)] == [True, True, True, False]
+
+
+def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
+    error = {"code": "x", "message": "x"}
+    jobs = []
+    for _ in range(3):
+        jobs.append(queue(store))
+        clock.now += 1
+    first, second, third = jobs
+    store.jobs.succeed(lease(store), [], {}, 1000.0)
+    store.jobs.fail(lease(store), error, permanent=True, retention=1000.0)
+    assert sorted(store.jobs.unswept(10)) == [(first, 1), (second, 1)]
+    assert len(store.jobs.unswept(1)) == 1
+    store.jobs.swept(first, 1)
+    store.jobs.swept(third, 0)
+    assert store.jobs.unswept(10) == [(second, 1)]
+    store.jobs.retry(second, "local", limit=10)
+    store.jobs.swept(second, 1)  # too late: it is not at its end any more
+    store.jobs.cancel(third, "local")
+    store.jobs.succeed(lease(store), [], {}, 1000.0)
+    assert sorted(store.jobs.unswept(10)) == [(second, 2), (third, 0)]
+    store.jobs.swept(second, 1)  # of an earlier lease
+    assert sorted(store.jobs.unswept(10)) == [(second, 2), (third, 0)]
+    store.jobs.swept(second, 2)
+    store.jobs.swept(third, 0)
+    assert store.jobs.unswept(10) == []
+    store.jobs.retry(third, "local", limit=10)
+    store.jobs.succeed(lease(store), [], {}, 1000.0)
+    assert store.jobs.unswept(10) == [(third, 1)], "it has run again since"
+
+
+def test_dispatchers_are_alive_as_long_as_they_are_heard_of(store: Store, clock: Clock) -> None:
+    operations = store.operations
+    operations.beat("one", 8, 8)
+    clock.now += LEASE / 2
+    operations.beat("two", 4, 0)
+    operations.beat("one", 8, 3)
+    assert [(row.name, row.places, row.free) for row in operations.dispatchers()] == [("one", 8, 3), ("two", 4, 0)]
+    operations.gone("one")
+    assert [row.name for row in operations.dispatchers()] == ["two"]
+    clock.now += LEASE + 1
+    assert operations.dispatchers() == []
+    clock.now += 2 * 86_400
+    operations.beat("three", 1, 1)
+    with store.database.reading() as session:
+        assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
+
+
+def test_the_migrations_keep_what_is_there(database: str | None, tmp_path: Path) -> None:
+    from alembic import command
+    from alembic.config import Config
+
+    settings = _settings(tmp_path, database)
+    first = Store(settings)
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    config.attributes["engine"] = first.database.engine
+    command.upgrade(config, "0001")
+    old = "id, owner, name, status, priority, parameters, inputs, created_at, queued_at, not_before, attempt, failures"
+    values = "'job_1', 'me', '', 'failed', 0, '{}', '[]', 1, 1, 1, 3, 3"
+    with first.database.writing() as session:
+        session.connection().exec_driver_sql(f"INSERT INTO jobs ({old}, lease_epoch) VALUES ({values}, 4)")
+    first.close()
+    store = open_store(settings)
+    job = store.jobs.get("job_1", "me")
+    assert (job.failures, job.saved_step, job.failed_step, job.swept) == (3, None, None, False)
+    assert store.jobs.unswept(10) == [("job_1", 4)]
+    store.close()
 
 
 def test_release_does_not_count_as_failure(store: Store) -> None:

@@ -1,0 +1,33 @@
+"""Dispatchers tell that they are alive; jobs know how far they came before they failed, and whether they are swept."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0002"
+down_revision = "0001"
+
+
+def upgrade() -> None:
+    """Add them."""
+    op.create_table(
+        "dispatchers",
+        sa.Column("name", sa.String(length=120), nullable=False),
+        sa.Column("seen_at", sa.Float(), nullable=False),
+        sa.Column("places", sa.Integer(), nullable=False),
+        sa.Column("free", sa.Integer(), nullable=False),
+        sa.PrimaryKeyConstraint("name", name=op.f("pk_dispatchers")),
+    )
+    op.add_column("jobs", sa.Column("saved_step", sa.Integer(), nullable=True))
+    op.add_column("jobs", sa.Column("failed_step", sa.Integer(), nullable=True))
+    op.add_column("jobs", sa.Column("swept", sa.Boolean(), nullable=False, server_default=sa.false()))
+    op.create_index("ix_jobs_swept", "jobs", ["swept", "status"], unique=False)
+
+
+def downgrade() -> None:
+    """Remove them."""
+    op.drop_index("ix_jobs_swept", table_name="jobs")
+    for column in ("swept", "failed_step", "saved_step"):
+        op.drop_column("jobs", column)
+    op.drop_table("dispatchers")
