@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from http import HTTPStatus
-from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -50,17 +49,25 @@ class Problem(BaseModel):
     detail: str = Field(description="What was wrong and what to do, for people.")
 
 
-#: For the OpenAPI document: what every route may answer with.
-RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {
-        "description": "The request cannot be served; `code` says why.",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    },
-    "5XX": {
-        "description": "The service cannot do it now.",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    },
-}
+class MalformedRequestError(ServiceError):
+    """Bytes that are no HTTP request; said by `api.connection`, below the app."""
+
+    code, status = "malformed-request", 400
+
+
+class HeadTooLargeError(ServiceError):
+    """A request's line and headers without end; said by `api.connection`, below the app."""
+
+    code, status = "head-too-large", 431
+
+
+class InternalError(ServiceError):
+    """A fault of the service itself."""
+
+    code, status = "internal", 500
+
+    def __init__(self) -> None:
+        super().__init__("Something went wrong on the service's side; its log says what.")
 
 
 def problem(
@@ -121,4 +128,4 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     _log.exception("%s %s broke", request.method, request.url.path, exc_info=error)
-    return problem(500, "internal", "Something went wrong on the service's side; its log says what.")
+    return from_service(InternalError())

@@ -18,7 +18,7 @@ import pytest
 
 from service.settings import ServiceSettings
 from service.store import open_store
-from tests.api.service import Service, wait_for
+from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
 
 MB = 1_000_000
@@ -69,6 +69,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
     """The problem document, after a look at its form."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
+    check_documented(answer)
     problem: dict[str, Any] = answer.json()
     assert (problem["status"], problem["code"]) == (status, code), problem
     assert problem["title"]
