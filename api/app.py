@@ -18,7 +18,7 @@ from api.context import Context
 from api.documentation import complete
 from api.hub import Hub
 from api.metrics import Metrics
-from api.problems import Problem, add_handlers
+from api.problems import METHODS, Problem, add_handlers
 from api.routes import artifacts, events, jobs, operations, uploads
 from api.submission import JobFromUploads
 from api.views import ANSWERS
@@ -105,13 +105,10 @@ class Observed:
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "(none)")
-        method = scope["method"] if scope["method"] in _METHODS else "(other)"
+        method = scope["method"] if scope["method"] in METHODS else "(other)"
         self._state.context.metrics.observe(method, route, status, seconds)
         extra = {"method": scope["method"], "path": scope["path"], "status": status, "seconds": round(seconds, 4)}
         _access.info("request", extra=extra)
-
-
-_METHODS = {"GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS"}
 
 
 def _version() -> str:

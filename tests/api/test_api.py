@@ -442,7 +442,9 @@ def _answers(url: str) -> bool:
 
 def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     refused(client.get("/v1/nothing"), 404, "not-found")
-    refused(client.put("/v1/jobs"), 405, "method-not-allowed")
+    answer = client.put("/v1/jobs")
+    refused(answer, 405, "method-not-allowed")
+    assert answer.headers["allow"] == "GET, POST"
     for job_id in ("job_00000000000", "../x", "job_' OR 1=1", "a" * 5000):
         assert client.get(f"/v1/jobs/{job_id}").status_code == 404
     refused(client.get("/v1/jobs", params={"limit": 0}), 422, "invalid-request")
