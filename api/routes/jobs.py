@@ -293,7 +293,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
         **problems(
             _NOT_THERE,
             ConflictError(
-                "The job has status running. Cancel it first, and delete it once it has ended.", job_status="running"
+                "The job has status running. Cancel it first; delete it once it has ended.", job_status="running"
             ),
         ),
     },

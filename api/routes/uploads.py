@@ -63,7 +63,15 @@ class LockedError(ServiceError):
 
 
 UploadId = Annotated[str, Path(description="Of an upload.", examples=[UPLOAD_ID])]
-Tus = Annotated[str, Header(alias="Tus-Resumable", description="The protocol's version.", examples=[VERSION])]
+Tus = Annotated[
+    str,
+    Header(
+        alias="Tus-Resumable",
+        description="The protocol's version.",
+        examples=[VERSION],
+        json_schema_extra={"const": VERSION},
+    ),
+]
 LengthHeader = Annotated[
     int, Header(alias="Upload-Length", ge=0, lt=2**60, description="Bytes of the whole file.", examples=[42301])
 ]

@@ -440,6 +440,18 @@ def _answers(url: str) -> bool:
         return False
 
 
+def test_a_stream_with_nothing_left_to_tell(client: httpx.Client, files: dict[str, bytes]) -> None:
+    """Of a job that has ended, after its last event or one that never was: it would not end."""
+    job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
+    client.post(f"/v1/jobs/{job_id}/cancel")
+    told = client.get(f"/v1/jobs/{job_id}/events").text
+    last = max(int(line.removeprefix("id: ")) for line in told.splitlines() if line.startswith("id: "))
+    for number in (last, last + 1, 10**15):
+        answer = client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(number)})
+        assert answer.status_code == 204
+    assert client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(last - 1)}).status_code == 200
+
+
 def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     refused(client.get("/v1/nothing"), 404, "not-found")
     answer = client.put("/v1/jobs")
