@@ -16,6 +16,8 @@ import httpx
 import psutil
 import pytest
 
+from api.serve import ServeError, serve
+from service.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import Service, check_documented, wait_for
@@ -409,6 +411,24 @@ def test_keys_are_needed_where_others_can_reach_the_service(tmp_path: Path) -> N
     with Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service, service.client() as client:
         refused(client.get("/v1/jobs"), 401, "unauthorized")
         assert client.get("/livez").status_code == 200
+
+
+def test_nobody_else_is_let_in_before_there_is_a_key(tmp_path: Path) -> None:
+    with pytest.raises(ServeError, match="there is no API key yet"):
+        serve(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
+
+
+def test_half_files_of_a_dead_process_are_collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(ServiceSettings(data=tmp_path))
+    blobs = BlobFolder(tmp_path, store.inputs, 0)
+    half = blobs.incoming / "half.part"
+    half.write_bytes(b"x")
+    blobs.collect()
+    assert half.exists(), "it may still be written to"
+    monkeypatch.setattr("service.blobs._ORPHAN_SECONDS", -1.0)  # no file's age can be made up: it is that of its name
+    blobs.collect()
+    assert not half.exists()
+    store.close()
 
 
 def test_limits_of_a_key_and_of_the_disk(tmp_path: Path, files: dict[str, bytes]) -> None:
