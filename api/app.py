@@ -15,14 +15,16 @@ from fastapi.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.context import Context
+from api.documentation import complete
 from api.hub import Hub
 from api.metrics import Metrics
-from api.problems import Problem, add_handlers
+from api.problems import METHODS, Problem, add_handlers
 from api.routes import artifacts, events, jobs, operations, uploads
+from api.submission import JobFromUploads
+from api.views import ANSWERS
 from service.artifacts import Artifacts
 from service.blobs import BlobFolder
 from service.inspection import Inspector
-from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
 
@@ -74,27 +76,11 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     def openapi() -> dict[str, Any]:
         if not app.openapi_schema:
-            _complete(plain())
+            complete(plain(), (Problem, JobFromUploads, *ANSWERS))
         return app.openapi_schema or {}
 
     app.openapi = openapi  # type: ignore[method-assign]
     return app
-
-
-def _complete(document: dict[str, Any]) -> None:
-    """Add what routes refer to without taking it as an argument; errors are described as what they are."""
-    from api.routes.jobs import JobFromUploads
-
-    schemas = document["components"]["schemas"]
-    for model in (Problem, JobFromUploads, JobParameters):
-        made = model.model_json_schema(ref_template="#/components/schemas/{model}")
-        schemas |= made.pop("$defs", {})
-        schemas[model.__name__] = made
-    for path in document["paths"].values():
-        for operation in path.values():
-            operation["responses"].pop("422", None)  # FastAPI's own form; ours is 4XX
-    for unused in ("HTTPValidationError", "ValidationError"):
-        schemas.pop(unused, None)
 
 
 class Observed:
@@ -119,13 +105,10 @@ class Observed:
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "(none)")
-        method = scope["method"] if scope["method"] in _METHODS else "(other)"
+        method = scope["method"] if scope["method"] in METHODS else "(other)"
         self._state.context.metrics.observe(method, route, status, seconds)
         extra = {"method": scope["method"], "path": scope["path"], "status": status, "seconds": round(seconds, 4)}
         _access.info("request", extra=extra)
-
-
-_METHODS = {"GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS"}
 
 
 def _version() -> str:

@@ -4,16 +4,16 @@ request's head."""
 from __future__ import annotations
 
 import asyncio
+from http import HTTPStatus
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from api.problems import HeadTooLargeError, MalformedRequestError, from_service
+from service.errors import ServiceError
+
 #: Bytes of a request's line and headers, counted in the pieces in which they come.
 MAX_HEAD_BYTES = 1 << 17
-_TOO_LARGE = (
-    b'{"type":"about:blank","title":"Request Header Fields Too Large","status":431,"code":"head-too-large",'
-    b'"detail":"The request\'s line and headers are too long."}'
-)
 
 
 class Connection(HttpToolsProtocol):
@@ -48,7 +48,7 @@ class Connection(HttpToolsProtocol):
             return  # all or some of it was no part of a head that is still open
         self._head_bytes += len(data)
         if self._head_bytes > MAX_HEAD_BYTES:
-            self._refuse()
+            self._refuse(HeadTooLargeError(f"The request's line and headers have more than {MAX_HEAD_BYTES:,} bytes."))
         elif self._head_timer is None:
             self._start()
 
@@ -80,10 +80,15 @@ class Connection(HttpToolsProtocol):
         elif not self.transport.is_closing():
             self.transport.close()
 
-    def _refuse(self) -> None:
-        head = (
-            "HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-type: application/problem+json\r\n"
-            f"content-length: {len(_TOO_LARGE)}\r\nconnection: close\r\n\r\n"
-        )
-        self.transport.write(head.encode() + _TOO_LARGE)
+    def send_400_response(self, msg: str) -> None:
+        """Say that it is no HTTP, as a problem document: uvicorn's own answer is plain text."""
+        self._refuse(MalformedRequestError(f"{msg} Its first line, a header or a chunk is not as HTTP has it."))
+
+    def _refuse(self, error: ServiceError) -> None:
+        """Answer below the app, and close; where an answer is on its way already, only close."""
+        if self.cycle is None or self.cycle.response_complete or not self.cycle.response_started:
+            answer = from_service(error)
+            lines = [f"HTTP/1.1 {error.status} {HTTPStatus(error.status).phrase}".encode()]
+            lines += [name + b": " + value for name, value in (*answer.raw_headers, (b"connection", b"close"))]
+            self.transport.write(b"\r\n".join(lines) + b"\r\n\r\n" + bytes(answer.body))
         self.transport.close()

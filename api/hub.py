@@ -68,8 +68,11 @@ class Hub:
 
     async def ended(self, job_id: str, after: int) -> bool:
         """Whether there is nothing to tell after that event, and never will be."""
-        rows = await asyncio.to_thread(self._store.jobs.events, job_id, after - 1, 2)
-        return len(rows) == 1 and rows[0].id == after and _item(rows[0]).ends
+        last = (await asyncio.to_thread(self._store.jobs.last_events, [job_id])).get(job_id)
+        if last is None or last > after:
+            return False
+        rows = await asyncio.to_thread(self._store.jobs.events, job_id, last - 1, 1)
+        return bool(rows) and _item(rows[0]).ends
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
         """Events of a job after one, as text, until the job has ended."""

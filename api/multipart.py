@@ -26,8 +26,8 @@ from sgsst_core.ply_header import read_header
 #: Bytes of a text field, which is JSON of parameters or an id.
 _MAX_TEXT = 1 << 16
 _TEXT_FIELDS = ("parameters", "webhook")
-#: Bytes of all headers of one part: its role and its file's name.
-_MAX_HEAD = 1 << 14
+#: Of one part, and bytes of each of them: they tell its role and its file's name.
+_MAX_HEADERS, _MAX_HEADER = 8, 4224
 #: What comes is gathered to blocks of this size: each is one step to another thread and back.
 _BLOCK = 1 << 18
 #: Bytes per second at which a body comes at least, once it has come for longer than it may stand still.
@@ -164,7 +164,7 @@ class _Form:
         self.received = Received()
         self._blobs, self._settings = blobs, settings
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
-        self._head_bytes = self._parts = 0
+        self._parts = 0
         self._headers: dict[bytes, bytes] = {}
         self._role = self._name = ""
         self._file: Receiver | None = None
@@ -173,8 +173,8 @@ class _Form:
         self._closed: list[Receiver] = []
         callbacks: dict[str, Callable[..., None]] = {
             "on_part_begin": self._begin,
-            "on_header_field": lambda data, start, end: self._head(0, data[start:end]),
-            "on_header_value": lambda data, start, end: self._head(1, data[start:end]),
+            "on_header_field": lambda data, start, end: self._header[0].extend(data[start:end]),
+            "on_header_value": lambda data, start, end: self._header[1].extend(data[start:end]),
             "on_header_end": self._header_end,
             "on_headers_finished": self._open,
             "on_part_data": self._data,
@@ -182,7 +182,12 @@ class _Form:
             "on_end": self._finished,
         }
         try:
-            self._parser = MultipartParser(boundary, callbacks)  # type: ignore[arg-type]
+            self._parser = MultipartParser(
+                boundary,
+                callbacks,  # type: ignore[arg-type]
+                max_header_count=_MAX_HEADERS,
+                max_header_size=_MAX_HEADER,
+            )
         except FormParserError as error:
             raise BadRequestError(f"The multipart boundary cannot be used: {error}.") from error
 
@@ -209,14 +214,7 @@ class _Form:
         if self._parts > self._settings.max_photos + MAX_CAMERA_FILES + 2 + len(_TEXT_FIELDS):
             raise RefusedInputError(f"There are more than {self._parts - 1} fields.", "too-many-files")
         self._headers = {}
-        self._head_bytes = 0
         self._clear_header()
-
-    def _head(self, which: int, data: bytes) -> None:
-        self._head_bytes += len(data)
-        if self._head_bytes > _MAX_HEAD:
-            raise BadRequestError(f"The headers of a part have more than {_MAX_HEAD} bytes.")
-        self._header[which].extend(data)
 
     def _clear_header(self) -> None:
         self._header[0].clear()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from http import HTTPStatus
-from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from service.errors import ServiceError
 from sgsst_core.errors import InvalidInputError
@@ -18,6 +18,7 @@ from sgsst_core.errors import InvalidInputError
 MEDIA_TYPE = "application/problem+json"
 #: 460 is the tus protocol's own.
 _TITLES = {460: "Checksum Mismatch"}
+METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
 #: Letters of an input value that a problem repeats.
 _SHOWN = 100
 
@@ -50,17 +51,25 @@ class Problem(BaseModel):
     detail: str = Field(description="What was wrong and what to do, for people.")
 
 
-#: For the OpenAPI document: what every route may answer with.
-RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {
-        "description": "The request cannot be served; `code` says why.",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    },
-    "5XX": {
-        "description": "The service cannot do it now.",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    },
-}
+class MalformedRequestError(ServiceError):
+    """Bytes that are no HTTP request; said by `api.connection`, below the app."""
+
+    code, status = "malformed-request", 400
+
+
+class HeadTooLargeError(ServiceError):
+    """A request's line and headers without end; said by `api.connection`, below the app."""
+
+    code, status = "head-too-large", 431
+
+
+class InternalError(ServiceError):
+    """A fault of the service itself."""
+
+    code, status = "internal", 500
+
+    def __init__(self) -> None:
+        super().__init__("Something went wrong on the service's side; its log says what.")
 
 
 def problem(
@@ -116,9 +125,19 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     code = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http-error")
-    return problem(error.status_code, code, str(error.detail), dict(error.headers or {}))
+    headers = dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(_allowed(request))  # the router names those of the first route alone
+    return problem(error.status_code, code, str(error.detail), headers)
+
+
+def _allowed(request: Request) -> list[str]:
+    """The methods that some route of this path has."""
+    routes = request.app.router.routes
+    scopes = {method: {**request.scope, "method": method} for method in METHODS}
+    return [method for method in METHODS if any(route.matches(scopes[method])[0] is Match.FULL for route in routes)]
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     _log.exception("%s %s broke", request.method, request.url.path, exc_info=error)
-    return problem(500, "internal", "Something went wrong on the service's side; its log says what.")
+    return from_service(InternalError())

@@ -15,10 +15,34 @@ from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 StatusName = Literal["queued", "starting", "running", "canceling", "succeeded", "failed", "canceled", "expired"]
 
 
+#: Of the examples, which tell of one job.
+JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
+UPLOAD_ID = "upl_1a1fe701a104f943e9d4d8cce5b818c"
+SHA256 = "3158b524aebf9351a4de9039a6b9b799cfc0452d9cec424a9f867085d0a9a7b5"
+_CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
+
+
+def _shown(**example: Any) -> ConfigDict:
+    """An example for the OpenAPI document."""
+    return ConfigDict(json_schema_extra={"examples": [example]})
+
+
+def _example(model: type[BaseModel]) -> dict[str, Any]:
+    """The example of a model, as a part of another's."""
+    extra = model.model_config["json_schema_extra"]
+    assert isinstance(extra, dict)
+    return extra["examples"][0]  # type: ignore[index, return-value]
+
+
 class ErrorView(BaseModel):
     """Why a job or an attempt failed."""
 
-    model_config = ConfigDict(extra="allow")
+    model_config = ConfigDict(
+        extra="allow",
+        json_schema_extra={
+            "examples": [{"code": "diverged", "message": "Step 41: the loss is not finite. Lower the learning rate."}]
+        },
+    )
 
     code: str
     message: str
@@ -27,22 +51,16 @@ class ErrorView(BaseModel):
 class ProgressView(BaseModel):
     """How far a job is."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "stage": "sos",
-                    "step": 120,
-                    "total": 300,
-                    "fraction": 0.4,
-                    "eta_s": 310.5,
-                    "loss": 23729174.8,
-                    "seconds": 205.1,
-                    "attempt": 1,
-                    "updated_at": "2026-11-21T14:09:30.532514Z",
-                }
-            ]
-        }
+    model_config = _shown(
+        stage="sos",
+        step=120,
+        total=300,
+        fraction=0.4,
+        eta_s=310.5,
+        loss=23729174.8,
+        seconds=205.1,
+        attempt=1,
+        updated_at=_NOW,
     )
 
     stage: str = Field(description="`reading`, `starting`, `coarse` (coarsest scale) or `sos` (all scales).")
@@ -59,6 +77,8 @@ class ProgressView(BaseModel):
 class InputView(BaseModel):
     """A file that a job was created from."""
 
+    model_config = _shown(role="scene", name="scene.ply", size=42301, sha256=SHA256)
+
     role: Literal["scene", "style", "cameras", "photos"]
     name: str
     size: int
@@ -67,6 +87,8 @@ class InputView(BaseModel):
 
 class AttemptView(BaseModel):
     """One attempt at a job."""
+
+    model_config = _shown(number=1, started_at=_STARTED, finished_at=None, outcome=None, error=None)
 
     number: int
     started_at: datetime
@@ -80,6 +102,13 @@ class AttemptView(BaseModel):
 class Links(BaseModel):
     """Where to go on."""
 
+    model_config = _shown(
+        self=f"/v1/jobs/{JOB_ID}",
+        events=f"/v1/jobs/{JOB_ID}/events",
+        artifacts=f"/v1/jobs/{JOB_ID}/artifacts",
+        result=None,
+    )
+
     self: str
     events: str
     artifacts: str
@@ -89,7 +118,28 @@ class Links(BaseModel):
 class JobView(BaseModel):
     """A job."""
 
-    id: str = Field(examples=["job_1a1fe701a104f943e9d4d8cce5b818c"])
+    model_config = _shown(
+        id=JOB_ID,
+        name="plush",
+        status="running",
+        created_at=_CREATED,
+        started_at=_STARTED,
+        finished_at=None,
+        expires_at=None,
+        attempt=1,
+        queue_position=None,
+        progress=_example(ProgressView),
+        result=None,
+        error=None,
+        parameters={"name": "plush", "preset": "standard"},
+        inputs=[
+            _example(InputView),
+            {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]},
+        ],
+        links=_example(Links),
+    )
+
+    id: str
     name: str
     status: StatusName
     created_at: datetime
@@ -109,11 +159,15 @@ class JobView(BaseModel):
 class JobDetail(JobView):
     """A job with its attempts."""
 
+    model_config = _shown(**_example(JobView), attempts=[_example(AttemptView)])
+
     attempts: list[AttemptView]
 
 
 class JobPage(BaseModel):
     """A page of jobs, the newest first."""
+
+    model_config = _shown(jobs=[_example(JobView)], next_cursor=JOB_ID)
 
     jobs: list[JobView]
     next_cursor: str | None = Field(description="For the next page; null on the last one.")
@@ -122,7 +176,16 @@ class JobPage(BaseModel):
 class ArtifactView(BaseModel):
     """A file that a job has made."""
 
-    name: str = Field(examples=["stylized.ply"])
+    model_config = _shown(
+        name="stylized.ply",
+        size=42301,
+        sha256=SHA256,
+        media_type="application/octet-stream",
+        created_at=_NOW,
+        url=f"/v1/jobs/{JOB_ID}/artifacts/stylized.ply",
+    )
+
+    name: str
     size: int
     sha256: str
     media_type: str
@@ -133,13 +196,25 @@ class ArtifactView(BaseModel):
 class ArtifactList(BaseModel):
     """All files that a job has made so far."""
 
+    model_config = _shown(artifacts=[_example(ArtifactView)])
+
     artifacts: list[ArtifactView]
 
 
 class UploadView(BaseModel):
     """A file that arrives in parts."""
 
-    id: str = Field(examples=["upl_1a1fe701a104f943e9d4d8cce5b818c"])
+    model_config = _shown(
+        id=UPLOAD_ID,
+        filename="scene.ply",
+        length=42301,
+        offset=16384,
+        complete=False,
+        sha256=None,
+        expires_at="2026-11-22T14:02:11.332514Z",
+    )
+
+    id: str
     filename: str
     length: int
     offset: int
@@ -150,6 +225,32 @@ class UploadView(BaseModel):
 
 class PlanView(BaseModel):
     """What a job would do; nothing was queued."""
+
+    model_config = _shown(
+        gaussians=616,
+        dropped=0,
+        sh_degree=0,
+        views=3,
+        pixels=9216,
+        style=[80, 96],
+        photos=0,
+        workers=1,
+        estimated_seconds=12.4,
+        memory_bytes=946495488,
+        plan={
+            "version": 1,
+            "decisions": [
+                {
+                    "item": "network layers",
+                    "decision": "none behind relu5_1, the deepest one used",
+                    "reason": "the loss reads no deeper one",
+                    "seconds": None,
+                    "bytes": None,
+                    "error": "none",
+                }
+            ],
+        },
+    )
 
     gaussians: int
     dropped: int
@@ -167,10 +268,15 @@ class PlanView(BaseModel):
 class Health(BaseModel):
     """Whether the service can do its work."""
 
+    model_config = _shown(status="ok", checks={"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "1"})
+
     status: Literal["ok", "waiting", "unavailable"] = Field(
         description="`waiting`: jobs are taken in, but nobody is there to run them yet."
     )
     checks: dict[str, str]
+
+
+ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health)
 
 
 def _time(seconds: float) -> datetime:

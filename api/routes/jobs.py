@@ -6,25 +6,25 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
 
 from api.context import Caller, CallerDep, Context, ContextDep, is_id
+from api.documentation import headers, invalid, links, problems
 from api.multipart import BadRequestError, Received, body_blocks, check_file, parse_json, receive
-from api.problems import RESPONSES
-from api.views import JobDetail, JobPage, JobView, PlanView, StatusName, job_detail, job_view, poll_seconds
-from service.errors import NotFoundError, RefusedInputError, TooLargeError
+from api.submission import BODY, REFUSALS, JobFromUploads
+from api.views import JOB_ID, JobDetail, JobPage, JobView, PlanView, StatusName, job_detail, job_view, poll_seconds
+from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError, TooLargeError
 from service.parameters import JobParameters
 from service.staging import check_roles, clean_name
 from service.store.jobs import Idempotency, NewJob
 from service.store.tables import JobRow, UploadRow
 from service.webhooks import check_url
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=RESPONSES)
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 #: Bytes of a JSON body, which only names uploads.
 _MAX_JSON = 1 << 20
 
@@ -35,84 +35,36 @@ IdempotencyHeader = Annotated[
         min_length=1,
         max_length=180,
         description="The same request with the same key creates nothing twice, for a day.",
+        examples=["5f0c9a52-9a3b-4c39-8a1c-0d9a2b8b6d1e"],
     ),
 ]
 
 
-class JobFromUploads(BaseModel):
-    """A job whose files have been uploaded before (`POST /v1/uploads`)."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {
-                    "scene": "upl_1a1fe701a104f943e9d4d8cce5b818c",
-                    "style": "upl_1a1fe701b52a0c11d0ab9f6ad0c2a54",
-                    "cameras": ["upl_1a1fe701b9e8e2a45b1c1d8c6bd8a90"],
-                    "parameters": {"preset": "preview"},
-                }
-            ]
-        },
-    )
-
-    scene: str = Field(description="Id of the upload with the 3DGS PLY.")
-    style: str = Field(description="Id of the upload with the style image.")
-    cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
-    photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
-    parameters: JobParameters = Field(default_factory=JobParameters)  # type: ignore[arg-type]
-    webhook: str | None = Field(None, max_length=2000, description="URL that is told when the job has ended.")
-
-
-_FILE = {"type": "string", "format": "binary"}
-_BODY = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["scene", "style"],
-                    "properties": {
-                        "scene": {**_FILE, "description": "3DGS PLY; or the id of an upload, as text."},
-                        "style": {**_FILE, "description": "Style image; or the id of an upload."},
-                        "cameras": {
-                            "type": "array",
-                            "items": _FILE,
-                            "description": "cameras.json, transforms.json, or the files of a COLMAP model.",
-                        },
-                        "photos": {"type": "array", "items": _FILE, "description": "Named as the cameras say."},
-                        "parameters": {"type": "string", "description": "JSON: see JobParameters."},
-                        "webhook": {"type": "string"},
-                    },
-                }
-            },
-            "application/json": {"schema": {"$ref": "#/components/schemas/JobFromUploads"}},
-        },
-    }
-}
+IfNoneMatch = Annotated[
+    str | None,
+    Header(alias="If-None-Match", description="An ETag; the same one is answered with 304.", examples=['"e7d2c939"']),
+]
+JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
+#: Headers of an answer that shows a job.
+_SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
+_NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
+#: What can be done with a job.
+_NEXT = ("get_job", "cancel_job", "retry_job", "delete_job", "watch_job", "list_artifacts")
 
 
 @router.post(
     "",
     status_code=202,
     response_model=JobView,
-    openapi_extra=_BODY,
+    openapi_extra=BODY,
     responses={
         200: {"model": PlanView, "description": "With `dry_run`: the plan. Nothing was queued."},
         202: {
             "description": "The job was accepted: it will not be lost.",
-            "headers": {"Location": {"schema": {"type": "string"}, "description": "The job."}},
-            "links": {
-                name: {"operationId": operation, "parameters": {"job_id": "$response.body#/id"}}
-                for name, operation in (
-                    ("get", "get_job"),
-                    ("cancel", "cancel_job"),
-                    ("delete", "delete_job"),
-                    ("artifacts", "list_artifacts"),
-                )
-            },
+            "headers": headers("Location", "Retry-After", maybe=("Idempotency-Replayed",)),
+            "links": links(*_NEXT, job_id="$response.body#/id"),
         },
+        **problems(*REFUSALS),
     },
     operation_id="create_job",
 )
@@ -121,7 +73,9 @@ async def create_job(
     context: ContextDep,
     caller: CallerDep,
     idempotency_key: IdempotencyHeader = None,
-    dry_run: Annotated[bool, Query(description="Check everything and plan, but queue nothing.")] = False,
+    dry_run: Annotated[
+        bool, Query(description="Check everything and plan, but queue nothing.", examples=[True])
+    ] = False,
 ) -> Response:
     """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -141,11 +95,11 @@ async def create_job(
     new = NewJob(caller.owner, parameters.name, caller.priority, values, inputs, webhook or None)
     limit = context.settings.max_jobs_per_key
     job, created = await asyncio.to_thread(context.store.jobs.create, new, limit=limit, idempotency=idempotency)
-    headers = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
+    sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
     if not created:
-        headers["Idempotency-Replayed"] = "true"
+        sent["Idempotency-Replayed"] = "true"
     position = await asyncio.to_thread(context.store.jobs.queue_position, job)
-    return JSONResponse(job_view(job, position).model_dump(mode="json"), 202, headers)
+    return JSONResponse(job_view(job, position).model_dump(mode="json"), 202, sent)
 
 
 Parts = tuple[Received, JobParameters, str | None]
@@ -218,7 +172,7 @@ def _content(context: Context, upload: UploadRow, role: str) -> str:
 
 
 async def _plan(
-    context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, Path], parameters: JobParameters
+    context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, FilePath], parameters: JobParameters
 ) -> Response:
     found = await context.inspector.inspect("plan", inputs, paths, parameters)
     view = PlanView(**found, workers=parameters.workers)
@@ -234,13 +188,26 @@ def _idempotency(
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
 
 
-@router.get("", response_model=JobPage, operation_id="list_jobs")
+@router.get(
+    "",
+    response_model=JobPage,
+    responses={
+        200: {"links": links(*_NEXT, job_id="$response.body#/jobs/0/id")},
+        **problems(invalid("query.limit", "Input should be less than or equal to 200")),
+    },
+    operation_id="list_jobs",
+)
 def list_jobs(
     context: ContextDep,
     caller: CallerDep,
-    status: Annotated[list[StatusName] | None, Query(description="Only these; may be given several times.")] = None,
-    cursor: Annotated[str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    status: Annotated[
+        list[StatusName] | None,
+        Query(description="Only these; may be given several times.", examples=[["queued", "running"]]),
+    ] = None,
+    cursor: Annotated[
+        str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.", examples=[JOB_ID])
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
 ) -> JobPage:
     """Jobs of this key, the newest first."""
     jobs = context.store.jobs
@@ -253,38 +220,86 @@ def list_jobs(
 @router.get(
     "/{job_id}",
     response_model=JobDetail,
-    responses={304: {"description": "Nothing has changed since the ETag of `If-None-Match`."}},
+    responses={
+        200: {"headers": _SHOWN, "links": links(*_NEXT[1:], job_id="$response.body#/id")},
+        304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
+        **problems(_NOT_THERE),
+    },
     operation_id="get_job",
 )
 def get_job(
-    job_id: str,
+    job_id: JobId,
     context: ContextDep,
     caller: CallerDep,
-    if_none_match: Annotated[str | None, Header()] = None,
+    if_none_match: IfNoneMatch = None,
 ) -> Response:
     """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
     check_id(job_id)
     return _shown(context, caller, job_id, if_none_match)
 
 
-@router.post("/{job_id}/cancel", response_model=JobDetail, operation_id="cancel_job")
-def cancel_job(job_id: str, context: ContextDep, caller: CallerDep) -> Response:
+@router.post(
+    "/{job_id}/cancel",
+    response_model=JobDetail,
+    responses={
+        200: {
+            "headers": _SHOWN,
+            "links": links("get_job", "retry_job", "delete_job", "watch_job", job_id="$response.body#/id"),
+        },
+        **problems(_NOT_THERE, ConflictError("The job has succeeded and cannot be canceled.", job_status="succeeded")),
+    },
+    operation_id="cancel_job",
+)
+def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel a job: at once where it waits, within seconds where it runs (`canceling` until then)."""
     check_id(job_id)
     context.store.jobs.cancel(job_id, caller.owner)
     return _shown(context, caller, job_id)
 
 
-@router.post("/{job_id}/retry", status_code=202, response_model=JobDetail, operation_id="retry_job")
-def retry_job(job_id: str, context: ContextDep, caller: CallerDep) -> Response:
+@router.post(
+    "/{job_id}/retry",
+    status_code=202,
+    response_model=JobDetail,
+    responses={
+        202: {
+            "description": "It waits for its turn again.",
+            "headers": _SHOWN,
+            "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
+        },
+        **problems(
+            _NOT_THERE,
+            ConflictError(
+                "The job has status running; only one that failed or was canceled can be tried again.",
+                job_status="running",
+            ),
+            QueueFullError("There are 100 unfinished jobs of this key already.", limit=100),
+        ),
+    },
+    operation_id="retry_job",
+)
+def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
     check_id(job_id)
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
     return _shown(context, caller, job_id, status=202)
 
 
-@router.delete("/{job_id}", status_code=204, operation_id="delete_job")
-def delete_job(job_id: str, context: ContextDep, caller: CallerDep) -> None:
+@router.delete(
+    "/{job_id}",
+    status_code=204,
+    responses={
+        204: {"description": "It is gone, with its results."},
+        **problems(
+            _NOT_THERE,
+            ConflictError(
+                "The job has status running. Cancel it first; delete it once it has ended.", job_status="running"
+            ),
+        ),
+    },
+    operation_id="delete_job",
+)
+def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
     """Remove a job that has ended, with its results."""
     find(context, caller, job_id)
     context.store.jobs.delete(job_id, caller.owner)
@@ -314,10 +329,10 @@ def _shown(
     view = job_detail(job, position, attempts)
     body = view.model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    sent = {"ETag": tag, "Cache-Control": "private, no-cache"}
     wait = poll_seconds(job)
     if wait is not None:
-        headers["Retry-After"] = str(wait)
+        sent["Retry-After"] = str(wait)
     if if_none_match is not None and tag in if_none_match:
-        return Response(status_code=304, headers=headers)
-    return Response(body, status, headers, media_type="application/json")
+        return Response(status_code=304, headers=sent)
+    return Response(body, status, sent, media_type="application/json")

@@ -8,12 +8,13 @@ from fastapi import APIRouter, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 
 from api.context import ContextDep
+from api.documentation import problems
 from api.views import Health
 
 router = APIRouter(tags=["operations"])
 
 
-@router.get("/livez", response_model=Health, operation_id="livez")
+@router.get("/livez", response_model=Health, responses=problems(key=False), operation_id="livez")
 async def livez() -> Health:
     """Whether the process answers: if not, restart it."""
     return Health(status="ok", checks={})
@@ -23,7 +24,21 @@ async def livez() -> Health:
     "/readyz",
     response_model=Health,
     operation_id="readyz",
-    responses={503: {"model": Health, "description": "Something that jobs need is away; `checks` says what."}},
+    responses={
+        503: {
+            "description": "Something that jobs need is away; `checks` says what.",
+            "content": {
+                "application/json": {
+                    "schema": {"$ref": "#/components/schemas/Health"},
+                    "example": {
+                        "status": "unavailable",
+                        "checks": {"database": "ok", "artifacts": "ok", "disk": "NoSpaceError"},
+                    },
+                }
+            },
+        },
+        **problems(key=False),
+    },
 )
 def readyz(context: ContextDep) -> Response:
     """Whether jobs can be taken in: the database answers, results can be stored, the disk has room.
@@ -50,7 +65,18 @@ def readyz(context: ContextDep) -> Response:
     return JSONResponse(view.model_dump())
 
 
-@router.get("/metrics", response_class=PlainTextResponse, operation_id="metrics")
+@router.get(
+    "/metrics",
+    response_class=PlainTextResponse,
+    responses={
+        200: {
+            "description": "The text form of Prometheus.",
+            "content": {"text/plain": {"example": 'sgsst_jobs{status="queued"} 3.0\n'}},
+        },
+        **problems(key=False),
+    },
+    operation_id="metrics",
+)
 def metrics(context: ContextDep) -> Response:
     """Prometheus metrics."""
     return Response(context.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")

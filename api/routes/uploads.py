@@ -10,21 +10,28 @@ import os
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from email.utils import format_datetime
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Request, Response
+from fastapi import APIRouter, Header, Path, Request, Response
 
 from api.context import CallerDep, Context, ContextDep, is_id
-from api.multipart import BadRequestError, MediaTypeError, body_blocks
-from api.problems import RESPONSES
+from api.documentation import headers, invalid, links, problems
+from api.multipart import BadRequestError, MediaTypeError, TooSlowError, body_blocks
 from api.routes.jobs import IdempotencyHeader
-from api.views import UploadView, upload_view
+from api.views import UPLOAD_ID, UploadView, upload_view
 from service.blobs import write_all
-from service.errors import ConflictError, NotFoundError, ServiceError, TooLargeError
+from service.errors import (
+    ConflictError,
+    IdempotencyError,
+    NoSpaceError,
+    NotFoundError,
+    ServiceError,
+    TooLargeError,
+)
 from service.staging import clean_name
 from service.store.tables import UploadRow
 
-router = APIRouter(prefix="/v1/uploads", tags=["uploads"], responses=RESPONSES)
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
 VERSION = "1.0.0"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
@@ -55,27 +62,66 @@ class LockedError(ServiceError):
     code, status = "upload-locked", 423
 
 
-Tus = Annotated[str, Header(alias="Tus-Resumable", description="1.0.0", examples=[VERSION])]
-LengthHeader = Annotated[int, Header(alias="Upload-Length", ge=0, lt=2**60, description="Bytes of the whole file.")]
-OffsetHeader = Annotated[int, Header(alias="Upload-Offset", ge=0, lt=2**60, description="Where these bytes begin.")]
+UploadId = Annotated[str, Path(description="Of an upload.", examples=[UPLOAD_ID])]
+Tus = Annotated[
+    str,
+    Header(
+        alias="Tus-Resumable",
+        description="The protocol's version.",
+        examples=[VERSION],
+        json_schema_extra={"const": VERSION},
+    ),
+]
+LengthHeader = Annotated[
+    int, Header(alias="Upload-Length", ge=0, lt=2**60, description="Bytes of the whole file.", examples=[42301])
+]
+OffsetHeader = Annotated[
+    int, Header(alias="Upload-Offset", ge=0, lt=2**60, description="Where these bytes begin.", examples=[16384])
+]
+
+_NOT_THERE = NotFoundError(f"There is no upload {UPLOAD_ID}, or it has expired.")
 
 
 def _check_version(version: str) -> None:
     if version != VERSION:
-        raise WrongVersionError(f"Tus-Resumable: {version[:20]!r} is not spoken here; {VERSION} is.")
+        raise _wrong_version(version)
 
 
-@router.options("", status_code=204, operation_id="describe_uploads")
+def _wrong_version(version: str) -> WrongVersionError:
+    message = f"Tus-Resumable: {version[:20]!r} is not spoken here; {VERSION} is."
+    return WrongVersionError(message, headers={"Tus-Version": VERSION})
+
+
+def _after(**parameters: str) -> dict[str, Any]:
+    """Where to go on with an upload."""
+    found = links("get_upload", "head_upload", "delete_upload", **parameters)
+    return found | links("append_upload", **parameters, **{"Upload-Offset": "0"})
+
+
+@router.options(
+    "",
+    status_code=204,
+    responses={
+        204: {
+            "description": "All in headers.",
+            "headers": headers(
+                "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Checksum-Algorithm", "Tus-Max-Size"
+            ),
+        },
+        **problems(key=False),
+    },
+    operation_id="describe_uploads",
+)
 def describe_uploads(context: ContextDep) -> Response:
     """What of the protocol is spoken."""
-    headers = {
+    sent = {
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,expiration,checksum,termination",
         "Tus-Checksum-Algorithm": ",".join(_ALGORITHMS),
         "Tus-Max-Size": str(context.settings.max_upload_bytes),
     }
-    return Response(status_code=204, headers=headers)
+    return Response(status_code=204, headers=sent)
 
 
 @router.post(
@@ -83,7 +129,22 @@ def describe_uploads(context: ContextDep) -> Response:
     status_code=201,
     response_model=UploadView,
     operation_id="create_upload",
-    responses={201: {"headers": {"Location": {"schema": {"type": "string"}, "description": "Where to send parts."}}}},
+    responses={
+        201: {
+            "description": "Its bytes can be sent to the `Location`.",
+            "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
+            "links": _after(upload_id="$response.body#/id"),
+        },
+        **problems(
+            BadRequestError("The file is empty. Give its size as Upload-Length."),
+            ConflictError(f"There are {_MAX_OPEN} unfinished uploads of this key. Finish or delete some."),
+            _wrong_version("0.2.2"),
+            TooLargeError("The file has 20,000,000,000 bytes; 16,000,000,000 may be.", limit=16_000_000_000),
+            invalid("header.Upload-Length", "Field required"),
+            IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key."),
+            NoSpaceError("The service's disk is too full to take this in. Try again later."),
+        ),
+    },
 )
 def create_upload(
     context: ContextDep,
@@ -91,7 +152,13 @@ def create_upload(
     length: LengthHeader,
     tus: Tus = VERSION,
     metadata: Annotated[
-        str, Header(alias="Upload-Metadata", max_length=4000, description="`filename` and its base64.")
+        str,
+        Header(
+            alias="Upload-Metadata",
+            max_length=4000,
+            description="`filename` and its base64.",
+            examples=["filename c2NlbmUucGx5"],
+        ),
     ] = "",
     idempotency_key: IdempotencyHeader = None,
 ) -> Response:
@@ -109,51 +176,102 @@ def create_upload(
     seconds = context.settings.upload_hours * 3600
     row = context.store.inputs.create_upload(caller.owner, length, name, metadata, seconds, idempotency_key)
     context.blobs.upload_path(row.id).touch()
-    headers = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
-    return Response(upload_view(row).model_dump_json(), 201, headers, "application/json")
+    sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
+    return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
 
 
-@router.get("/{upload_id}", response_model=UploadView, operation_id="get_upload")
-def get_upload(upload_id: str, context: ContextDep, caller: CallerDep) -> UploadView:
+@router.get("/{upload_id}", response_model=UploadView, responses=problems(_NOT_THERE), operation_id="get_upload")
+def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
     """How far an upload is, as JSON."""
     return upload_view(_find(context, caller.owner, upload_id))
 
 
-@router.head("/{upload_id}", operation_id="head_upload", response_class=Response)
-def head_upload(upload_id: str, context: ContextDep, caller: CallerDep) -> Response:
+@router.head(
+    "/{upload_id}",
+    responses={
+        200: {
+            "description": "All in headers.",
+            "headers": headers(
+                "Upload-Offset",
+                "Upload-Length",
+                "Upload-Expires",
+                "Tus-Resumable",
+                "Cache-Control",
+                maybe=("Upload-Metadata",),
+            ),
+        },
+        **problems(_NOT_THERE),
+    },
+    operation_id="head_upload",
+    response_class=Response,
+)
+def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """How far an upload is: `Upload-Offset` says where to go on."""
     row = _find(context, caller.owner, upload_id)
-    headers = {
+    sent = {
         **_HEADERS,
         "Upload-Offset": str(row.offset),
         "Upload-Length": str(row.length),
         "Upload-Expires": _http_date(row.expires_at),
     }
     if row.metadata_header:
-        headers["Upload-Metadata"] = row.metadata_header
-    return Response(headers=headers)
+        sent["Upload-Metadata"] = row.metadata_header
+    return Response(headers=sent)
 
 
 _PATCH_BODY = {
     "requestBody": {
         "required": True,
-        "content": {"application/offset+octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "content": {
+            "application/offset+octet-stream": {
+                "schema": {"type": "string", "format": "binary"},
+                "example": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
+            }
+        },
     }
 }
 
 
 @router.patch(
-    "/{upload_id}", status_code=204, operation_id="append_upload", openapi_extra=_PATCH_BODY, response_class=Response
+    "/{upload_id}",
+    status_code=204,
+    responses={
+        204: {
+            "description": "It is kept; `Upload-Offset` is where the next part begins.",
+            "headers": headers("Upload-Offset", "Upload-Expires", "Tus-Resumable", "Cache-Control"),
+        },
+        **problems(
+            BadRequestError("The request was cut off."),
+            _NOT_THERE,
+            TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
+            ConflictError("Upload-Offset is 0, but the next byte is 16384.", offset=16384),
+            _wrong_version("0.2.2"),
+            TooLargeError("More bytes come than the 42,301 of Upload-Length.", limit=42_301),
+            MediaTypeError("The Content-Type must be application/offset+octet-stream."),
+            invalid("header.Upload-Offset", "Field required"),
+            LockedError("Another request is writing to this upload. Ask for its offset, and go on from there."),
+            ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again."),
+            NoSpaceError("The service's disk is too full to take this in. Try again later."),
+        ),
+    },
+    operation_id="append_upload",
+    openapi_extra=_PATCH_BODY,
+    response_class=Response,
 )
 async def append_upload(
     request: Request,
-    upload_id: str,
+    upload_id: UploadId,
     context: ContextDep,
     caller: CallerDep,
     offset: OffsetHeader,
     tus: Tus = VERSION,
     checksum: Annotated[
-        str | None, Header(alias="Upload-Checksum", description="Algorithm and base64 of this part's digest.")
+        str | None,
+        Header(
+            alias="Upload-Checksum",
+            description="Algorithm and base64 of this part's digest.",
+            examples=["sha1 Kq5sNclPz7QV2+lfQIuc6R7oRu0="],
+        ),
     ] = None,
 ) -> Response:
     """Send the next part. What has arrived when a connection breaks is kept, unless a checksum was announced."""
@@ -183,8 +301,16 @@ async def append_upload(
     )
 
 
-@router.delete("/{upload_id}", status_code=204, operation_id="delete_upload")
-def delete_upload(upload_id: str, context: ContextDep, caller: CallerDep) -> Response:
+@router.delete(
+    "/{upload_id}",
+    status_code=204,
+    responses={
+        204: {"description": "It is gone.", "headers": headers("Tus-Resumable", "Cache-Control")},
+        **problems(_NOT_THERE),
+    },
+    operation_id="delete_upload",
+)
+def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Give an upload up, or let go of a finished one; jobs that use it keep their file."""
     _find(context, caller.owner, upload_id)
     context.store.inputs.delete_upload(upload_id, caller.owner)

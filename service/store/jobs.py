@@ -258,9 +258,9 @@ class Jobs:
         with self._database.writing() as session:
             job = _owned(session, job_id, owner, lock=True)
             if job.status in UNFINISHED:
+                first = "It ends in some seconds" if job.status == "canceling" else "Cancel it first"
                 raise ConflictError(
-                    f"The job has status {job.status}. Cancel it first, and delete it once it has ended.",
-                    job_status=job.status,
+                    f"The job has status {job.status}. {first}; delete it once it has ended.", job_status=job.status
                 )
             _forget(session, job)
 

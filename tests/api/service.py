@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import httpx
 import psutil
+
+from api.app import create_app
+from service.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 #: How long a test waits for anything before it fails; none of them measures how long it took.
@@ -136,6 +141,25 @@ def undisturbed(files: Mapping[str, Path], parameters: Mapping[str, Any], folder
     environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(ROOT)}
     subprocess.run(command, check=True, env=environment, cwd=ROOT, stdout=subprocess.DEVNULL)
     return out
+
+
+@cache
+def _document() -> dict[str, Any]:
+    return create_app(ServiceSettings()).openapi()
+
+
+def check_documented(answer: httpx.Response) -> None:
+    """Fail where the OpenAPI document does not have a problem's status and code for the operation that answered it."""
+    path, method = answer.request.url.path, answer.request.method.lower()
+    for template, operations in _document()["paths"].items():
+        pattern = re.sub(r"\{[a-z_]+\}", "[^/]+", template.replace("{name}", "(?s:.+)"))
+        if not re.fullmatch(pattern, path) or method not in operations:
+            continue
+        found = operations[method]["responses"].get(str(answer.status_code))
+        assert found, f"{method} {template}: {answer.status_code} is not documented"
+        examples = found["content"][answer.headers["content-type"]]["examples"]
+        code = answer.json()["code"]
+        assert code in examples, f"{method} {template}: {answer.status_code} {code} is not documented"
 
 
 def wait_for(

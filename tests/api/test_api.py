@@ -17,9 +17,11 @@ import httpx
 import psutil
 import pytest
 
+from api.serve import ServeError, serve
+from service.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
-from tests.api.service import Service, wait_for
+from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
 
 MB = 1_000_000
@@ -70,6 +72,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
     """The problem document, after a look at its form."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
+    check_documented(answer)
     problem: dict[str, Any] = answer.json()
     assert (problem["status"], problem["code"]) == (status, code), problem
     assert problem["title"]
@@ -411,6 +414,24 @@ def test_keys_are_needed_where_others_can_reach_the_service(tmp_path: Path) -> N
         assert client.get("/livez").status_code == 200
 
 
+def test_nobody_else_is_let_in_before_there_is_a_key(tmp_path: Path) -> None:
+    with pytest.raises(ServeError, match="there is no API key yet"):
+        serve(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
+
+
+def test_half_files_of_a_dead_process_are_collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(ServiceSettings(data=tmp_path))
+    blobs = BlobFolder(tmp_path, store.inputs, 0)
+    half = blobs.incoming / "half.part"
+    half.write_bytes(b"x")
+    blobs.collect()
+    assert half.exists(), "it may still be written to"
+    monkeypatch.setattr("service.blobs._ORPHAN_SECONDS", -1.0)  # no file's age can be made up: it is that of its name
+    blobs.collect()
+    assert not half.exists()
+    store.close()
+
+
 def test_limits_of_a_key_and_of_the_disk(tmp_path: Path, files: dict[str, bytes]) -> None:
     with Service(tmp_path / "data", alone=True, SGSST_MAX_JOBS_PER_KEY="1") as service, service.client() as client:
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
@@ -440,9 +461,23 @@ def _answers(url: str) -> bool:
         return False
 
 
+def test_a_stream_with_nothing_left_to_tell(client: httpx.Client, files: dict[str, bytes]) -> None:
+    """Of a job that has ended, after its last event or one that never was: it would not end."""
+    job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
+    client.post(f"/v1/jobs/{job_id}/cancel")
+    told = client.get(f"/v1/jobs/{job_id}/events").text
+    last = max(int(line.removeprefix("id: ")) for line in told.splitlines() if line.startswith("id: "))
+    for number in (last, last + 1, 10**15):
+        answer = client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(number)})
+        assert answer.status_code == 204
+    assert client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(last - 1)}).status_code == 200
+
+
 def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     refused(client.get("/v1/nothing"), 404, "not-found")
-    refused(client.put("/v1/jobs"), 405, "method-not-allowed")
+    answer = client.put("/v1/jobs")
+    refused(answer, 405, "method-not-allowed")
+    assert answer.headers["allow"] == "GET, POST"
     for job_id in ("job_00000000000", "../x", "job_' OR 1=1", "a" * 5000):
         assert client.get(f"/v1/jobs/{job_id}").status_code == 404
     refused(client.get("/v1/jobs", params={"limit": 0}), 422, "invalid-request")

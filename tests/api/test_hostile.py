@@ -22,11 +22,12 @@ import psutil
 import pytest
 from PIL import Image, PngImagePlugin
 
+from api.connection import MAX_HEAD_BYTES
 from service.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.tables import UploadRow
-from tests.api.service import Service, wait_for
+from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
 
 MB = 1_000_000
@@ -129,6 +130,7 @@ def refused(answer: httpx.Response, status: int, *codes: str) -> dict[str, Any]:
     """The problem document, after a look at its form."""
     assert answer.status_code == status, f"{answer.status_code} {answer.text[:500]}"
     assert answer.headers["content-type"] == "application/problem+json"
+    check_documented(answer)
     problem: dict[str, Any] = answer.json()
     assert problem["status"] == status
     assert problem["code"] in codes, problem
@@ -1109,13 +1111,44 @@ HEADS: list[tuple[str, bytes]] = [
 
 @pytest.mark.parametrize("data", [case[1] for case in HEADS], ids=[case[0] for case in HEADS])
 def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: bytes) -> None:
-    """Refused below the app, in plain text; the connection ends, so that nothing of it passes for another request."""
+    """Refused below the app; the connection ends, so that nothing of it passes for another request."""
     with connect(service) as connection:
         connection.sendall(data)
         connection.shutdown(socket.SHUT_WR)
-        first = closed(connection).split(b"\r\n")[0]
-    assert first == b"" or first.split()[1] in (b"400", b"403", b"405"), first
+        answer = closed(connection)
+    if answer:  # half a request ends with its connection
+        head, _, body = answer.partition(b"\r\n\r\n")
+        problem = json.loads(body)
+        assert b"content-type: application/problem+json" in head.lower()
+        assert int(head.split()[1]) == problem["status"]
+        assert (problem["status"], problem["code"]) in (
+            (400, "malformed-request"),
+            (403, "foreign-site"),
+            (405, "method-not-allowed"),
+        )
     assert client.get("/livez").status_code == 200
+
+
+def test_a_chunk_that_makes_no_sense(service: Service) -> None:
+    """Within a body that is being read: said once, and nothing behind it is taken for a request."""
+    start = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}"
+    with connect(service) as connection:
+        connection.sendall(lines(start + "\nTransfer-Encoding: chunked\nExpect: 100-continue"))
+        assert b" 100 " in connection.recv(100)  # the app is reading
+        connection.sendall(b"5\r\n--b0u\r\nnonsense\r\n" + lines("GET /livez HTTP/1.1"))
+        answer = closed(connection)
+    assert answer.count(b"HTTP/1.1") == 1
+    assert answer.startswith(b"HTTP/1.1 400 Bad Request\r\n")
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "malformed-request"
+
+
+def test_a_head_that_is_too_large(service: Service) -> None:
+    head = lines("GET /v1/jobs HTTP/1.1")[:-2] + b"X: y\r\n" * (MAX_HEAD_BYTES // 6)
+    with connect(service) as connection:
+        connection.sendall(head)  # no byte more than are read: the answer would be lost with them
+        answer = closed(connection)
+    assert answer.startswith(b"HTTP/1.1 431 Request Header Fields Too Large\r\n")
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "head-too-large"
 
 
 def test_nothing_of_all_that_is_left(service: Service, client: httpx.Client, store: Store) -> None:

@@ -33,6 +33,7 @@ class Listener:
                 body = self.rfile.read(int(self.headers["content-length"]))
                 listener.heard.append(({name.lower(): value for name, value in self.headers.items()}, body))
                 self.send_response(listener.status)
+                self.send_header("Location", listener.url)
                 self.end_headers()
 
             def log_message(self, *ignored: object) -> None:
@@ -87,6 +88,14 @@ def test_a_message_that_is_refused_is_kept(tmp_path: Path, listener: Listener) -
     with store.database.reading() as session:
         left = session.connection().exec_driver_sql("SELECT tries FROM deliveries").scalars().all()
     assert left == [1]
+
+
+def test_redirects_are_not_followed(tmp_path: Path, listener: Listener) -> None:
+    settings, store = _store(tmp_path, webhook_private_addresses=True)
+    _ended_job(store, listener.url)
+    listener.status = 307
+    Deliverer(settings, store).deliver_due()
+    assert len(listener.heard) == 1
 
 
 def test_private_addresses_are_not_called(tmp_path: Path, listener: Listener) -> None:
