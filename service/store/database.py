@@ -43,7 +43,7 @@ class Database:
         self.sqlite = self.url.get_backend_name() == "sqlite"
         if self.sqlite and self.url.database:
             Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"pool_size": 20, "max_overflow": 30, "pool_pre_ping": not self.sqlite}
+        options: dict[str, Any] = {"pool_size": 20, "max_overflow": 30, "pool_use_lifo": True, "pool_pre_ping": not self.sqlite}
         if self.sqlite:
             options["connect_args"] = {"timeout": _BUSY_SECONDS, "check_same_thread": False}
         self.engine = create_engine(self.url, **options)
@@ -133,7 +133,10 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 def _begin(connection: Connection) -> None:
     """A transaction that reads first and writes later could fail halfway on SQLite: writers take the lock at once."""
     writes = connection.get_execution_options().get("sgsst_writes")
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+    if writes:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+    else:  # waits for nobody, so that it has no errors which SQLAlchemy would have to name
+        connection.connection.cursor().execute("BEGIN")
 
 
 def new_id(prefix: str, now: float) -> str:
