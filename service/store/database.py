@@ -43,7 +43,12 @@ class Database:
         self.sqlite = self.url.get_backend_name() == "sqlite"
         if self.sqlite and self.url.database:
             Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"pool_size": 20, "max_overflow": 30, "pool_use_lifo": True, "pool_pre_ping": not self.sqlite}
+        options: dict[str, Any] = {
+            "pool_size": 20,
+            "max_overflow": 30,
+            "pool_use_lifo": True,
+            "pool_pre_ping": not self.sqlite,
+        }
         if self.sqlite:
             options["connect_args"] = {"timeout": _BUSY_SECONDS, "check_same_thread": False}
         self.engine = create_engine(self.url, **options)
