@@ -44,8 +44,11 @@ def main() -> None:
         timeout_keep_alive=75,
         server_header=False,
     )
+    server = uvicorn.Server(config)
     with contextlib.suppress(KeyboardInterrupt):
-        uvicorn.Server(config).run(listeners)
+        server.run(listeners)
+    if not server.started:
+        sys.exit("The API could not be started.")
 
 
 def _allow_many_connections() -> None:

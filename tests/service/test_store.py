@@ -378,6 +378,9 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(owner=st.sampled_from("ab"), priority=st.integers(0, 1))
     def create(self, owner: str, priority: int) -> None:
+        self.clock.now += (
+            1e-3  # ids sort by time and then by chance, which would make a run one that cannot be repeated
+        )
         job_id = queue(self.store, owner, priority)
         self.status[job_id] = "queued"
 
