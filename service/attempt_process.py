@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: A job takes every core for as long as it runs. Where that is the service's machine, requests go first; alone on its
 #: cores, a job loses nothing by it.
-_NICENESS = 10
+_NICENESS = 5
 #: Of previews, in the attempt's folder.
 _PREVIEWS = Path("out", "previews")
 
