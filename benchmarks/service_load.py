@@ -4,7 +4,7 @@ python -m benchmarks.service_load [--upload-mb 2000] [--watchers 1000] [--second
 
 Aims: 100 submissions a second by reference to uploads; status at 200 requests a second with a 99th percentile under
 50 ms; 1000 watchers of server-sent events; an API that grows by less than 64 MB during an upload of 2 GB. The client
-runs on the same machine and takes a share of its processors: it is part of what is measured.
+runs on the same machine and takes a share of its processors: it is part of what is measured, and told.
 """
 
 from __future__ import annotations
@@ -15,15 +15,18 @@ import base64
 import contextlib
 import json
 import os
+import re
 import statistics
 import tempfile
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
 import psutil
+import uvloop
 
 from benchmarks.machine import write_result
 from tests.api.service import Service, wait_for
@@ -58,72 +61,127 @@ async def upload(client: httpx.AsyncClient, path: Path) -> str:
     return str(begun.json()["id"])
 
 
-async def submissions(
-    client: httpx.AsyncClient, body: dict[str, Any], seconds: float, made: list[str]
-) -> dict[str, Any]:
+class Connection:
+    """A connection that is kept, and just enough HTTP: a client for all purposes takes as much processor time as the
+    API, on the same processors."""
+
+    def __init__(self, url: str) -> None:
+        self._host, _, port = url.removeprefix("http://").partition(":")
+        self._port = int(port)
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    async def ask(self, method: str, path: str, body: bytes = b"") -> tuple[int, bytes]:
+        """Status and body of the answer.
+
+        Raises:
+            OSError, EOFError: the connection broke; the next request makes a new one.
+        """
+        reader, writer = self._streams = self._streams or await asyncio.open_connection(self._host, self._port)
+        try:
+            writer.write(self._head(method, path, len(body)) + body)
+            head = (await reader.readuntil(b"\r\n\r\n")).lower()
+            length = re.search(rb"\r\ncontent-length: (\d+)", head)
+            return int(head[9:12]), await reader.readexactly(int(length[1]) if length else 0)
+        except BaseException:
+            self.close()
+            raise
+
+    async def lines(self, path: str) -> AsyncIterator[bytes]:
+        """The lines of an answer that does not end, those of its head too."""
+        reader, writer = self._streams = await asyncio.open_connection(self._host, self._port)
+        writer.write(self._head("GET", path, 0))
+        while line := await reader.readline():
+            yield line
+
+    def close(self) -> None:
+        """Give the connection up."""
+        if self._streams is not None:
+            self._streams[1].close()
+            self._streams = None
+
+    def _head(self, method: str, path: str, length: int) -> bytes:
+        kind = f"Content-Type: application/json\r\nContent-Length: {length}\r\n" if length else ""
+        return f"{method} {path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\n{kind}\r\n".encode()
+
+
+async def submissions(url: str, body: dict[str, Any], seconds: float, made: list[str]) -> dict[str, Any]:
     """Jobs by reference to uploads, by some clients at once, as fast as they are accepted; their ids go into `made`."""
     took: list[float] = []
-    refused = 0
+    failures: Counter[str] = Counter()
     end = time.perf_counter() + seconds
 
     async def submit(number: int) -> None:
-        nonlocal refused
+        connection = Connection(url)
         while time.perf_counter() < end:
             parameters = body["parameters"] | {"seed": number * 1_000_000 + len(made)}
+            text = json.dumps(body | {"parameters": parameters}).encode()
             started = time.perf_counter()
-            answer = await client.post("/v1/jobs", json=body | {"parameters": parameters})
+            try:
+                status, answer = await connection.ask("POST", "/v1/jobs", text)
+            except (OSError, EOFError) as error:
+                failures[type(error).__name__] += 1
+                continue
             took.append(time.perf_counter() - started)
-            if answer.status_code == 202:
-                made.append(answer.json()["id"])
+            if status == 202:
+                made.append(json.loads(answer)["id"])
             else:
-                refused += 1
+                failures[str(status)] += 1
+        connection.close()
 
     started = time.perf_counter()
     await asyncio.gather(*(submit(number) for number in range(_SUBMITTERS)))
     elapsed = time.perf_counter() - started
-    return {"per_second": round(len(made) / elapsed, 1), "accepted": len(made), "refused": refused, **spread(took)}
+    return {"per_second": round(len(made) / elapsed, 1), "accepted": len(made), "failures": failures, **spread(took)}
 
 
-async def at_a_rate(
-    ask: Callable[[int], Awaitable[httpx.Response]], rate: float, seconds: float, good: tuple[int, ...] = (200, 304)
-) -> dict[str, Any]:
+async def at_a_rate(url: str, path: Callable[[int], str], rate: float, seconds: float) -> dict[str, Any]:
     """Requests that are due at fixed moments, whether or not earlier ones have been answered.
 
     A request that waits for a free connection waits on our clock: the time counts from when it was due.
     """
     took: list[float] = []
-    failed = 0
+    failures: Counter[str] = Counter()
+    free: asyncio.LifoQueue[Connection] = asyncio.LifoQueue()
+    for _ in range(_STATUS_CONNECTIONS):
+        free.put_nowait(Connection(url))
     start = time.perf_counter()
 
     async def one(number: int) -> None:
-        nonlocal failed
         due = start + number / rate
         await asyncio.sleep(due - time.perf_counter())
+        connection = await free.get()
         try:
-            answer = await ask(number)
-            failed += answer.status_code not in good
-        except httpx.TransportError:
-            failed += 1
+            status, _ = await connection.ask("GET", path(number))
+            if status != 200:
+                failures[str(status)] += 1
+        except (OSError, EOFError) as error:
+            failures[type(error).__name__] += 1
+        free.put_nowait(connection)
         took.append(time.perf_counter() - due)
 
     await asyncio.gather(*(one(number) for number in range(int(rate * seconds))))
     elapsed = time.perf_counter() - start
+    while not free.empty():
+        free.get_nowait().close()
     return {
         "rate": rate,
         "requests": len(took),
         "answered_per_second": round(len(took) / elapsed, 1),
-        "failed": failed,
+        "failures": failures,
         **spread(took),
     }
 
 
 async def with_processor(api: psutil.Process, work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
-    """Figures with the API's own processor time for each request, which other work on the machine does not change."""
-    before = api.cpu_times()
+    """Figures with the processor time of API and client for each request, which other work does not change much."""
+    processes = {"api": api, "client": psutil.Process()}
+    before = {name: process.cpu_times() for name, process in processes.items()}
     figures = await work
-    after = api.cpu_times()
-    used = after.user + after.system - before.user - before.system
-    return {**figures, "api_cpu_ms_each": round(1000 * used / max(1, figures[count]), 2)}
+    for name, process in processes.items():
+        after = process.cpu_times()
+        used = after.user + after.system - before[name].user - before[name].system
+        figures[f"{name}_cpu_ms_each"] = round(1000 * used / max(1, figures[count]), 2)
+    return figures
 
 
 async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.Process) -> dict[str, Any]:
@@ -132,32 +190,35 @@ async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.P
     late: list[float] = []
     events = [0] * count
     connected = 0
-    limits = httpx.Limits(max_connections=None, max_keepalive_connections=0)
-    async with httpx.AsyncClient(base_url=url, limits=limits, timeout=httpx.Timeout(60, read=None)) as client:
+    opened = float("inf")  # events of the past do not count
 
-        async def one(number: int) -> None:
-            nonlocal connected
-            await asyncio.sleep(number / 200)  # not all of them in one moment
-            async with client.stream("GET", f"/v1/jobs/{job_id}/events") as stream:
-                stream.raise_for_status()
-                connected += 1
-                async for data in _events(stream):
-                    if "updated_at" in data and data["updated_at"] > opened:
+    async def one(number: int) -> None:
+        nonlocal connected
+        await asyncio.sleep(number / 200)  # not all of them in one moment
+        connection = Connection(url)
+        try:
+            async for line in connection.lines(f"/v1/jobs/{job_id}/events"):
+                if line.startswith(b"HTTP/1.1 200"):
+                    connected += 1
+                elif line.startswith(b"data: ") and time.time() > opened:
+                    data = json.loads(line[6:])
+                    if data.get("updated_at", 0) > opened:
                         events[number] += 1
                         late.append(time.time() - data["updated_at"])
+        finally:
+            connection.close()
 
-        tasks = [asyncio.create_task(one(number)) for number in range(count)]
-        deadline = time.monotonic() + 120
-        opened = float("inf")  # events of the past do not count
-        while connected < count and time.monotonic() < deadline and not any(task.done() for task in tasks):
-            await asyncio.sleep(0.1)
-        opened = time.time()
-        grown = api.memory_info().rss - before
-        await asyncio.sleep(seconds)
-        alive = sum(not task.done() for task in tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+    tasks = [asyncio.create_task(one(number)) for number in range(count)]
+    deadline = time.monotonic() + 120
+    while connected < count and time.monotonic() < deadline and not any(task.done() for task in tasks):
+        await asyncio.sleep(0.1)
+    opened = time.time()
+    grown = api.memory_info().rss - before
+    await asyncio.sleep(seconds)
+    alive = sum(not task.done() for task in tasks)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
     return {
         "wanted": count,
         "connected": connected,
@@ -167,12 +228,6 @@ async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.P
         "watchers_without_an_event": sum(not each for each in events),
         "delay": spread(late) if late else None,
     }
-
-
-async def _events(stream: httpx.Response) -> AsyncIterator[dict[str, Any]]:
-    async for line in stream.aiter_lines():
-        if line.startswith("data: "):
-            yield json.loads(line[6:])
 
 
 async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
@@ -223,8 +278,7 @@ async def measure(
     """All figures, one after the other."""
     api = service.process(_API)
     assert api is not None
-    limits = httpx.Limits(max_connections=_STATUS_CONNECTIONS, max_keepalive_connections=_STATUS_CONNECTIONS)
-    async with httpx.AsyncClient(base_url=service.url, limits=limits, timeout=120) as client:
+    async with httpx.AsyncClient(base_url=service.url, timeout=120) as client:
         ids = {role: await upload(client, path) for role, path in files.items()}
         body = {"scene": ids["scene"], "style": ids["style"], "cameras": [ids["cameras"]], "parameters": LONG}
         running = (await client.post("/v1/jobs", json=body)).json()["id"]
@@ -234,23 +288,18 @@ async def measure(
         # first, as what watchers leave free in the API's heap would hide its growth
         figures["upload"] = await large_upload(client, large, api)
         print(figures["upload"], flush=True)
-
-        async def status(number: int) -> httpx.Response:
-            return await client.get(f"/v1/jobs/{running}")
-
-        figures["status"] = await with_processor(api, at_a_rate(status, 200, arguments.seconds), "requests")
+        asking = at_a_rate(service.url, lambda number: f"/v1/jobs/{running}", 200, arguments.seconds)
+        figures["status"] = await with_processor(api, asking, "requests")
         print(figures["status"], flush=True)
         figures["watchers"] = await watch(service.url, running, arguments.watchers, arguments.seconds, api)
         print(figures["watchers"], flush=True)
         made: list[str] = []
-        submitting = submissions(client, body, arguments.seconds, made)
+        submitting = submissions(service.url, body, arguments.seconds, made)
         figures["submissions"] = await with_processor(api, submitting, "accepted")
         print(figures["submissions"], flush=True)
-
-        async def any_status(number: int) -> httpx.Response:
-            return await client.get(f"/v1/jobs/{made[number % len(made)]}")
-
-        asking = at_a_rate(any_status, 200, arguments.seconds / 2)
+        asking = at_a_rate(
+            service.url, lambda number: f"/v1/jobs/{made[number % len(made)]}", 200, arguments.seconds / 2
+        )
         figures["status_of_queued_jobs"] = await with_processor(api, asking, "requests")
         print(figures["status_of_queued_jobs"], flush=True)
         figures["job_still_running"] = (await client.get(f"/v1/jobs/{running}")).json()["status"] == "running"
@@ -282,6 +331,7 @@ def main() -> None:
     parser.add_argument("--watchers", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=20.0)
     arguments = parser.parse_args()
+    load = [round(value, 2) for value in psutil.getloadavg()]  # of what else the machine does
     with tempfile.TemporaryDirectory(prefix="sgsst-load-") as name:
         folder = Path(name)
         (folder / "inputs").mkdir()
@@ -298,8 +348,9 @@ def main() -> None:
         with Service(folder / "data", **SETTINGS) as service:
             wait_for(service.ready, "the service", service.said)
             files = {"scene": ply, "cameras": cameras, "style": style}
-            figures = asyncio.run(measure(service, files, arguments, large))
-    print(write_result("service_load", {"processors": os.cpu_count(), **figures}))
+            figures = uvloop.run(measure(service, files, arguments, large))
+    measured = {"processors": os.cpu_count(), "load_average_at_start": load, **figures}
+    print(write_result("service_load", measured))
 
 
 if __name__ == "__main__":

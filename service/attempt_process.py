@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from sgsst_core.loop import Progress
     from worker.job import Prepared, Result, StylizeRequest
 
+#: A job takes every core for as long as it runs. Where that is the service's machine, requests go first; alone on its
+#: cores, a job loses nothing by it.
+_NICENESS = 5
 #: Of previews, in the attempt's folder.
 _PREVIEWS = Path("out", "previews")
 
@@ -221,6 +224,8 @@ def main() -> None:
     """Run the task of the folder that the command line names."""
     global _channel
     die_with_parent()
+    if not os.environ.get("CUDA_VISIBLE_DEVICES"):  # a GPU's work is not in the way, and must not wait
+        os.nice(_NICENESS)
     _channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     os.chdir(sys.argv[1])

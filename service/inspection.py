@@ -114,6 +114,17 @@ class Inspector:
             "image_pixels": settings.max_image_pixels,
         }
 
+    def recall(
+        self, work: Literal["check", "plan"], inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
+    ) -> dict[str, Any] | None:
+        """What `inspect` found in the same files before; None where they are new.
+
+        Raises:
+            RefusedInputError: they were found to be of no use.
+        """
+        known = self._store.inputs.inspection(self._key(work, inputs, parameters))
+        return None if known is None else _found(known)
+
     async def inspect(
         self,
         work: Literal["check", "plan"],
@@ -127,19 +138,15 @@ class Inspector:
             RefusedInputError: they cannot be used.
             BusyError: it cannot be told now.
         """
-        key = self._key(work, inputs, parameters)
-        known = await asyncio.to_thread(self._store.inputs.inspection, key)
-        if known is None:
-            known = await self._look(work, inputs, blobs, parameters)
-            passing = known.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
-            if not passing:  # another day it may be otherwise
-                await asyncio.to_thread(self._store.inputs.add_inspection, key, known)
-        if "error" in known:
-            error = known["error"]
-            raise RefusedInputError(
-                error["message"], error["code"], **({"input": error["input"]} if error["input"] else {})
-            )
-        return known["found"]
+        recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
+        if recalled is not None:
+            return recalled
+        answer = await self._look(work, inputs, blobs, parameters)
+        passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
+        if not passing:  # another day it may be otherwise
+            key = self._key(work, inputs, parameters)
+            await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
+        return _found(answer)
 
     async def _look(
         self,
@@ -174,6 +181,17 @@ class Inspector:
         """End both processes."""
         await self._checks.close()
         await self._plans.close()
+
+
+def _found(answer: Mapping[str, Any]) -> dict[str, Any]:
+    """What the process found; raises RefusedInputError where that is an error."""
+    if "error" in answer:
+        error = answer["error"]
+        raise RefusedInputError(
+            error["message"], error["code"], **({"input": error["input"]} if error["input"] else {})
+        )
+    found: dict[str, Any] = answer["found"]
+    return found
 
 
 def _as_text(staged: Staged) -> dict[str, str | None]:

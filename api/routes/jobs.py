@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
@@ -79,30 +80,62 @@ async def create_job(
 ) -> Response:
     """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    received = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
-    files, parameters, webhook = received
-    inputs = await asyncio.to_thread(_resolve, context, caller, files)
-    check_roles(inputs, orbit=parameters.orbit is not None)
-    if webhook:
-        check_url(webhook, context.settings)
-    rows = await asyncio.to_thread(context.store.inputs.blobs, sorted({entry["sha256"] for entry in inputs}))
-    paths = {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
-    await context.inspector.inspect("check", inputs, paths, parameters)
+    parts = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
+    wanted = await asyncio.to_thread(_gather, context, caller, parts)
+    if not wanted.checked:
+        await context.inspector.inspect("check", wanted.inputs, wanted.paths, wanted.parameters)
     if dry_run:
-        return await _plan(context, inputs, paths, parameters)
-    idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)
-    values = parameters.model_dump(mode="json", exclude_unset=True)
-    new = NewJob(caller.owner, parameters.name, caller.priority, values, inputs, webhook or None)
-    limit = context.settings.max_jobs_per_key
-    job, created = await asyncio.to_thread(context.store.jobs.create, new, limit=limit, idempotency=idempotency)
-    sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
-    if not created:
-        sent["Idempotency-Replayed"] = "true"
-    position = await asyncio.to_thread(context.store.jobs.queue_position, job)
-    return JSONResponse(job_view(job, position).model_dump(mode="json"), 202, sent)
+        return await _plan(context, wanted.inputs, wanted.paths, wanted.parameters)
+    return await asyncio.to_thread(_queue, context, caller, wanted, idempotency_key)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """A job that somebody wants.
+
+    Attributes:
+        inputs: `role`, `name`, `sha256`, `size` of each file.
+        paths: the files by digest.
+        checked: the same files have been inspected before, and can be used.
+    """
+
+    inputs: list[dict[str, Any]]
+    paths: dict[str, FilePath]
+    parameters: JobParameters
+    webhook: str | None
+    checked: bool
 
 
 Parts = tuple[Received, JobParameters, str | None]
+
+
+def _gather(context: Context, caller: Caller, parts: Parts) -> _Wanted:
+    """Find the files of a job, and prove what can be proved without the inspecting process."""
+    received, parameters, webhook = parts
+    inputs, paths = _resolve(context, caller, received)
+    check_roles(inputs, orbit=parameters.orbit is not None)
+    if webhook:
+        check_url(webhook, context.settings)
+    checked = context.inspector.recall("check", inputs, parameters) is not None
+    if not checked:
+        for entry in inputs:
+            check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
+    return _Wanted(inputs, paths, parameters, webhook, checked)
+
+
+def _queue(context: Context, caller: Caller, wanted: _Wanted, idempotency_key: str | None) -> Response:
+    """Queue a job that has been checked, and answer."""
+    parameters, webhook = wanted.parameters, wanted.webhook
+    idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
+    values = parameters.model_dump(mode="json", exclude_unset=True)
+    new = NewJob(caller.owner, parameters.name, caller.priority, values, wanted.inputs, webhook or None)
+    jobs = context.store.jobs
+    job, created = jobs.create(new, limit=context.settings.max_jobs_per_key, idempotency=idempotency)
+    sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
+    if not created:
+        sent["Idempotency-Replayed"] = "true"
+    body = job_view(job, jobs.queue_position(job)).model_dump_json()
+    return Response(body, 202, sent, media_type="application/json")
 
 
 async def _from_form(request: Request, context: Context) -> Parts:
@@ -133,8 +166,9 @@ async def _from_json(request: Request, context: Context) -> Parts:
     return Received(uploads=named), job.parameters, job.webhook
 
 
-def _resolve(context: Context, caller: Caller, received: Received) -> list[dict[str, Any]]:
-    """All files of a job, those that came with it and those that were uploaded before; they stay for now."""
+def _resolve(context: Context, caller: Caller, received: Received) -> tuple[list[dict[str, Any]], dict[str, FilePath]]:
+    """All files of a job, those that came with it and those that were uploaded before, and where they are by digest.
+    They stay for now."""
     inputs = list(received.files)
     ids = [upload_id for _, upload_id in received.uploads if is_id(upload_id)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
@@ -148,13 +182,11 @@ def _resolve(context: Context, caller: Caller, received: Received) -> list[dict[
                 input=role,
             )
         digests.append(_content(context, upload, role))
-    rows = context.store.inputs.hold(digests) if digests else {}
+    rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
     for number, ((role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
-        row, name = rows[sha256], clean_name(role, uploads[upload_id].filename, number)
-        if role == "scene":
-            check_file(role, name, context.blobs.path(row.location), row.size, context.settings)
-        inputs.append({"role": role, "name": name, "sha256": row.sha256, "size": row.size})
-    return inputs
+        name = clean_name(role, uploads[upload_id].filename, number)
+        inputs.append({"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
+    return inputs, {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
 
 
 def _content(context: Context, upload: UploadRow, role: str) -> str:

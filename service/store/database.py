@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import fcntl
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from service.errors import IdempotencyError
 from service.store.tables import Base, CounterRow, IdempotencyRow
 
 #: The newest migration; a database that says so needs no look at the migrations themselves.
-SCHEMA = "0002"
+SCHEMA = "0003"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Seconds that a writer waits for another one's transaction. All are short.
 _BUSY_SECONDS = 30
@@ -41,7 +43,12 @@ class Database:
         self.sqlite = self.url.get_backend_name() == "sqlite"
         if self.sqlite and self.url.database:
             Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"pool_size": 20, "max_overflow": 30, "pool_pre_ping": not self.sqlite}
+        options: dict[str, Any] = {
+            "pool_size": 20,
+            "max_overflow": 30,
+            "pool_use_lifo": True,
+            "pool_pre_ping": not self.sqlite,
+        }
         if self.sqlite:
             options["connect_args"] = {"timeout": _BUSY_SECONDS, "check_same_thread": False}
         self.engine = create_engine(self.url, **options)
@@ -49,11 +56,13 @@ class Database:
             event.listen(self.engine, "connect", _set_pragmas)
             event.listen(self.engine, "begin", _begin)
         self._writer = self.engine.execution_options(sgsst_writes=True)
+        # SQLite's writers wait by sleeping and asking again; those of one process need not
+        self._turn: AbstractContextManager[Any] = threading.Lock() if self.sqlite else nullcontext()
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
         """A transaction that is committed at the end of the block; on SQLite it is the only writer from the start."""
-        with Session(self._writer, expire_on_commit=False) as session, session.begin():
+        with self._turn, Session(self._writer, expire_on_commit=False) as session, session.begin():
             yield session
 
     @contextmanager
@@ -61,6 +70,12 @@ class Database:
         """A transaction that sees one state of the database, and never waits for a writer."""
         with Session(self.engine, expire_on_commit=False) as session:
             yield session
+
+    @contextmanager
+    def looking(self) -> Iterator[Connection]:
+        """As `reading`, for plain rows: a third of the work, for what is asked hundreds of times a second."""
+        with self.engine.connect() as connection:
+            yield connection
 
     def upgrade(self) -> None:
         """Bring the tables to this version; of several processes that start at once one does it."""
@@ -123,7 +138,10 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 def _begin(connection: Connection) -> None:
     """A transaction that reads first and writes later could fail halfway on SQLite: writers take the lock at once."""
     writes = connection.get_execution_options().get("sgsst_writes")
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+    if writes:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+    else:  # waits for nobody, so that it has no errors which SQLAlchemy would have to name
+        connection.connection.cursor().execute("BEGIN")
 
 
 def new_id(prefix: str, now: float) -> str:
@@ -152,9 +170,16 @@ def remembered(session: Session, owner: str, key: str, fingerprint: str, now: fl
 
 def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:
     """Add to a counter, within the transaction of what is counted."""
-    insert = upsert(session)(CounterRow).values(name=name, labels=labels, value=amount)
-    added = CounterRow.value + insert.excluded.value
-    session.execute(insert.on_conflict_do_update(index_elements=["name", "labels"], set_={"value": added}))
+    statement = _counting(session.get_bind().dialect.name)
+    session.execute(statement, {"name": name, "labels": labels, "value": amount})
+
+
+@cache
+def _counting(dialect: str) -> Any:
+    table = Base.metadata.tables[CounterRow.__tablename__]
+    insert = (sqlite.insert if dialect == "sqlite" else postgresql.insert)(table)
+    added = table.c.value + insert.excluded.value
+    return insert.on_conflict_do_update(index_elements=["name", "labels"], set_={"value": added})
 
 
 def upsert(session: Session) -> Any:

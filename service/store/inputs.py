@@ -6,11 +6,11 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import delete, exists, select, update
+from sqlalchemy import bindparam, delete, exists, select, update
 
 from service.errors import ConflictError, NotFoundError
 from service.store.database import Database, new_id, remembered, upsert
-from service.store.tables import BlobRow, BlobUseRow, InspectionRow, UploadRow
+from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
 GRACE_SECONDS = 3600.0
@@ -18,6 +18,15 @@ GRACE_SECONDS = 3600.0
 _HOLD_SHARE = 0.1
 #: What checking an input found is kept for so long.
 _INSPECTION_SECONDS = 30 * 86_400.0
+
+# Built once: building a query takes longer than answering it.
+_BLOBS = select(Base.metadata.tables["blobs"]).where(BlobRow.sha256.in_(bindparam("digests", expanding=True)))
+_UPLOADS = select(Base.metadata.tables["uploads"]).where(
+    UploadRow.id.in_(bindparam("ids", expanding=True)),
+    UploadRow.owner == bindparam("owner"),
+    UploadRow.expires_at >= bindparam("now"),
+)
+_INSPECTION = select(Base.metadata.tables["inspections"].c.result).where(InspectionRow.key == bindparam("key"))
 
 
 class Inputs:
@@ -57,12 +66,12 @@ class Inputs:
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Blobs by their digest, for a job that holds them."""
-        with self._database.reading() as session:
-            found: dict[str, BlobRow] = {}
+        found: dict[str, BlobRow] = {}
+        with self._database.looking() as connection:
             for start in range(0, len(digests), 500):
-                part = select(BlobRow).where(BlobRow.sha256.in_(digests[start : start + 500]))
-                found |= {row.sha256: row for row in session.scalars(part)}
-            return found
+                rows = connection.execute(_BLOBS, {"digests": digests[start : start + 500]})
+                found |= {row.sha256: BlobRow(**row._mapping) for row in rows}
+        return found
 
     def collect(self) -> list[str]:
         """Drop blobs that nobody has referred to for a while; returns their locations, for removing the files."""
@@ -121,11 +130,10 @@ class Inputs:
         """Uploads of this owner by their id; those that are not there or have expired are left out."""
         now = self._database.clock()
         found: dict[str, UploadRow] = {}
-        with self._database.reading() as session:
+        with self._database.looking() as connection:
             for start in range(0, len(upload_ids), 500):
-                part = select(UploadRow).where(UploadRow.id.in_(upload_ids[start : start + 500]))
-                rows = session.scalars(part.where(UploadRow.owner == owner, UploadRow.expires_at >= now))
-                found |= {row.id: row for row in rows}
+                wanted = {"ids": upload_ids[start : start + 500], "owner": owner, "now": now}
+                found |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, wanted)}
         return found
 
     def advance_upload(self, upload_id: str, offset: int, seconds: float) -> float:
@@ -175,9 +183,9 @@ class Inputs:
 
     def inspection(self, key: str) -> dict[str, Any] | None:
         """What an earlier check of the same content found."""
-        with self._database.reading() as session:
-            row = session.get(InspectionRow, key)
-            return row.result if row else None
+        with self._database.looking() as connection:
+            found: dict[str, Any] | None = connection.execute(_INSPECTION, {"key": key}).scalar()
+            return found
 
     def add_inspection(self, key: str, result: dict[str, Any]) -> None:
         """Remember what a check found, and forget what is old."""

@@ -11,7 +11,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Select, and_, case, delete, func, or_, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Float,
+    Select,
+    String,
+    and_,
+    bindparam,
+    case,
+    delete,
+    func,
+    insert,
+    or_,
+    select,
+    tuple_,
+    update,
+)
 from sqlalchemy.orm import Session
 
 from service.errors import ConflictError, LeaseLostError, NotFoundError, QueueFullError
@@ -19,6 +35,7 @@ from service.store.database import IDEMPOTENCY_SECONDS, Database, count, new_id,
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,
+    Base,
     BlobUseRow,
     DeliveryRow,
     EventRow,
@@ -37,6 +54,26 @@ KEPT_PROGRESS = 200
 #: A wait between attempts doubles, but not beyond this.
 _MAX_RETRY_SECONDS = 300.0
 DAY = 86_400.0
+
+_JOBS, _ATTEMPTS, _EVENTS, _BLOB_USES = (
+    Base.metadata.tables[name] for name in ("jobs", "attempts", "events", "blob_uses")
+)
+# What is asked most, built once: building a query takes longer than answering it.
+_JOB = select(_JOBS).where(_JOBS.c.id == bindparam("job_id"))
+_ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
+_UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"), _JOBS.c.status.in_(UNFINISHED))
+
+
+def _ahead() -> Select[int]:
+    """How many queued jobs come before one: two ranges of the queue's index."""
+    queued = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == "queued")
+    higher = queued.where(_JOBS.c.priority > bindparam("priority"))
+    own_place = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
+    earlier = queued.where(_JOBS.c.priority == bindparam("priority"), tuple_(_JOBS.c.queued_at, _JOBS.c.id) < own_place)
+    return select(higher.scalar_subquery() + earlier.scalar_subquery())
+
+
+_AHEAD = _ahead()
 
 
 @dataclass(frozen=True)
@@ -124,34 +161,19 @@ class Jobs:
                 known = session.get(JobRow, memory.created_id)
                 if known is not None:
                     return known, False
-            unfinished = select(func.count()).where(JobRow.owner == new.owner, JobRow.status.in_(UNFINISHED))
-            if (session.scalar(unfinished) or 0) >= limit:
+            if session.execute(_UNFINISHED_OF, {"owner": new.owner}).scalar_one() >= limit:
                 raise QueueFullError(
                     f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.",
                     limit=limit,
                 )
-            job = JobRow(
-                id=new_id("job", now),
-                owner=new.owner,
-                name=new.name,
-                status="queued",
-                priority=new.priority,
-                parameters=new.parameters,
-                inputs=new.inputs,
-                created_at=now,
-                queued_at=now,
-                not_before=now,
-                attempt=0,
-                failures=0,
-                lease_epoch=0,
-                webhook=new.webhook,
-            )
-            session.add(job)
+            values = _first_values(new, now)
+            session.execute(insert(_JOBS), values)
+            job = JobRow(**values)
             if memory is not None:
                 memory.created_id = job.id
-            session.flush()
-            for sha256 in sorted({entry["sha256"] for entry in new.inputs}):
-                session.add(BlobUseRow(holder=f"job:{job.id}", sha256=sha256))
+            digests = sorted({entry["sha256"] for entry in new.inputs})
+            uses = [{"holder": f"job:{job.id}", "sha256": sha256} for sha256 in digests]
+            session.execute(insert(_BLOB_USES), uses)
             _say(session, job, now)
             count(session, "sgsst_jobs_submitted_total")
         return job, True
@@ -177,13 +199,14 @@ class Jobs:
         Raises:
             NotFoundError: as `get`.
         """
-        with self._database.reading() as session:
-            job = _owned(session, job_id, owner)
-            attempts: list[AttemptRow] = []
-            if job.attempt:
-                found = select(AttemptRow).where(AttemptRow.job_id == job_id).order_by(AttemptRow.number)
-                attempts = list(session.scalars(found))
-            return job, _position(session, job), attempts
+        with self._database.looking() as connection:
+            row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
+            if row is None or (owner is not None and row.owner != owner):
+                raise NotFoundError(f"There is no job {job_id}.")
+            job = JobRow(**row._mapping)
+            found = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
+            attempts = [AttemptRow(**each._mapping) for each in found]
+            return job, _position(connection, job), attempts
 
     def page(
         self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
@@ -204,8 +227,8 @@ class Jobs:
 
         Turns between owners, which change with every lease, are left out.
         """
-        with self._database.reading() as session:
-            return _position(session, job)
+        with self._database.looking() as connection:
+            return _position(connection, job)
 
     def cancel(self, job_id: str, owner: str | None) -> JobRow:
         """Cancel a job: at once where it is queued, else as soon as its dispatcher sees it.
@@ -240,8 +263,7 @@ class Jobs:
                     f"The job has status {job.status}; only one that failed or was canceled can be tried again.",
                     job_status=job.status,
                 )
-            unfinished = select(func.count()).where(JobRow.owner == job.owner, JobRow.status.in_(UNFINISHED))
-            if (session.scalar(unfinished) or 0) >= limit:
+            if session.execute(_UNFINISHED_OF, {"owner": job.owner}).scalar_one() >= limit:
                 raise QueueFullError(f"There are {limit} unfinished jobs of this key already.", limit=limit)
             job.status, job.queued_at, job.not_before, job.failures = "queued", now, now, 0
             job.swept = False
@@ -405,7 +427,7 @@ class Jobs:
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
             job.progress = {**progress, "updated_at": now}
-            session.add(EventRow(job_id=job.id, kind="progress", data=job.progress, created_at=now))
+            _note(session, job.id, "progress", job.progress, now)
             mine = and_(EventRow.job_id == job.id, EventRow.kind == "progress")
             oldest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(KEPT_PROGRESS).limit(1)
             found = session.scalar(oldest)
@@ -545,6 +567,26 @@ class Jobs:
             session.add(delivery)
 
 
+def _first_values(new: NewJob, now: float) -> dict[str, Any]:
+    """The row of a job that has just been accepted."""
+    return {
+        "id": new_id("job", now),
+        "owner": new.owner,
+        "name": new.name,
+        "status": "queued",
+        "priority": new.priority,
+        "parameters": new.parameters,
+        "inputs": new.inputs,
+        "created_at": now,
+        "queued_at": now,
+        "not_before": now,
+        "attempt": 0,
+        "failures": 0,
+        "lease_epoch": 0,
+        "webhook": new.webhook,
+    }
+
+
 def _owned(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
     job = session.get(JobRow, job_id, with_for_update=lock)
     if job is None or (owner is not None and job.owner != owner):
@@ -567,13 +609,11 @@ def _count_failure(job: JobRow) -> None:
     job.failed_step = job.saved_step
 
 
-def _position(session: Session, job: JobRow) -> int | None:
+def _position(connection: Connection, job: JobRow) -> int | None:
     if job.status != "queued":
         return None
-    same = and_(JobRow.priority == job.priority, JobRow.queued_at == job.queued_at, JobRow.id < job.id)
-    earlier = and_(JobRow.priority == job.priority, JobRow.queued_at < job.queued_at)
-    ahead = or_(JobRow.priority > job.priority, earlier, same)
-    return 1 + (session.scalar(select(func.count()).where(JobRow.status == "queued", ahead)) or 0)
+    own = {"priority": job.priority, "queued_at": job.queued_at, "job_id": job.id}
+    return 1 + int(connection.execute(_AHEAD, own).scalar_one())
 
 
 def _is_held(job: JobRow | None, lease: Lease) -> bool:
@@ -597,7 +637,11 @@ def _say(session: Session, job: JobRow, now: float) -> None:
     data: dict[str, Any] = {"status": job.status, "attempt": job.attempt}
     if job.error:
         data["error"] = job.error
-    session.add(EventRow(job_id=job.id, kind="status", data=data, created_at=now))
+    _note(session, job.id, "status", data, now)
+
+
+def _note(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
+    session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
 
 
 def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
@@ -614,7 +658,7 @@ def _publish(session: Session, job: JobRow, files: Sequence[Published], now: flo
         row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
         if not file.name.startswith("."):
             data = {"name": file.name, "size": file.size, "sha256": file.sha256}
-            session.add(EventRow(job_id=job.id, kind="artifact", data=data, created_at=now))
+            _note(session, job.id, "artifact", data, now)
     return unused
 
 

@@ -62,8 +62,9 @@ class JobRow(Base):
     lease_expires_at: Mapped[float | None] = mapped_column(Float)
 
     __table_args__ = (
-        Index("ix_jobs_queue", "status", "not_before"),
+        Index("ix_jobs_queue", "status", "priority", "queued_at", "id"),  # a place in the queue is counted in it alone
         Index("ix_jobs_owner_id", "owner", "id"),
+        Index("ix_jobs_owner_status", "owner", "status", "id"),
         Index("ix_jobs_expires_at", "expires_at"),
         Index("ix_jobs_swept", "swept", "status"),
     )

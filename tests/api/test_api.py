@@ -230,6 +230,18 @@ def test_a_body_that_is_cut_off(service: Service, client: httpx.Client, files: d
     wait_for(lambda: not list((service.data / "incoming").iterdir()), "half files to be removed")
 
 
+def test_a_connection_may_rest_between_requests(service: Service) -> None:
+    host, port = service.url.removeprefix("http://").split(":")
+    post = "POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(post.encode())
+        assert b" 422 " in connection.recv(65536).splitlines()[0]
+        time.sleep(2.5)  # longer than a request may stand still
+        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+        assert b"HTTP/1.1 200 OK" in answer
+
+
 def test_a_body_that_comes_too_slowly(service: Service) -> None:
     head = (
         "POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: 1000\nContent-Type: multipart/form-data; boundary=x"

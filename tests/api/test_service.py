@@ -208,6 +208,10 @@ def test_killed_processes_cost_time_and_nothing_else(service: Service, files: di
     with service.client() as client:
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 5)
+        job_process, api = service.process("service.attempt_process"), service.process("api.server")
+        assert job_process is not None
+        assert api is not None
+        assert job_process.nice() > api.nice()  # requests do not wait for a job that has all cores
         service.kill("service.attempt_process")
         wait_for_step(service, client, job_id, 15, attempt=2)
         service.kill("api.server")

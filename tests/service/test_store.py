@@ -153,6 +153,17 @@ def test_the_same_idempotency_key_creates_one_job(store: Store) -> None:
     assert other.id != first.id
 
 
+def test_places_in_the_queue_are_the_order_of_leases(store: Store, clock: Clock) -> None:
+    ids = []
+    for number, priority in enumerate([0, 5, 0, 5, -1, 0]):
+        clock.now += number % 2  # two at a time
+        ids.append(queue(store, priority=priority))
+    found = {store.jobs.detail(job_id, "local")[1]: job_id for job_id in ids}
+    assert {store.jobs.queue_position(store.jobs.get(job_id, None)): job_id for job_id in ids} == found
+    assert [lease(store).job_id for _ in ids] == [found[place] for place in range(1, len(ids) + 1)]
+    assert store.jobs.detail(ids[0], "local")[1] is None
+
+
 def test_of_many_requests_at_once_with_one_key_one_creates(store: Store) -> None:
     found: list[tuple[str, bool]] = []
 
@@ -379,7 +390,7 @@ def test_release_does_not_count_as_failure(store: Store) -> None:
 
 def test_another_owners_job_is_not_there(store: Store) -> None:
     job_id = queue(store, "a")
-    for use in (store.jobs.get, store.jobs.cancel, store.jobs.delete):
+    for use in (store.jobs.get, store.jobs.detail, store.jobs.cancel, store.jobs.delete):
         with pytest.raises(NotFoundError):
             use(job_id, "b")
     with pytest.raises(NotFoundError):
@@ -481,6 +492,9 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(owner=st.sampled_from("ab"), priority=st.integers(0, 1))
     def create(self, owner: str, priority: int) -> None:
+        self.clock.now += (
+            1e-3  # ids sort by time and then by chance, which would make a run one that cannot be repeated
+        )
         job_id = queue(self.store, owner, priority)
         self.status[job_id] = "queued"
 
