@@ -29,7 +29,7 @@ from sgsst_core.collectives import ALONE, Collectives
 from sgsst_core.cost import pieces_of
 from sgsst_core.division import Piece, divide, loads
 from sgsst_core.images import load_image
-from sgsst_core.partition import Rectangle
+from sgsst_core.partition import Rectangle, computed_twice
 from sgsst_core.ply import read_scene
 from sgsst_core.scaling import IterationWork, Link, probe_link
 from worker.process_group import process_group
@@ -125,6 +125,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         return {}
     loss = alone.loss
     pieces = pieces_of(alone.views.cameras[0], loss, None)
+    areas = [[tile.outer.pixels for tile in loss.tiles(*piece.size)] for piece in pieces]
     halo = loss.network.halo
     one, shared = (divide(pieces, halo, (1.0,) * count) for count in (1, collectives.size))
     return {
@@ -140,6 +141,10 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "steps": steps,
         "pieces": [[piece.scale, *piece.size] for piece in pieces],
         "halo": halo,
+        "held_pixels": loss.held,
+        "pixels_one_rank": sum(map(sum, areas)),
+        "pixels_twice_one_rank": sum(computed_twice(each, loss.kept(each)) for each in areas),
+        "working": loss.working,
     }
 
 
@@ -159,9 +164,21 @@ def modelled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) ->
     network = sum(median(steps, part) for part in NETWORK)
     raster = sum(median(steps, part) for part in RASTER)
     pieces = tuple(whole_piece(*values) for values in figures["pieces"])
-    pixels = loads(divide(pieces, figures["halo"], (1.0,)), figures["halo"])[0]
+    pixels, twice = figures["pixels_one_rank"], figures["pixels_twice_one_rank"]
+    forward = median(steps, "vgg_forward") / (pixels + twice)
     fixed = max(median(steps, "total") - network - raster, 0.0)
-    work = IterationWork(pieces, figures["halo"], network / pixels, raster, fixed, gaussians)
+    work = IterationWork(
+        pieces,
+        figures["halo"],
+        (network - forward * twice) / pixels,
+        raster,
+        fixed,
+        gaussians,
+        forward=forward,
+        held=figures["held_pixels"],
+        working=figures["working"],
+        sharing=ranks,
+    )
     seconds = work.seconds(ranks, link)
     return {
         "model_seconds": seconds,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sgsst_core.camera import Camera
 from sgsst_core.division import Piece
-from sgsst_core.partition import Rectangle, covered_region
+from sgsst_core.partition import Rectangle, computed_twice, covered_region
 from sgsst_core.pyramid import downscale
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -73,14 +73,14 @@ class Work:
         again: forward a second time, because activations do not fit.
         without_region: what `pixels` would be if uncovered pixels were not left out.
         tiles: of the full-size view with most tiles.
-        largest: most pixels that are held at a time.
+        peak: most pixels that are held at a time, and what a pass needs beside them counted as such.
     """
 
     pixels: float
     again: float
     without_region: float
     tiles: int
-    largest: int
+    peak: float
 
     @staticmethod
     def of(
@@ -94,8 +94,8 @@ class Work:
     ) -> Work:
         """The work of all scales, or of the coarsest alone; leave_out: uncovered pixels do not go through."""
         pixels = again = without = 0.0
-        tiles = largest = 0
-        held = loss.memory / loss.network.held_bytes_per_pixel()
+        tiles = 0
+        peak = 0.0
         for index in covered:
             camera = cameras[index]
             count = loss.scale_count(camera.height, camera.width)
@@ -104,15 +104,16 @@ class Work:
                 region = _scaled(looked.regions[index], scale, size) if leave_out else None
                 areas = [tile.outer.pixels for tile in loss.tiles(*size, region)]
                 whole = [tile.outer.pixels for tile in loss.tiles(*size)]
-                kept = sum(areas) if len(areas) == 1 else min(sum(areas), max(held - max(areas, default=0), 0))
-                kept = kept if loss.keep_activations else 0
+                flags = loss.kept(areas)
+                twice = computed_twice(areas, flags)
                 pixels += sum(areas)
-                again += sum(areas) - kept
+                again += twice
                 without += sum(whole)
                 tiles = max(tiles, len(areas))
-                largest = max(largest, int(kept) + (max(areas, default=0) if len(areas) > 1 else 0))
+                once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
+                peak = max(peak, sum(areas) - twice + loss.working * max(areas, default=0), (1 + loss.working) * once)
         views = len(covered)
-        return Work(pixels / views, again / views, without / views, tiles, largest)
+        return Work(pixels / views, again / views, without / views, tiles, peak)
 
     def seconds(self, rate: Rate) -> float:
         """Of the feature network and the statistics in one iteration."""
@@ -120,8 +121,7 @@ class Work:
 
     def peak_bytes(self, loss: SosLoss) -> int:
         """Activations at their peak."""
-        network = loss.network
-        return int(self.largest * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel()))
+        return int(self.peak * loss.network.held_bytes_per_pixel())
 
 
 def _scaled(region: Rectangle, scale: int, size: tuple[int, int]) -> Tensor:

@@ -8,6 +8,7 @@ SPST keeps the inner part of each block's pixel gradient instead, which takes a 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -111,6 +112,29 @@ def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
     return [(start, min(start + step, last)) for start in range(first, last, step)]
 
 
+def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
+    """Which tiles' activations stay in memory from the forward to the backward pass: the largest that fit.
+
+    They must be back-propagated before the others, which find their memory free when they are computed again.
+
+    Args:
+        areas: pixels of the tiles that wait for each other.
+        held, working: as for `choose_tile_size`.
+    """
+    kept = [False] * len(areas)
+    room = held - working * max(areas, default=0)
+    for place in sorted(range(len(areas)), key=lambda place: -areas[place]):
+        if areas[place] <= room:
+            kept[place] = True
+            room -= areas[place]
+    return kept
+
+
+def computed_twice(areas: Sequence[int], kept: Sequence[bool]) -> int:
+    """Pixels of the tiles that are not kept: they go forward a second time."""
+    return sum(area for area, flag in zip(areas, kept, strict=True) if not flag)
+
+
 #: Tile sizes that are weighed against each other; below 64, the halo costs more than any memory saved is worth.
 TILE_SIZES = (64, 128, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 
@@ -131,10 +155,9 @@ def choose_tile_size(
     """
 
     def work(size: int | None) -> float:
-        areas = [tile.outer.pixels for tile in partition(height, width, size, halo, region)] or [0]
-        largest = max(areas) * (1 + working)
-        if largest > held and size != TILE_SIZES[0]:
+        areas = [tile.outer.pixels for tile in partition(height, width, size, halo, region)]
+        if max(areas, default=0) * (1 + working) > held and size != TILE_SIZES[0]:
             return math.inf
-        return 2 * sum(areas) + max(sum(areas) - max(held - largest * (len(areas) > 1), 0), 0)
+        return 2 * sum(areas) + computed_twice(areas, kept_tiles(areas, held, working))
 
     return min((None, *TILE_SIZES), key=work)

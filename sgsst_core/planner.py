@@ -132,6 +132,7 @@ def make_plan(
     rasterizer: Rasterizer,
     memory: int,
     collectives: Collectives = ALONE,
+    sharing: int = 1,
 ) -> Plan:
     """Survey the views, time network, rasterizer and what connects the ranks, decide. Every rank gets the same plan.
 
@@ -141,6 +142,7 @@ def make_plan(
         rasterizer: of the whole scene.
         memory: bytes that this rank may plan with.
         collectives: of all ranks that there are.
+        sharing: among how many of them a machine's memory is divided: fewer ranks have more each.
 
     Raises:
         CameraError: no camera sees a Gaussian.
@@ -150,7 +152,7 @@ def make_plan(
     link = probe_link(collectives, rasterizer.device)
     # Timings differ from rank to rank: one decides for all.
     return collectives.from_first(
-        lambda: _decide(scene, cameras, settings, loss, rasterizer, memory, looked, link, collectives.size)
+        lambda: _decide(scene, cameras, settings, loss, rasterizer, memory, looked, link, collectives.size, sharing)
     )
 
 
@@ -164,6 +166,7 @@ def _decide(
     looked: Survey,
     link: Link,
     available: int,
+    sharing: int,
 ) -> Plan:
     plan = _choose(scene, cameras, settings, loss, looked)
     leave_out = plan.weighted and "uncovered" not in settings.keep
@@ -187,12 +190,19 @@ def _decide(
         peak += work.peak_bytes(loss)
         expected = Prediction(work.seconds(rate) + seconds, coarse.seconds(rate) + seconds, int(peak))
         return replace(plan, prediction=expected)
-    samples = _samples(plan, cameras, loss, rate, seconds, leave_out=leave_out)
+    samples = _samples(plan, cameras, loss, rate, seconds, sharing, leave_out=leave_out)
     return _share_out(plan, settings, loss, samples, link, available, int(peak))
 
 
 def _samples(
-    plan: Plan, cameras: Sequence[Camera], loss: SosLoss, rate: Rate, raster: float, *, leave_out: bool
+    plan: Plan,
+    cameras: Sequence[Camera],
+    loss: SosLoss,
+    rate: Rate,
+    raster: float,
+    sharing: int,
+    *,
+    leave_out: bool,
 ) -> tuple[list[IterationWork], list[IterationWork]]:
     """Iterations of some views, for the model of several ranks: of phase 1, and on all scales."""
     fixed = probe(loss, ALIGNMENT).both * ALIGNMENT**2  # as good as no pixel: what it takes is the same for any number
@@ -210,6 +220,10 @@ def _samples(
             fixed * len(pieces),
             gaussians,
             whole_image=not (coarsest and plan.coarse_weights),
+            forward=rate.forward,
+            held=loss.held * sharing,
+            working=loss.working,
+            sharing=sharing,
         )
 
     return [of(index, True) for index in views], [of(index, False) for index in views]

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import torch
 
 from sgsst_core.collectives import Collectives
-from sgsst_core.division import Piece, divide, loads
+from sgsst_core.division import Piece, divide, rounds
+from sgsst_core.partition import choose_tile_size, computed_twice, kept_tiles, partition
 
 #: Channels of the style layers: their statistics travel as n, mean and one half of C, in float64.
 _STYLE_CHANNELS = (64, 128, 256, 512, 512)
@@ -60,6 +61,10 @@ class IterationWork:
         fixed: seconds that every rank needs, however many there are: comparing statistics, the optimiser.
         gaussians: that are optimised.
         whole_image: the full-size image and its gradient are exchanged (phase 1 with kept weights needs neither).
+        forward: seconds a pixel of a forward pass alone, for pixels whose activations do not stay in memory.
+        held, working: pixels whose activations one rank alone can hold, and what a pass needs beside them as a share of
+            them (see `choose_tile_size`).
+        sharing: ranks among which that memory is divided.
     """
 
     pieces: tuple[Piece, ...]
@@ -69,11 +74,30 @@ class IterationWork:
     fixed: float
     gaussians: int
     whole_image: bool = True
+    forward: float = 0.0
+    held: float = math.inf
+    working: float = 0.0
+    sharing: int = 1
 
     def computing(self, ranks: int) -> float:
         """Seconds of the rank with most work."""
-        largest = max(loads(divide(self.pieces, self.halo, (1.0,) * ranks), self.halo))
-        return largest * self.pixel + self.raster / ranks + self.fixed
+        shares = divide(self.pieces, self.halo, (1.0,) * ranks)
+        return max(self._network(share, ranks) for share in shares) + self.raster / ranks + self.fixed
+
+    def _network(self, share: Sequence[Piece], ranks: int) -> float:
+        """Seconds of a rank's pieces, cut into partition tiles as its memory allows."""
+        held = self.held / min(ranks, self.sharing)
+        areas = {piece.scale: self._areas(piece, held) for piece in share if piece.region.pixels}
+        seconds = 0.0
+        for scales in rounds(list(areas), ranks):
+            together = [area for scale in scales for area in areas[scale]]
+            twice = computed_twice(together, kept_tiles(together, held, self.working))
+            seconds += sum(together) * self.pixel + twice * self.forward
+        return seconds
+
+    def _areas(self, piece: Piece, held: float) -> list[int]:
+        size = choose_tile_size(*piece.size, self.halo, held=held, working=self.working, region=piece.region)
+        return [tile.outer.pixels for tile in partition(*piece.size, size, self.halo, piece.region)]
 
     def communication(self, ranks: int, link: Link) -> float:
         """Seconds in which ranks wait for what others send. Statistics of all scales but the last travel meanwhile."""

@@ -17,7 +17,7 @@ from sgsst_core.collectives import ALONE, Collectives, Merged
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.division import Piece, Size, divide, rounds
 from sgsst_core.loss import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
-from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, covered_region, partition
+from sgsst_core.partition import PartitionTile, Rectangle, choose_tile_size, covered_region, kept_tiles, partition
 from sgsst_core.pyramid import (
     add_upscaled_,
     coverage_pyramid,
@@ -167,16 +167,28 @@ class SosLoss:
             return Piece(scale, size, Rectangle(0, 0, *size))
         return Piece(scale, size, covered_region(coverage))
 
+    def kept(self, areas: Sequence[int]) -> list[bool]:
+        """Which of the tiles with so many pixels keep their activations, if they are in memory at the same time."""
+        if not self.keep_activations:
+            return [False] * len(areas)
+        return kept_tiles(areas, self.held, self.working)
+
+    @property
+    def held(self) -> float:
+        """Pixels whose activations the memory holds."""
+        return self.memory / self.network.held_bytes_per_pixel()
+
+    @property
+    def working(self) -> float:
+        """Memory that a tile needs in a pass beside its activations, as a share of them."""
+        return self.network.working_bytes_per_pixel() / self.network.held_bytes_per_pixel()
+
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
         """The partition tiles of a piece, as large as the memory allows."""
         halo = self.network.halo
         tile_size = self.tile_size
         if tile_size is None:
-            held = self.network.held_bytes_per_pixel()
-            working = self.network.working_bytes_per_pixel() / held
-            tile_size = choose_tile_size(
-                *piece.size, halo, held=self.memory / held, working=working, region=piece.region
-            )
+            tile_size = choose_tile_size(*piece.size, halo, held=self.held, working=self.working, region=piece.region)
         tiles = partition(*piece.size, tile_size, halo, piece.region)
         if coverage is None or not self.leave_out:
             return tiles
@@ -295,8 +307,7 @@ class SosLoss:
             statistics, content = self._wait(waiting)
             with self.timer("statistics"):
                 self._compare(pass_, dict(zip(self.style_layers, statistics, strict=True)), content, style[pass_.scale])
-        for pass_ in passes:
-            yield pass_, self._backward(pass_, kept.pop(0)) if gradient else None
+        yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
 
     def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], float]:
         with self.timer("communication"):
@@ -313,13 +324,23 @@ class SosLoss:
                 layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=eps)
                 pass_.terms += layer_terms
 
-    def _backward(self, pass_: _ScalePass, kept: dict[PartitionTile, Activations | None]) -> Tensor:
-        result = torch.zeros(pass_.image.shape, dtype=_gradient_dtype(self.network), device=pass_.image.device)
-        for tile in pass_.tiles:
-            activations = kept.pop(tile) or self._forward(pass_.image, tile)
-            with self.timer("vgg_backward"):
-                result[tile.outer.slices] += self.network.backward(activations, pass_.feature_gradient(tile))
-        return result
+    def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:
+        """Pixel gradient [h, w, 3] of each scale: first of what was kept, which makes room for what was not."""
+        dtype = _gradient_dtype(self.network)
+        results = [torch.zeros(pass_.image.shape, dtype=dtype, device=pass_.image.device) for pass_ in passes]
+        again = [[tile for tile in pass_.tiles if tile not in own] for pass_, own in zip(passes, kept, strict=True)]
+        for pass_, result, own in zip(passes, results, kept, strict=True):
+            while own:
+                tile = next(iter(own))
+                self._backward_tile(pass_, tile, own.pop(tile), result)
+        for pass_, result, tiles in zip(passes, results, again, strict=True):
+            for tile in tiles:
+                self._backward_tile(pass_, tile, self._forward(pass_.image, tile), result)
+        return results
+
+    def _backward_tile(self, pass_: _ScalePass, tile: PartitionTile, activations: Activations, result: Tensor) -> None:
+        with self.timer("vgg_backward"):
+            result[tile.outer.slices] += self.network.backward(activations, pass_.feature_gradient(tile))
 
     def _content(self, view: ViewTarget, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures | None:
         if not self.content_weight:
@@ -332,16 +353,11 @@ class SosLoss:
 
     def _first_passes(
         self, passes: Sequence[_ScalePass], *, keep: bool
-    ) -> tuple[list[Merged], list[dict[PartitionTile, Activations | None]]]:
+    ) -> tuple[list[Merged], list[dict[PartitionTile, Activations]]]:
         """For each scale, the merge of its statistics and content loss under way, and the activations that fit."""
         merged: list[Merged] = []
-        kept: list[dict[PartitionTile, Activations | None]] = []
-        tiles = [tile for pass_ in passes for tile in pass_.tiles]
-        held = self.network.held_bytes_per_pixel()
-        # Whatever is kept, there must be room to back-propagate the largest tile.
-        budget = self.memory - max((tile.outer.pixels for tile in tiles), default=0) * (
-            held + self.network.working_bytes_per_pixel()
-        )
+        kept: list[dict[PartitionTile, Activations]] = []
+        fits = iter(self.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
             statistics = [
                 LayerStatistics.zero(self.network.channels(layer), pass_.image.device) for layer in self.style_layers
@@ -349,15 +365,15 @@ class SosLoss:
             content = 0.0
             kept.append({})
             for tile in pass_.tiles:
-                keep_this = keep and self.keep_activations and (len(tiles) == 1 or tile.outer.pixels * held <= budget)
-                budget -= tile.outer.pixels * held if keep_this else 0
+                keep_this = next(fits) and keep
                 activations = self._forward(pass_.image, tile, keep=keep_this)
                 with self.timer("statistics"):
                     for place, layer in enumerate(self.style_layers):
                         part = pass_.statistics(layer, tile, activations.features[layer])
                         statistics[place] = merge(statistics[place], part)
                     content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
-                kept[-1][tile] = activations if keep_this else None
+                if keep_this:
+                    kept[-1][tile] = activations
             merged.append(self.collectives.merge_statistics(statistics, content))
         return merged, kept
 

@@ -169,11 +169,15 @@ class Stylizer:
         self.photos = photos
         self.style = style
         self.network, precision = choose_network(self.weights, settings, collectives)
-        self._agree_on_memory(collectives)
+        limit = settings.memory_limit or default_memory_limit(self.network.device)
+        #: The partition follows from it, and so does rounding: it must be the same on all ranks.
+        self.memory_limit = min(collectives.gather(limit))
+        sharing = self._sharing(collectives)
+        self.memory = self.memory_limit // sharing
         cameras = fit_cameras(cameras, settings)
         if plan is None:
             whole = self._rasterizer(scene, "cpu" if rasterizer in ("auto", "cached") else rasterizer)
-            plan = make_plan(scene, cameras, settings, self._loss(ALONE), whole, self.memory, collectives)
+            plan = make_plan(scene, cameras, settings, self._loss(ALONE), whole, self.memory, collectives, sharing)
             plan.decisions.extend(precision)
         self.plan = plan
         self._join(collectives)
@@ -209,14 +213,9 @@ class Stylizer:
         self._process = psutil.Process()
         self._start: Evaluation | None = None
 
-    def _agree_on_memory(self, collectives: Collectives) -> None:
-        """What each rank may plan with: the partition, and so rounding, must be the same on all of them."""
-        device = self.network.device
-        limit = self.settings.memory_limit or default_memory_limit(device)
-        sharing = 1 if device.type == "cuda" else collectives.local_size
-        limits = collectives.gather((limit, sharing))
-        self.memory_limit = min(limit for limit, _ in limits)
-        self.memory = min(limit // sharing for limit, sharing in limits)
+    def _sharing(self, collectives: Collectives) -> int:
+        """Most ranks that have to share the memory of a machine; each GPU has its own."""
+        return max(collectives.gather(1 if self.network.device.type == "cuda" else collectives.local_size))
 
     def _join(self, collectives: Collectives) -> None:
         """Take part in what the plan needs, in the group whose views are this rank's."""
@@ -224,6 +223,7 @@ class Stylizer:
         if taking_part is None:
             raise RankLeftOut
         self.collectives = taking_part
+        self.memory = self.memory_limit // self._sharing(taking_part)
         self.groups = math.gcd(self.settings.views_per_step, taking_part.size)
         self.group = taking_part.split(self.groups)
         expected = self.plan.prediction

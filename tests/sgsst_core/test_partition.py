@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sgsst_core.partition import Rectangle, choose_tile_size, covered_region, partition
+from sgsst_core.partition import Rectangle, choose_tile_size, computed_twice, covered_region, kept_tiles, partition
 from sgsst_core.vgg import STYLE_LAYERS, layer_stride
 
 
@@ -60,3 +60,21 @@ def test_region_holds_what_is_covered_and_no_more_than_it_must():
 
 def test_work_outside_the_region_does_not_count():
     assert choose_tile_size(4000, 4000, 64, held=1e6, working=0.5, region=Rectangle(1600, 1600, 2000, 2000)) is None
+
+
+@pytest.mark.parametrize("held", [0.0, 90.0, 130.0, 250.0, 299.0, 1000.0])
+@pytest.mark.parametrize("working", [0.0, 0.4])
+def test_what_is_kept_fits_beside_the_pass_in_hand_and_leaves_no_room_for_another_tile(held, working):
+    areas = [40, 100, 60, 100]
+    kept = kept_tiles(areas, held, working)
+    total = sum(area for area, flag in zip(areas, kept, strict=True) if flag)
+    others = [area for area, flag in zip(areas, kept, strict=True) if not flag]
+    assert total == 0 or total + working * max(areas) <= held
+    assert all(total + area + working * max(areas) > held for area in others)
+    assert computed_twice(areas, kept) == sum(areas) - total
+
+
+def test_a_view_that_just_fits_is_kept_whole():
+    assert kept_tiles([100], 140.0, 0.4) == [True]
+    assert kept_tiles([100], 139.0, 0.4) == [False]
+    assert choose_tile_size(1000, 1000, 64, held=1.4e6, working=0.4) is None

@@ -65,3 +65,14 @@ def test_many_ranks_are_looked_at_in_steps() -> None:
     found = choose_ranks([(0, [work()]), (1, [work()])], 1, 64, FREE)
     assert {1, 2, 3, 4, 8, 64} <= set(found.seconds)
     assert len(found.seconds) < 25
+
+
+def test_what_does_not_fit_the_memory_goes_forward_twice() -> None:
+    """Two ranks of one machine have half of its memory each, and hold all scales at once."""
+    pixels = 1.25 * 720 * 1280
+    roomy = replace(work(), forward=1e-6, held=2 * pixels, working=0.1, sharing=2)
+    tight = replace(roomy, held=pixels)
+    assert tight.computing(1) == roomy.computing(1) == replace(roomy, held=math.inf).computing(1)
+    assert tight.computing(2) > 1.1 * roomy.computing(2)
+    assert replace(tight, sharing=1).computing(2) == roomy.computing(2)
+    assert roomy.computing(2) == pytest.approx(work().computing(2))

@@ -38,10 +38,11 @@ def gradient(
     dtype: torch.dtype,
     tile_size: int | None,
     speeds: tuple[float, ...] | None = None,
-) -> tuple[Tensor, float]:
-    """Colour gradient [N, 3] and SOS loss of one view, two or three scales."""
+    memory: int = 1 << 34,
+) -> tuple[Tensor, float, list[bool]]:
+    """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
     network = FeatureNetwork(load_weights("vgg16"), (*STYLE_LAYERS, CONTENT_LAYER), dtype)
-    loss = SosLoss(network, tile_size=tile_size, coarsest=40, collectives=collectives)
+    loss = SosLoss(network, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives)
     loss.speeds = speeds or loss.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     looked = survey(scene, [camera], rasterizer)
@@ -62,7 +63,9 @@ def gradient(
     colours = views.colours(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
     result = loss.evaluate(views.render(0, colours), targets, target, scales)
     assert result.image_gradient is not None
-    return views.gradient(0, result.image_gradient, colours), result.loss
+    assert target.share is not None
+    kept = loss.kept([tile.outer.pixels for tiles in target.share.tiles.values() for tile in tiles])
+    return views.gradient(0, result.image_gradient, colours), result.loss, kept
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
@@ -81,9 +84,9 @@ def test_gradient_is_that_of_one_rank(
     dtype: torch.dtype, ranks: int, width: int, height: int, tile_size: int | None, scene: Scene
 ) -> None:
     camera = cameras(1, width, height)[0]
-    expected, loss = gradient(ALONE, scene, camera, dtype, tile_size)
+    expected, loss, _ = gradient(ALONE, scene, camera, dtype, tile_size)
     results = on_ranks(ranks, gradient, scene, camera, dtype, tile_size)
-    for found, found_loss in results:
+    for found, found_loss, _ in results:
         assert relative_error(found, expected) < BOUNDS[dtype]
         assert found_loss == pytest.approx(loss, rel=BOUNDS[dtype])
         assert torch.equal(found, results[0][0])
@@ -91,8 +94,18 @@ def test_gradient_is_that_of_one_rank(
 
 def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
-    expected, loss = gradient(ALONE, scene, camera, torch.float64, None)
-    for found, found_loss in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
+    expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
+    for found, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
+        assert relative_error(found, expected) < 1e-9
+        assert found_loss == pytest.approx(loss, rel=1e-9)
+
+
+def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
+    scene, camera = wall(), cameras(1, 128, 96)[0]
+    expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
+    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, 70 << 20)
+    assert set(results[0][2]) == {True, False}
+    for found, found_loss, _ in results:
         assert relative_error(found, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 
