@@ -63,10 +63,11 @@ def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: 
         wanted = network.forward(content[tile.outer.slices], keep=False).features[CONTENT_LAYER]  # content forward
         activations = network.forward(image[tile.outer.slices])  # second forward
 
-        def pull(layer: str, features: Tensor, wanted: Tensor = wanted) -> Tensor:
+        def pull(layer: str, features: Tensor, so_far: Tensor, wanted: Tensor = wanted) -> None:
             if layer == CONTENT_LAYER:
-                return content_loss(features, wanted, cells, 1.0)[1]
-            return maps[layer].apply(features)
+                so_far += content_loss(features, wanted, cells, 1.0)[1]
+            else:
+                maps[layer].add_to(so_far, features)
 
         gradient = network.backward(activations, pull)
         inner = Rectangle(

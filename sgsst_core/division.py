@@ -101,12 +101,12 @@ def _cuts(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
     def part(region: Rectangle) -> Piece:
         return Piece(piece.scale, piece.size, region)
 
+    for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):  # first: rows lie together in memory
+        upper = part(Rectangle(area.top, area.left, row, area.right))
+        cuts.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
     for column in range(area.left + ALIGNMENT, area.right, ALIGNMENT):
         left = part(Rectangle(area.top, area.left, area.bottom, column))
         cuts.append((left, part(Rectangle(area.top, column, area.bottom, area.right))))
-    for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):
-        upper = part(Rectangle(area.top, area.left, row, area.right))
-        cuts.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
     return cuts
 
 

@@ -75,10 +75,15 @@ class StyleGradient:
     offset: Tensor  # [c] float64
 
     def apply(self, features: Tensor, weights: Tensor | None = None) -> Tensor:
-        """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w], chunk by chunk."""
+        """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
+        result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
+        self.add_to(result, features, weights)
+        return result
+
+    def add_to(self, gradient: Tensor, features: Tensor, weights: Tensor | None = None) -> None:
+        """Add `apply` to a gradient [h, w, c] in place, chunk by chunk: nothing as large as the features is made."""
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
-        result = torch.empty(features.shape, dtype=features.dtype, device=features.device)
         height, width, channels = features.shape
         rows = max(1, CHUNK_VALUES // max(width * channels, 1))
         for top in range(0, height, rows):
@@ -86,8 +91,7 @@ class StyleGradient:
             part = torch.addmm(offset, centred.reshape(-1, channels), matrix).view(centred.shape)
             if weights is not None:
                 part = part.mul_(weights[top : top + rows, :, None].to(precision))
-            result[top : top + rows] = part
-        return result
+            gradient[top : top + rows] += part
 
 
 def style_loss(

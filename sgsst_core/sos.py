@@ -436,27 +436,17 @@ class _ScalePass:
         )
 
     def feature_gradient(self, tile: PartitionTile) -> FeatureGradient:
-        """dE/dfeatures of one tile, zero on cells that it does not own."""
+        """Adds dE/dfeatures of one tile, which is zero on cells that it does not own."""
 
-        def gradient(layer: str, features: Tensor) -> Tensor | None:
-            with self._timer("statistics"):
-                return timed(layer, features)
-
-        def timed(layer: str, features: Tensor) -> Tensor | None:
+        def add(layer: str, features: Tensor, gradient: Tensor) -> None:
             view, own = tile.owned_cells(layer, self.size)
-            if layer == CONTENT_LAYER:
-                owned = self.content_loss(tile, features)[1]
-            elif layer in self.maps:
-                owned = self.maps[layer].apply(features[own.slices], self.weights(layer, view))
-            else:
-                owned = None
-            if owned is None or owned.shape == features.shape:
-                return owned
-            embedded = torch.zeros(features.shape, dtype=owned.dtype, device=owned.device)
-            embedded[own.slices] = owned
-            return embedded
+            with self._timer("statistics"):
+                if layer in self.maps:
+                    self.maps[layer].add_to(gradient[own.slices], features[own.slices], self.weights(layer, view))
+                elif layer == CONTENT_LAYER and (owned := self.content_loss(tile, features)[1]) is not None:
+                    gradient[own.slices] += owned
 
-        return gradient
+        return add
 
 
 def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:

@@ -34,7 +34,7 @@ def layer_stride(layer: str) -> int:
     return 1 << (int(layer[4]) - 1)
 
 
-FeatureGradient = Callable[[str, Tensor], Tensor | None]
+FeatureGradient = Callable[[str, Tensor, Tensor], None]
 
 
 @dataclass
@@ -165,8 +165,8 @@ class FeatureNetwork:
 
         Args:
             kept: a forward pass made with keep=True; its tensors are released on the way.
-            feature_gradient: called for each reported layer, deepest first, with its name and features [h, w, c];
-                returns dL/dfeatures [h, w, c] or None for zero.
+            feature_gradient: called for each reported layer, deepest first, with its name, its features [h, w, c] and
+                the gradient [h, w, c] so far; adds dL/dfeatures to it in place.
 
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
@@ -180,10 +180,8 @@ class FeatureNetwork:
                 continue
             features = kept.features.pop(step.layer, None)
             if features is not None and features.numel():
-                own = feature_gradient(step.layer, features)
-                if own is not None:
-                    own = own.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
-                    gradient = own if gradient is None else gradient.add_(own)
+                gradient = torch.zeros_like(output) if gradient is None else gradient
+                feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0))
             if gradient is not None:
                 gradient = torch.ops.aten.threshold_backward(gradient, output, 0)
                 gradient = F.conv2d(gradient, step.backward_weight, padding=1)

@@ -350,17 +350,19 @@ class _Job:
                 raise _Lost(f"{self._name(rank)} was lost: {_first_line(error)}", None) from error
 
     def _leave_out(self, rank: _Rank) -> None:
-        """End a rank that the plan does without, and let go of its GPU, where that is this machine's.
+        """End a rank that the plan does without, and let go of its GPU.
 
         On a cluster its place stays reserved until the attempt ends: Ray gives places back together only.
         """
         import ray
 
         assert rank.place is not None
-        if not self._cluster.local or not rank.place.gpus:
+        if not self._cluster.local:
             return
         ray.kill(rank.actor, no_restart=True)
         kill([rank.place.process])  # what it held of the GPU is free when it is gone
+        if not rank.place.gpus:
+            return
         kept = [gpu for other in self._ranks if other.place and not other.left_out for gpu in other.place.gpus]
         self._workers, self._let_go = len(kept), True
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)  # for the next attempt

@@ -1,4 +1,4 @@
-"""Ranks that the plan does without: on GPUs they end at once, so that others can have these."""
+"""Ranks that the plan does without end at once; what they had is there for others."""
 
 from __future__ import annotations
 
@@ -23,6 +23,21 @@ pytestmark = [
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = 16
+
+
+def ranks_that_run() -> int:
+    """Processes of ranks below this one."""
+    children = psutil.Process().children(recursive=True)
+    return sum("FaultyRank" in " ".join(child.cmdline()) for child in children if child.is_running())
+
+
+def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_path: Path) -> None:
+    request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
+    ranks_alive: list[int] = []
+    listener = Listener(progress=lambda now: ranks_alive.append(ranks_that_run()))
+    ended = stylize_on_ranks(request, 2, listener, options=WorkerOptions(actor=FaultyRank))
+    assert ended.step == STEPS
+    assert ranks_alive[-1] == 1
 
 
 def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
@@ -55,9 +70,7 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
 
     def progress(now: Progress) -> None:
         if given_back:
-            children = psutil.Process().children(recursive=True)
-            titles = [" ".join(child.cmdline()) for child in children if child.is_running()]
-            ranks_alive.append(sum("FaultyRank" in title for title in titles))
+            ranks_alive.append(ranks_that_run())
 
     options = WorkerOptions(checkpoint_seconds=0.2, actor=FaultyRank)
     listener = Listener(progress=progress, left_out=left_out, happened=happened.append)
