@@ -84,7 +84,7 @@ class Chaos:
 
     def run(self) -> RanksResult:
         """The job to its end."""
-        options = WorkerOptions(RANK_TIMEOUT, CHECKPOINT_SECONDS, FaultyRank)
+        options = WorkerOptions(RANK_TIMEOUT, CHECKPOINT_SECONDS, actor=FaultyRank)
         listener = Listener(progress=self._progress, happened=self._happened)
         ended = stylize_on_ranks(self._request, 2, listener, options=options, cluster=self._cluster)
         if self._current is not None:
@@ -191,6 +191,8 @@ def main() -> None:
                 same = request.out.read_bytes() == content
                 jobs.append({"faults": len(chaos.found), "loss_relative_error": difference, "same_file": same})
                 print(json.dumps(jobs[-1]), flush=True)
+                if not chaos.found:
+                    sys.exit("No fault has happened in a whole job.")
     killed = [entry for entry in found if entry["fault"].get("what") == "SIGKILL" and "seconds_to_running" in entry]
     seconds = sorted(entry["seconds_to_running"] for entry in killed)
     figures = {
