@@ -221,6 +221,7 @@ class _Job:
                 except self._ray_errors() as error:
                     raise _Lost(f"Ray failed: {_first_line(error)}", error) from error
                 finally:
+                    self._lost_at = time.monotonic()
                     self._end_ranks()
             except _Lost as lost:
                 self._note(lost, useless=(self._step, self._saved) == before)
@@ -456,7 +457,6 @@ class _Job:
             Exception: what the last two attempts failed with, where it was the same at the same step.
             RanksFailedError: nothing is gained by another attempt.
         """
-        self._lost_at = time.monotonic()
         again = bool(self._attempts) and (lost.reason, self._last_step) == (
             self._attempts[-1].reason,
             self._attempts[-1].last_step,

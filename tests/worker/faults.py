@@ -61,6 +61,7 @@ class Fault:
             if calls != self.call:
                 return original(*arguments, **options)
             _file(request).rename(_fired(request))  # the next attempt is left alone
+            os.utime(_fired(request))  # now: a file keeps its time under another name
             if self.what == "full":
                 with _full_disk():
                     return original(*arguments, **options)
