@@ -9,6 +9,9 @@ from collections import deque
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 
+from pydantic_core import to_jsonable_python
+
+from api.views import utc
 from service.store import Store
 from service.store.jobs import FINISHED
 from service.store.tables import EventRow
@@ -144,5 +147,8 @@ def _wake(channel: _Channel) -> None:
 
 
 def _item(row: EventRow) -> Item:
-    text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(row.data)}\n\n"
+    data = row.data
+    if row.kind == "progress":  # as the job's own view says it
+        data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
+    text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
     return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in _ENDED)

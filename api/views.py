@@ -279,12 +279,13 @@ class Health(BaseModel):
 ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health)
 
 
-def _time(seconds: float) -> datetime:
+def utc(seconds: float) -> datetime:
+    """A moment, given in seconds since the epoch."""
     return datetime.fromtimestamp(seconds, UTC)
 
 
 def _maybe(seconds: float | None) -> datetime | None:
-    return None if seconds is None else _time(seconds)
+    return None if seconds is None else utc(seconds)
 
 
 def job_view(job: JobRow, queue_position: int | None) -> JobView:
@@ -297,7 +298,7 @@ def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRo
     shown = [
         AttemptView(
             number=row.number,
-            started_at=_time(row.started_at),
+            started_at=utc(row.started_at),
             finished_at=_maybe(row.finished_at),
             outcome=row.outcome,  # type: ignore[arg-type]
             error=ErrorView(**row.error) if row.error else None,
@@ -314,13 +315,13 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "created_at": _time(job.created_at),
+        "created_at": utc(job.created_at),
         "started_at": _maybe(job.started_at),
         "finished_at": _maybe(job.finished_at),
         "expires_at": _maybe(job.expires_at),
         "attempt": job.attempt,
         "queue_position": queue_position,
-        "progress": ProgressView(**{**progress, "updated_at": _time(progress["updated_at"])}) if progress else None,
+        "progress": ProgressView(**{**progress, "updated_at": utc(progress["updated_at"])}) if progress else None,
         "result": job.result,
         "error": ErrorView(**job.error) if job.error else None,
         "parameters": JobParameters(**job.parameters),
@@ -349,7 +350,7 @@ def artifact_view(row: ArtifactRow) -> ArtifactView:
         size=row.size,
         sha256=row.sha256,
         media_type=media_type(row.name),
-        created_at=_time(row.created_at),
+        created_at=utc(row.created_at),
         url=f"/v1/jobs/{row.job_id}/artifacts/{row.name}",
     )
 
@@ -363,5 +364,5 @@ def upload_view(row: UploadRow) -> UploadView:
         offset=row.offset,
         complete=row.sha256 is not None,
         sha256=row.sha256,
-        expires_at=_time(row.expires_at),
+        expires_at=utc(row.expires_at),
     )

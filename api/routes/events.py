@@ -29,7 +29,15 @@ _EVENT = {
 }
 _EXAMPLES = {
     "status": {"status": "running", "attempt": 1},
-    "progress": {"stage": "sos", "step": 120, "total": 300, "fraction": 0.4, "eta_s": 310.5, "attempt": 1},
+    "progress": {
+        "stage": "sos",
+        "step": 120,
+        "total": 300,
+        "fraction": 0.4,
+        "eta_s": 310.5,
+        "attempt": 1,
+        "updated_at": "2026-11-21T14:02:11Z",
+    },
     "artifact": {"name": "previews/000100.jpg", "size": 41239, "sha256": SHA256},
 }
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,7 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
         assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
         steps = [data["step"] for _, kind, data in seen if kind == "progress"]
+        assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
         assert steps == sorted(steps)
         assert steps[-1] == STEPS
         middle = seen[len(seen) // 2][0]
