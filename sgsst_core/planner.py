@@ -253,10 +253,12 @@ def _share_out(
 
     largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in samples[1])
     held = loss.network.held_bytes_per_pixel() + loss.network.working_bytes_per_pixel()
+    sharing = samples[1][0].sharing
+    memory = loss.memory * sharing / min(ranks, sharing)  # of fewer ranks, each has more
     expected = Prediction(
-        mean(work.seconds(each, link) for work in samples[1]),
-        mean(work.seconds(each, link) for work in samples[0]),
-        peak + int(min(largest * held, loss.memory)),
+        mean(work.seconds(each, link, groups) for work in samples[1]),
+        mean(work.seconds(each, link, groups) for work in samples[0]),
+        peak + int(min(largest * held, memory)),
         mean(work.communication(each, link) for work in samples[1]),
         mean(work.seconds(1, link) for work in samples[1]) * groups,
     )

@@ -79,14 +79,14 @@ class IterationWork:
     working: float = 0.0
     sharing: int = 1
 
-    def computing(self, ranks: int) -> float:
-        """Seconds of the rank with most work."""
+    def computing(self, ranks: int, groups: int = 1) -> float:
+        """Seconds of the rank with most work, where so many groups of ranks take a view each."""
         shares = divide(self.pieces, self.halo, (1.0,) * ranks)
-        return max(self._network(share, ranks) for share in shares) + self.raster / ranks + self.fixed
+        held = self.held / min(ranks * groups, self.sharing)
+        return max(self._network(share, ranks, held) for share in shares) + self.raster / ranks + self.fixed
 
-    def _network(self, share: Sequence[Piece], ranks: int) -> float:
+    def _network(self, share: Sequence[Piece], ranks: int, held: float) -> float:
         """Seconds of a rank's pieces, cut into partition tiles as its memory allows."""
-        held = self.held / min(ranks, self.sharing)
         areas = {piece.scale: self._areas(piece, held) for piece in share if piece.region.pixels}
         seconds = 0.0
         for scales in rounds(list(areas), ranks):
@@ -108,9 +108,9 @@ class IterationWork:
         statistics = link.sum(_FIRST_BYTES, ranks) + link.sum(_SECOND_BYTES, ranks)
         return image + statistics + link.sum(self.gaussians * 12, ranks)
 
-    def seconds(self, ranks: int, link: Link) -> float:
-        """Of one iteration."""
-        return self.computing(ranks) + self.communication(ranks, link)
+    def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
+        """Of one iteration of one view, on each of so many groups of ranks."""
+        return self.computing(ranks, groups) + self.communication(ranks, link)
 
 
 def probe_link(collectives: Collectives, device: torch.device) -> Link:
@@ -183,7 +183,7 @@ def _schedule_seconds(
     each = ranks // groups
     total = 0.0
     for steps, works in phases:
-        mean = sum(work.seconds(each, link) for work in works) / len(works)
+        mean = sum(work.seconds(each, link, groups) for work in works) / len(works)
         across = link.sum(works[0].gaussians * 12, ranks) if groups > 1 else 0.0
         total += steps * (mean * views_per_step / groups + across)
     return total

@@ -75,4 +75,5 @@ def test_what_does_not_fit_the_memory_goes_forward_twice() -> None:
     assert tight.computing(1) == roomy.computing(1) == replace(roomy, held=math.inf).computing(1)
     assert tight.computing(2) > 1.1 * roomy.computing(2)
     assert replace(tight, sharing=1).computing(2) == roomy.computing(2)
+    assert tight.computing(1, groups=2) > tight.computing(1), "groups share memory as well"
     assert roomy.computing(2) == pytest.approx(work().computing(2))
