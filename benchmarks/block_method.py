@@ -10,12 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.loss import content_loss, style_loss
-from sgsst_core.partition import PartitionTile, Rectangle
-from sgsst_core.pyramid import add_upscaled_, downscale, scale_count
-from sgsst_core.sos import ScaleTarget
-from sgsst_core.statistics import layer_statistics, merge_all
-from sgsst_core.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.features.statistics import layer_statistics, merge_all
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import ScaleTarget
+from sgsst_core.loss.terms import content_loss, style_loss
+from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count
 
 BLOCK = 512
 MARGIN = 256

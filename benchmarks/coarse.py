@@ -20,16 +20,16 @@ from torch import Tensor
 
 from benchmarks.machine import write_result
 from benchmarks.rasterizer import timed
-from sgsst_core.camera import Camera, orbit, resized
-from sgsst_core.camera_files import read_cameras
-from sgsst_core.ply import read_scene
-from sgsst_core.pyramid import add_upscaled_, downscale
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.scene import Scene
-from sgsst_core.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.camera import Camera, orbit, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import add_upscaled_, downscale
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 
 
 def at_full_size(rasterizer: Rasterizer, colours: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:

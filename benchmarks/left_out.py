@@ -21,9 +21,9 @@ from typing import Any
 from benchmarks.cameras import read_views
 from benchmarks.machine import write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.images import load_image
-from sgsst_core.ply import read_scene
-from sgsst_core.report import peak_memory
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.report.document import peak_memory
 from sgsst_core.settings import EVERYTHING
 
 

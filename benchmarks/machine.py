@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import torch
 
-from sgsst_core.files import atomic_path
+from sgsst_core.files.atomic import atomic_path
 
 RESULTS = Path(__file__).parent / "results"
 _PACKAGES = ("torch", "numpy", "numba")

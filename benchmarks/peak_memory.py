@@ -11,9 +11,9 @@ import time
 
 from benchmarks.machine import write_result
 from benchmarks.pictures import picture
-from sgsst_core.sos import SosLoss
-from sgsst_core.vgg import FeatureNetwork
-from sgsst_core.weights import load_weights
+from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
 
 
 def main() -> None:

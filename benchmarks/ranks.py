@@ -23,16 +23,16 @@ import torch
 
 from benchmarks.machine import write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.camera import Camera, spread
-from sgsst_core.camera_files import read_cameras
-from sgsst_core.collectives import ALONE, Collectives
-from sgsst_core.cost import pieces_of
-from sgsst_core.division import Piece, divide, loads
-from sgsst_core.images import load_image
-from sgsst_core.partition import Rectangle, computed_twice
-from sgsst_core.ply import read_scene
-from sgsst_core.scaling import IterationWork, Link, probe_link
-from worker.process_group import process_group
+from sgsst_core.features.partition import Rectangle, computed_twice
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel.division import Piece, divide, loads
+from sgsst_core.planning.cost import pieces_of
+from sgsst_core.planning.ranks_model import IterationWork, Link, probe_link
+from sgsst_core.scene.camera import Camera, spread
+from worker.ranks.process_group import process_group
 
 NETWORK = ("vgg_forward", "vgg_backward", "statistics")
 RASTER = ("render", "raster_backward")

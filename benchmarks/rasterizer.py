@@ -21,15 +21,15 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import write_result
-from sgsst_core.camera import Camera, orbit
-from sgsst_core.camera_files import read_cameras
-from sgsst_core.ply import read_scene
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene import Scene
-from sgsst_core.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.camera import Camera, orbit
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 
 WIDTH, HEIGHT = 1280, 720
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"

@@ -13,11 +13,11 @@ from dataclasses import asdict
 from typing import Any
 
 from benchmarks.machine import write_result
-from sgsst_core.division import Piece, divide, loads
-from sgsst_core.partition import Rectangle
-from sgsst_core.pyramid import scale_count
-from sgsst_core.scaling import IterationWork, Link
-from sgsst_core.vgg import HALO
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.features.vgg import HALO
+from sgsst_core.parallel.division import Piece, divide, loads
+from sgsst_core.planning.ranks_model import IterationWork, Link
+from sgsst_core.scene.pyramid import scale_count
 
 RANKS = (1, 2, 4, 8, 16, 32, 64)
 #: VGG19 up to relu5_1: operations a pixel, forward, and as many backward.

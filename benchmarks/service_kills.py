@@ -30,7 +30,7 @@ from typing import Any
 import httpx
 
 from benchmarks.machine import write_result
-from sgsst_core.ply import read_scene
+from sgsst_core.files.ply import read_scene
 from tests.api.service import Service, undisturbed
 from tests.small_scenes import wall, write_files
 
@@ -46,7 +46,12 @@ SETTINGS = {
     "SGSST_CHECKPOINT_SECONDS": "1",
     "SGSST_POLL_SECONDS": "0.5",
 }
-API, DISPATCHER, ATTEMPT, RANK = "api.server", "service.dispatcher", "service.attempt_process", "ray::RankProcess"
+API, DISPATCHER, ATTEMPT, RANK = (
+    "api.http.server",
+    "service.scheduling.dispatcher",
+    "service.scheduling.attempt_process",
+    "ray::RankProcess",
+)
 EVERYTHING = "sgsst serve"
 #: Mean seconds between two kills of one kind.
 EVERY = {API: 9.0, DISPATCHER: 30.0, ATTEMPT: 30.0, EVERYTHING: 120.0}

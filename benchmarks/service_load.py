@@ -43,7 +43,7 @@ SETTINGS = {
     "SGSST_MIN_FREE_BYTES": "1000000000",
 }
 _TUS = {"Tus-Resumable": "1.0.0"}
-_API = "api.server"
+_API = "api.http.server"
 _SUBMITTERS, _STATUS_CONNECTIONS = 16, 32
 _PIECE = 1 << 20
 

@@ -12,11 +12,11 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.cameras import read_views
-from sgsst_core.camera import Camera
-from sgsst_core.ply import read_scene
+from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene import Scene
-from sgsst_core.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 
 _LABEL = 22
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from benchmarks.block_method import block_gradient
 from benchmarks.machine import write_result
 from benchmarks.pictures import picture
-from sgsst_core.sos import SosLoss
-from sgsst_core.vgg import FeatureNetwork
-from sgsst_core.weights import load_weights
+from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
 
 #: Activations of a 2048x2048 view stay in memory: 1.3 KB a pixel in float32.
 MEMORY = 12 << 30

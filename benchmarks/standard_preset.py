@@ -18,9 +18,9 @@ from typing import Any
 from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.images import load_image
-from sgsst_core.ply import read_scene, write_stylized
-from sgsst_core.stylizer import mean_loss
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene, write_stylized
+from sgsst_core.stylizing.stylizer import mean_loss
 
 #: Shares of each phase after which all views are evaluated.
 MARKS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)

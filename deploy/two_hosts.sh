@@ -71,7 +71,7 @@ python - "$WORK" <<'PYTHON'
 import sys
 from pathlib import Path
 
-from api.demo_scene import build_demo
+from api.cli.demo_scene import build_demo
 
 build_demo(Path(sys.argv[1]) / "scene")
 PYTHON

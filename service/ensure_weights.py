@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from sgsst_core.errors import SgsstError
-from sgsst_core.weights import fetch_weights, list_weights
+from sgsst_core.features.network_weights import fetch_weights, list_weights
 
 
 def main() -> int:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.names import RESULT
+from service.files.names import RESULT
+from service.files.staging import Staged
 from service.parameters import JobParameters
-from service.staging import Staged
 from worker.job import SceneRequest, StylizeRequest
 
 

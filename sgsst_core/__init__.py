@@ -6,20 +6,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sgsst_core.camera import Camera
-    from sgsst_core.loop import Callbacks, Progress, run, stylize
-    from sgsst_core.scene import Scene
+    from sgsst_core.scene.camera import Camera
+    from sgsst_core.scene.gaussians import Scene
     from sgsst_core.settings import Settings, make_settings
-    from sgsst_core.stylizer import Stylizer
+    from sgsst_core.stylizing.loop import Callbacks, Progress, run, stylize
+    from sgsst_core.stylizing.stylizer import Stylizer
 
 __all__ = ["Callbacks", "Camera", "Progress", "Scene", "Settings", "Stylizer", "make_settings", "run", "stylize"]
 
 _MODULES = {
-    "Camera": "camera",
-    "Scene": "scene",
+    "Callbacks": "stylizing.loop",
+    "Camera": "scene.camera",
+    "Progress": "stylizing.loop",
+    "Scene": "scene.gaussians",
     "Settings": "settings",
-    "Stylizer": "stylizer",
+    "Stylizer": "stylizing.stylizer",
     "make_settings": "settings",
+    "run": "stylizing.loop",
+    "stylize": "stylizing.loop",
 }
 
 
@@ -27,4 +31,4 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for when it is asked for: PyTorch takes seconds, which `sgsst --help` does without."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES.get(name, 'loop')}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sgsst_core.errors import WeightsError
-from sgsst_core.weights import BackboneWeights, fetch_weights, load_weights
+from sgsst_core.features.network_weights import BackboneWeights, fetch_weights, load_weights
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

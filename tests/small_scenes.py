@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from sgsst_core.camera import Camera, look_at
-from sgsst_core.ply import write_scene
-from sgsst_core.scene import Scene
+from sgsst_core.files.ply import write_scene
+from sgsst_core.scene.camera import Camera, look_at
+from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.pictures import picture
 
 WIDTH, HEIGHT = 64, 48

@@ -16,19 +16,17 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from sgsst_core.camera import Camera, orbit, resized, spread
-from sgsst_core.camera_files import read_cameras
-from sgsst_core.check import Finding, check_scene, check_style, check_views
-from sgsst_core.checkpoint import Checkpoint, Checkpoints, fingerprint, versions
-from sgsst_core.collectives import ALONE, Collectives
 from sgsst_core.errors import CameraError, CheckpointError, OutputError, SettingsError, SgsstError
-from sgsst_core.files import ensure_writable_folder, remove_leftovers
-from sgsst_core.images import check_photos, load_image, load_photo
-from sgsst_core.loop import Callbacks, Progress, Stopped, run
-from sgsst_core.measure import Measurements, with_measuring
-from sgsst_core.ply import SceneFile, write_stylized
+from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.files.atomic import ensure_writable_folder, remove_leftovers
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import check_photos, load_image, load_photo
+from sgsst_core.files.ply import SceneFile, write_stylized
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
+from sgsst_core.quality.measure import Measurements, with_measuring
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report import (
+from sgsst_core.report.document import (
     Sources,
     bought,
     build_report,
@@ -37,12 +35,14 @@ from sgsst_core.report import (
     write_json,
     write_loss_curves,
 )
-from sgsst_core.report_page import write_page
-from sgsst_core.scene import Scene
+from sgsst_core.report.page import write_page
+from sgsst_core.scene.camera import Camera, orbit, resized, spread
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.stylizer import Evaluation, Stylizer, fit_cameras
-from sgsst_core.weights import BackboneWeights, load_weights
-from worker.geometry import read_shared_scene
+from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, versions
+from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
+from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, fit_cameras
+from worker.ranks.geometry import read_shared_scene
 
 T = TypeVar("T")
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from sgsst_core.camera import resized
-from sgsst_core.images import save_jpg
-from sgsst_core.stylizer import Stylizer
+from sgsst_core.files.images import save_jpg
+from sgsst_core.scene.camera import resized
+from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Previews become rarer as a job goes on: this share of its time lies between two, so that there are never thousands.
 _SHARE = 0.05

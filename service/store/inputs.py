@@ -1,4 +1,4 @@
-"""Blobs, uploads and inspections in the store: the rows; the files are `service.blobs`'."""
+"""Blobs, uploads and inspections in the store: the rows; the files are `service.files.blobs`'."""
 
 from __future__ import annotations
 

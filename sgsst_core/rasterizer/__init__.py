@@ -11,11 +11,11 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
-from sgsst_core.camera import Camera
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.arguments import Rows
-from sgsst_core.scene import Scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 __all__ = ["Rasterizer", "RasterizerName", "Rows", "make_rasterizer"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.camera import Camera
+from sgsst_core.scene.camera import Camera
 
 Rows = tuple[int, int]
 

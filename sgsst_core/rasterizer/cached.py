@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.camera import Camera
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import ALPHA_MAX, NEAR, RASTER_TILE
 from sgsst_core.rasterizer import kernels
@@ -35,7 +34,8 @@ from sgsst_core.rasterizer.arguments import (
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.raster_lists import RasterLists
 from sgsst_core.rasterizer.vectors import as_float
-from sgsst_core.scene import Scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 Precision = Literal["float32", "half"]
 _ITEM_BYTES = 20  # a Gaussian's index, a slot, a gradient

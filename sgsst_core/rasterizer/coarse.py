@@ -1,7 +1,7 @@
 """`coarse`: the box average of a view and its blend weights kept as one operator, for phase 1.
 
 At scale s the optimiser sees image_s = D (W c + T_final background), D the 2^s x 2^s box average
-(`sgsst_core.pyramid.downscale`). Geometry is frozen, so D W never changes either; and because the pixels of a square
+(`pyramid.downscale`). Geometry is frozen, so D W never changes either; and because the pixels of a square
 share one weight, it is far smaller than W, and faster to apply by as much.
 """
 
@@ -15,14 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.camera import Camera
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
-from sgsst_core.pyramid import add_upscaled_, downscale
 from sgsst_core.rasterizer import coarse_kernels, kernels
 from sgsst_core.rasterizer.arguments import CameraKey, camera_key, check_colours
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
 _CPU = torch.device("cpu")
 #: At this scale a raster tile is one pixel. Coarser pixels are averages of these.
@@ -142,7 +142,7 @@ class CoarseRasterizer:
     to rounding. Results are the same bits for any number of threads.
 
     A scale is 1 or more; rows and columns that fill no square of 2^scale pixels are left out, as by
-    `sgsst_core.pyramid.downscale`. Every method raises ValueError for scale 0 or less, and for a view that holds no
+    `pyramid.downscale`. Every method raises ValueError for scale 0 or less, and for a view that holds no
     such square: its image would be empty.
 
     Args:

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.camera import Camera
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import ALPHA_MAX, NEAR
 from sgsst_core.rasterizer import kernels
@@ -22,7 +21,8 @@ from sgsst_core.rasterizer.arguments import (
     check_rows,
 )
 from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
-from sgsst_core.scene import Scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 #: Lists are some 15 to 20 bytes for each Gaussian and tile: a few megabytes a view at 1280x720.
 DEFAULT_LIST_BYTES = 1 << 30

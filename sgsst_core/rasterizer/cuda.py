@@ -14,7 +14,6 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from sgsst_core.camera import Camera
 from sgsst_core.constants import EPS2D, NEAR, RASTER_TILE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.arguments import (
@@ -25,7 +24,8 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
-from sgsst_core.scene import Scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 
 def load_gsplat() -> ModuleType:

@@ -13,12 +13,12 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from sgsst_core.camera import Camera
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import ALPHA_MIN, NEAR, RASTER_TILE
 from sgsst_core.errors import TooManyIntersectionsError
-from sgsst_core.projection import Projection, project
-from sgsst_core.scene import Scene
+from sgsst_core.rasterizer.projection import Projection, project
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 #: Positions in the lists are 32-bit numbers.
 MAX_INTERSECTIONS = 2**31 - 1

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sgsst_core.camera import Camera
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
 from sgsst_core.rasterizer.arguments import (
     CameraKey,
@@ -23,7 +22,8 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
-from sgsst_core.scene import Scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 #: (pixel, Gaussian) pairs evaluated at a time; a batch holds about ten tensors of this many values.
 _BATCH_PAIRS = 1 << 20

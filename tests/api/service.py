@@ -16,7 +16,7 @@ from typing import Any
 import httpx
 import psutil
 
-from api.app import create_app
+from api.http.app import create_app
 from service.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,7 +42,9 @@ class Service:
     def __init__(self, data: Path, *, alone: bool = False, **settings: str) -> None:
         self.data = data
         self.environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(ROOT), "SGSST_DATA": str(data), **settings}
-        self._command = [sys.executable, "-m", "api.server"] if alone else [sys.executable, "-m", "api.cli", "serve"]
+        self._command = (
+            [sys.executable, "-m", "api.http.server"] if alone else [sys.executable, "-m", "api.cli", "serve"]
+        )
         self._alone = alone
         self.log = data.with_name(data.name + ".log")
         self.url = ""

@@ -17,9 +17,9 @@ import httpx
 import psutil
 import pytest
 
-from api.client import AsyncClient, Client
-from sgsst_core.ply import read_scene
-from sgsst_core.weights import BackboneWeights
+from api.client.client import AsyncClient, Client
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.ply import read_scene
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -210,15 +210,15 @@ def test_killed_processes_cost_time_and_nothing_else(service: Service, files: di
     with service.client() as client:
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 5)
-        job_process, api = service.process("service.attempt_process"), service.process("api.server")
+        job_process, api = service.process("service.scheduling.attempt_process"), service.process("api.http.server")
         assert job_process is not None
         assert api is not None
         assert job_process.nice() > api.nice()  # requests do not wait for a job that has all cores
-        service.kill("service.attempt_process")
+        service.kill("service.scheduling.attempt_process")
         wait_for_step(service, client, job_id, 15, attempt=2)
-        service.kill("api.server")
+        service.kill("api.http.server")
         wait_for(service.ready, "the API", service.said)
-        service.kill("service.dispatcher")
+        service.kill("service.scheduling.dispatcher")
         wait_for_step(service, client, job_id, 20, attempt=3)
         found = wait_until(service, client, job_id, "succeeded", "failed")
         assert [attempt["outcome"] for attempt in found["attempts"]] == ["failed", "lost", "succeeded"]
@@ -239,7 +239,7 @@ def test_stopping_saves_running_jobs_and_starting_goes_on(
         found = wait_until(service, client, job_id, "succeeded")
         assert [attempt["outcome"] for attempt in found["attempts"]] == ["released", "succeeded"]
         assert result(client, job_id) == expected
-    assert service.process("service.dispatcher") is None
+    assert service.process("service.scheduling.dispatcher") is None
     assert not any((tmp_path / "data" / "work").iterdir())
 
 
@@ -262,7 +262,9 @@ def test_jobs_side_by_side_share_cores_and_memory(files: dict[str, Path], tmp_pa
         limits = [task["parameters"]["memory_limit"] for task in tasks]
         assert len(limits) == 2
         assert 0 < sum(limits) <= 0.8 * psutil.virtual_memory().total
-        threads = [process.environ()["MKL_NUM_THREADS"] for process in service.processes("service.attempt_process")]
+        threads = [
+            process.environ()["MKL_NUM_THREADS"] for process in service.processes("service.scheduling.attempt_process")
+        ]
         assert set(threads) == {str(max(1, (os.cpu_count() or 1) // 2))}
         wait_for(lambda: "sgsst_places_free 0.0" in client.get("/metrics").text, "no place to be free", service.said)
         ready = client.get("/readyz").json()
@@ -291,7 +293,7 @@ def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, P
 def test_the_api_never_loads_pytorch_or_ray(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         wait_until(service, client, submit(client, files, steps_sos=1), "succeeded")
-    process = service.process("api.server")
+    process = service.process("api.http.server")
     assert process is not None
     mapped = Path(f"/proc/{process.pid}/maps").read_text()
     assert "libtorch" not in mapped

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from sgsst_core.camera import Camera
-from sgsst_core.scene import Scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 
 
 def camera(width: int = 70, height: int = 45, *, focal: float = 60.0, pose: Tensor | None = None) -> Camera:

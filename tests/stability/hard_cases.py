@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sgsst_core.stability import Case, measure
+from sgsst_core.bench.stability import Case, measure
 
 #: No case needs more than some hundred megabytes; a runaway takes many gigabytes.
 LARGEST_GROWTH = 1 << 30

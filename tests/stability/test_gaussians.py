@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.projection import Outcome, project
+from sgsst_core.bench.stability import Case
+from sgsst_core.bench.stability import gaussian_cases as gaussians
+from sgsst_core.bench.stability.case import camera
+from sgsst_core.rasterizer.projection import Outcome, project
 from sgsst_core.rasterizer.reference import splat
-from sgsst_core.stability import Case, gaussians
-from sgsst_core.stability.case import camera
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -7,7 +7,8 @@ from typing import get_args
 
 import pytest
 
-from sgsst_core.stability import Case, CaseResult, Group, all_cases, precision
+from sgsst_core.bench.stability import Case, CaseResult, Group, all_cases
+from sgsst_core.bench.stability import precision_cases as precision
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from sgsst_core.bench.stability import Case
+from sgsst_core.bench.stability import optimisation_cases as optimisation
 from sgsst_core.errors import DivergedError
-from sgsst_core.stability import Case, optimisation
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")

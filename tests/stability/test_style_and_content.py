@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sgsst_core.stability import Case, pictures
+from sgsst_core.bench.stability import Case
+from sgsst_core.bench.stability import picture_cases as pictures
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import CheckpointError
-from sgsst_core.ply import read_scene
-from tests.worker.faults import Fault, small_request
+from sgsst_core.files.ply import read_scene
+from tests.worker.ranks.faults import Fault, small_request
 from worker.job import Job, Result, Resume, StylizeRequest, execute, prepare
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
@@ -83,7 +83,7 @@ def test_what_may_start_anew_does_so_without_a_checkpoint(request_: StylizeReque
 def test_a_disk_that_is_full_for_a_while_is_a_warning(
     request_: StylizeRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sgsst_core import checkpoint
+    from sgsst_core.stylizing import checkpoint
 
     monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # put back what the fault leaves
     fault = Fault(0, "checkpoint", 2, "full")

@@ -1,0 +1,167 @@
+"""`sgsst bench`: measurements that a user can repeat on their own scene and machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Column, Table
+
+from sgsst_core.bench.error_time import Curve, Point, Variant, as_dict, choose_variants, error_time, write_plot
+from sgsst_core.bench.stability import Case, Measurement, all_cases, measure
+from sgsst_core.errors import OutputError, SettingsError
+from sgsst_core.features.network_weights import load_weights
+from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene, write_stylized
+from sgsst_core.report.document import machine, write_json
+from worker.job import SceneRequest, check_choice, check_folder, read_cameras_of
+
+
+@dataclass(frozen=True)
+class ErrorTimeRequest:
+    """What `sgsst bench error-time` was asked for.
+
+    Attributes:
+        source: scene and cameras.
+        style: style image.
+        out: folder for table, plot, JSON and scenes.
+        variants: names; none for all.
+        seconds: of optimisation, for each variant.
+        backbone: "auto", "vgg19" or "vgg16".
+        settings: on top of the standard preset, for all variants.
+    """
+
+    source: SceneRequest
+    style: Path
+    out: Path
+    variants: Sequence[str]
+    seconds: float
+    backbone: str
+    settings: dict[str, Any]
+
+
+def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
+    """Run the variants and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
+
+    Args:
+        progress: called with a variant and each of its points.
+
+    Raises:
+        InvalidInputError: in one of its forms, for the first input that cannot be used.
+    """
+    check_choice(request.source)
+    variants: list[Variant] = choose_variants(request.variants)
+    check_folder(request.out)
+    weights = load_weights(request.backbone)
+    style = load_image(request.style)
+    file = read_scene(request.source.scene, drop_invalid=request.source.drop_invalid)
+    cameras = read_cameras_of(request.source, file.scene)
+    ensure_writable_folder(request.out)
+    options = {name: value for name, value in request.settings.items() if value is not None}
+    arguments = (file.scene, cameras, style, variants, request.seconds)
+    curves = error_time(*arguments, weights=weights, progress=progress, **options)
+    values = {
+        "version": 1,
+        "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
+        "style": request.style.name,
+        "views": len(cameras),
+        "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],
+        "budget_seconds": request.seconds,
+        "settings": options,
+        "backbone": weights.name,
+        "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
+        **as_dict(curves),
+    }
+    write_json(request.out / "error_time.json", values)
+    title = f"{request.source.scene.parent.name or request.source.scene.stem}, {request.style.stem}"
+    write_plot(request.out / "error_time.png", curves, title)
+    for curve in curves:
+        if curve.sh_dc is not None:
+            write_stylized(file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
+    return curves
+
+
+def error_time_table(curves: Sequence[Curve]) -> Table:
+    """Variants against what was left of the loss at each moment, and of each scale's at the end."""
+    shown = [curve for curve in curves if curve.points]
+    scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
+    moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
+    table = Table(
+        Column("variant", no_wrap=True),
+        *moments,
+        *(f"scale {scale}" for scale in scales),
+        "steps",
+        title="loss that is left",
+    )
+    for curve in curves:
+        if not curve.points:
+            continue
+        losses = [f"{point.relative:.3f}" for point in curve.points]
+        ends = [f"{curve.points[-1].by_scale[scale]:.3f}" for scale in scales]
+        table.add_row(curve.variant.name, *losses, *ends, str(curve.points[-1].step))
+    return table
+
+
+def point_line(variant: Variant, point: Point) -> str:
+    """One evaluation, for a log."""
+    return f"{variant.name}: {point.relative:.2%} of the loss left after {point.seconds:.1f} s, {point.step} steps"
+
+
+def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> list[tuple[Case, Measurement]]:
+    """Measure the hard cases whose name or group holds `only`.
+
+    Raises:
+        SettingsError: no case is called so.
+        OutputError: the file cannot be written.
+    """
+    chosen = [case for case in all_cases() if only in case.name or only == case.group]
+    if not chosen:
+        raise SettingsError(f"No case or group holds {only!r} in its name.")
+    if out is not None:
+        if out.is_dir() or out.suffix.lower() != ".json":
+            raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as stability.json.")
+        check_folder(out.parent)
+    found = []
+    for case in chosen:
+        progress(case)
+        found.append((case, measure(case, full=not quick)))
+    if out is not None:
+        values = {"version": 1, "full": not quick, "machine": machine(torch.device("cpu"))}
+        write_json(out, {**values, "cases": [_stability_row(*pair) for pair in found]})
+    return found
+
+
+def stability_table(found: Sequence[tuple[Case, Measurement]]) -> Table:
+    """Cases against errors."""
+    result = Table("case", "measure", "error", "bound", "", "note", title="Numerical stability")
+    group = ""
+    for case, measured in found:
+        if case.group != group:
+            group = case.group
+            result.add_section()
+            result.add_row(f"[bold]{group}[/bold]")
+        outcome = measured.result
+        mark = "ok" if outcome.passed else "[red]MISSED[/red]"
+        numbers = (f"{outcome.error:.1e}" if outcome.error else "0", f"{outcome.bound:.0e}" if outcome.bound else "0")
+        result.add_row(case.name, case.measure, *numbers, mark, outcome.note)
+    return result
+
+
+def _stability_row(case: Case, measured: Measurement) -> dict[str, object]:
+    """One case for JSON; errors that are not finite are words there."""
+    outcome = measured.result
+    return {
+        "group": case.group,
+        "case": case.name,
+        "measure": case.measure,
+        "error": outcome.error if outcome.error < float("inf") else str(outcome.error),
+        "bound": outcome.bound,
+        "passed": outcome.passed,
+        "note": outcome.note,
+        "seconds": round(measured.seconds, 3),
+        "peak_growth": measured.peak_growth,
+    }

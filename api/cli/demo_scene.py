@@ -1,0 +1,289 @@
+"""A real scene that needs no download: the Motorcycle stereo pair in scikit-image, lifted to Gaussians.
+
+The pair and its disparity are from the Middlebury 2014 benchmark (Scharstein et al., "High-resolution stereo
+datasets with subpixel-accurate ground truth", GCPR 2014). Every pixel of the left photo becomes a flat Gaussian that
+covers just that pixel as seen from the left camera; what only the right camera sees is added from the right photo, and
+a thin margin behind depth edges is invented, so that the views between and around the two have no cracks.
+
+World: metres, the left camera's axes (x right, y down, z forward), the origin at the left camera.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+from skimage import data
+
+from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
+from sgsst_core.files.ply import write_scene
+from sgsst_core.scene.gaussians import Scene
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Calibration at the photos' size (741x500), as scikit-image's `stereo_motorcycle` documents it: Middlebury's
+#: (focal 3979.911 px, doffs 124.343 px at 2964x2000, baseline 193.001 mm) divided by 4.
+FOCAL = 994.978
+CENTRE_X, CENTRE_Y = 311.193, 254.877
+BASELINE = 0.193001
+#: Difference of the two principal points' x: depth = FOCAL * BASELINE / (disparity + DISPARITY_OFFSET).
+DISPARITY_OFFSET = 31.086
+
+#: Standard deviation of a Gaussian in pixels of the photo it comes from. Wider blurs, narrower leaves a lattice.
+PIXEL_SIGMA = 0.5
+#: The same for a Gaussian that stands for several pixels, to which the rasterizer's own blur of 0.3 px^2 adds less.
+MERGED_SIGMA = 0.62
+#: Thickness of a disc against its smaller radius.
+FLATNESS = 0.1
+OPACITY = 0.97
+#: A surface seen more obliquely than this (depth per unit of width) is lifted as if it were no steeper; differences
+#: over an edge between two objects look like such surfaces, and would make needles.
+MAX_SLOPE = 3.0
+#: Pixels: a step of disparity beyond this is an edge between two objects.
+EDGE_STEP = 3.0
+#: Rows and columns in which the surface behind a pixel is looked for; half of it on each side of an edge is invented.
+#: Wide because the cameras lie side by side; low because the floor's disparity grows downwards.
+EDGE_WINDOW = (13, 49)
+#: Pixels beside an edge that may be part of the foreground though the disparity is unknown there.
+RIM = 3.0
+#: Difference of colour (0..1) between the two photos beyond which a guessed disparity is dropped.
+WRONG_COLOUR = 0.2
+#: Four pixels whose colours differ by less (0..1) and whose disparities lie on a plane within FLAT_STEP share one
+#: Gaussian: a third fewer of them for no visible difference.
+FLAT_COLOUR = 0.08
+FLAT_STEP = 0.3
+
+#: Views of the camera path: an ellipse through the neighbourhood of both cameras, looking at the motorcycle.
+VIEWS = 10
+VIEW_WIDTH, VIEW_HEIGHT = 720, 480
+#: Focal length of the views; a little longer than the photos', so that the rim of the photos stays outside.
+VIEW_FOCAL = 1.14 * FOCAL
+PATH_RADIUS = (0.12, 0.035, 0.05)  # metres along x, y, z
+LOOK_AT = (0.13, 0.0, 2.7)
+
+
+@dataclass(frozen=True)
+class DemoScene:
+    """Files of the demo.
+
+    Attributes:
+        ply: the scene, 3DGS PLY of SH degree 0.
+        cameras: its views, INRIA cameras.json.
+        style: the style image, PNG.
+    """
+
+    ply: Path
+    cameras: Path
+    style: Path
+
+
+class Samples(NamedTuple):
+    """Pixels to be lifted: position, disparity, its gradient, colour 0..1, and size in pixels; [n] or [n, 3]."""
+
+    x: Array
+    y: Array
+    disparity: Array
+    slope_x: Array
+    slope_y: Array
+    colour: Array
+    size: Array
+
+
+def build_demo(folder: Path) -> DemoScene:
+    """Write the demo's scene, cameras and style image into a folder, which is created.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    ensure_writable_folder(folder)
+    demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "style.png")
+    write_scene(demo.ply, lift_pair())
+    with atomic_path(demo.cameras) as temporary:
+        temporary.write_text(json.dumps(camera_path(), indent=1), encoding="utf-8")
+    with atomic_path(demo.style) as temporary:
+        # A stained tissue section: fibres like brush strokes, in three strong colours. In the wheel, no download.
+        Image.fromarray(data.immunohistochemistry()).save(temporary, format="PNG")
+    return demo
+
+
+def lift_pair() -> Scene:
+    """The Gaussians of the stereo pair, of SH degree 0."""
+    left, right, measured = data.stereo_motorcycle()
+    left, right = left / 255.0, right / 255.0
+    known = np.isfinite(measured)
+    disparity, behind_left = _fill(measured.astype(np.float64), known, left)
+
+    # A guessed disparity that would show on the right with another colour than is there was a bad guess.
+    moved, _ = _move_to_right(disparity)
+    rows, columns, inside = _in_other_photo(disparity, -1)
+    shows = inside & (disparity > moved[rows, columns] - EDGE_STEP)
+    wrong = ~known & shows & (np.abs(left - right[rows, columns]).max(axis=2) > WRONG_COLOUR)
+
+    moved, seen = _move_to_right(np.where(wrong, np.inf, disparity))
+    filled, behind_right = _fill(moved, seen, right)
+    # One pixel more all around: the seam between the two photos has no cracks.
+    only_right = ndimage.binary_dilation(~seen, np.ones((3, 3)))
+    invented_left = behind_left.mask & _hidden(behind_left.disparity, filled, -1)
+    invented_right = behind_right.mask & _hidden(behind_right.disparity, disparity, 1)
+    parts = [
+        _gaussians(_samples(disparity, left, ~wrong), 0.0),
+        _gaussians(_samples(behind_left.disparity, behind_left.colour, invented_left), 0.0),
+        _gaussians(_samples(filled, right, only_right), BASELINE),
+        _gaussians(_samples(behind_right.disparity, behind_right.colour, invented_right), BASELINE),
+    ]
+    means, quats, scales, sh_dc = (np.concatenate(columns).astype(np.float32) for columns in zip(*parts, strict=True))
+    return Scene(
+        means=torch.from_numpy(means),
+        quats=torch.from_numpy(quats),
+        scales=torch.from_numpy(scales),
+        opacities=torch.full((len(means),), float(np.log(OPACITY / (1 - OPACITY)))),
+        sh_dc=torch.from_numpy(sh_dc),
+        sh_rest=torch.zeros(len(means), 0, 3),
+    )
+
+
+class _Behind(NamedTuple):
+    """The surface behind depth edges: where it is invented, its disparity and colour."""
+
+    mask: Mask
+    disparity: Array
+    colour: Array
+
+
+def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
+    """Disparity at unknown pixels, and the surface behind the foreground's rims.
+
+    Unknown pixels lie mostly beside a foreground object, where the other camera's sight of the background was
+    blocked: they get the disparity of the nearest pixel that is not foreground (nearer than something in its window).
+    """
+    lowest = ndimage.minimum_filter(np.where(known, disparity, np.inf), size=EDGE_WINDOW)
+    source = known & (disparity <= lowest + EDGE_STEP)
+    rows, columns = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
+    nearest = disparity[rows, columns]
+    distance, (near_rows, near_columns) = ndimage.distance_transform_edt(~known, return_indices=True)
+    # Beside an edge an unknown pixel may still be foreground: its colour tells.
+    unlike_known = np.abs(photo - photo[near_rows, near_columns]).sum(axis=2)
+    unlike_source = np.abs(photo - photo[rows, columns]).sum(axis=2)
+    front = (distance <= RIM) & (unlike_known < unlike_source)
+    filled = np.where(known | front, disparity[near_rows, near_columns], nearest)
+    mask = known & ~source & (nearest < disparity - EDGE_STEP)
+    # Copies of the nearest pixel make streaks; invented colours are better blurred.
+    colour = ndimage.gaussian_filter(photo[rows, columns], (3, 3, 0))
+    return filled, _Behind(mask, nearest, colour)
+
+
+def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
+    """Row and column of each pixel in the other photo (direction -1 from left to right, 1 back), and where it has one.
+
+    Columns outside are brought to the border.
+    """
+    rows, columns = np.meshgrid(*map(np.arange, disparity.shape), indexing="ij")
+    moved = np.rint(columns + direction * disparity)
+    last = disparity.shape[1] - 1
+    return rows, np.clip(moved, 0, last).astype(np.intp), (moved >= 0) & (moved <= last)
+
+
+def _hidden(disparity: Array, other: Array, direction: int) -> Mask:
+    """Where a surface is out of the other photo's sight: behind something there, or beyond its border."""
+    rows, columns, inside = _in_other_photo(disparity, direction)
+    return ~inside | (other[rows, columns] > disparity + EDGE_STEP)
+
+
+def _move_to_right(disparity: Array) -> tuple[Array, Mask]:
+    """The left photo's disparity as the right camera sees it, and where it sees any of it (0 elsewhere)."""
+    rows, columns, inside = _in_other_photo(disparity, -1)
+    moved = np.full(disparity.shape, -np.inf)
+    np.maximum.at(moved, (rows[inside], columns[inside]), disparity[inside])  # the nearest surface wins
+    # Slanted surfaces are stretched on the right: single columns between two that were hit are no gaps.
+    hit = ndimage.binary_closing(moved > 0, np.ones((1, 3)))
+    between = hit & ~(moved > 0)
+    moved[between] = ndimage.maximum_filter(moved, size=(1, 3))[between]
+    return np.where(hit, moved, 0.0), hit
+
+
+def _samples(disparity: Array, photo: Array, chosen: Mask) -> Samples:
+    """Samples of the chosen pixels; four alike become one."""
+    slope_x, slope_y = (_slope(disparity, axis) for axis in (1, 0))
+    rows, columns = np.meshgrid(*map(np.arange, disparity.shape), indexing="ij")
+    fields = np.dstack([columns + 0.5, rows + 0.5, disparity, slope_x, slope_y, photo])
+    height, width = (side // 2 * 2 for side in disparity.shape)
+    blocks = fields[:height, :width].reshape(height // 2, 2, width // 2, 2, -1)
+    mean = blocks.mean(axis=(1, 3), keepdims=True)
+    off = blocks - mean
+    plane = off[..., 0] * mean[..., 3] + off[..., 1] * mean[..., 4]
+    alike = (np.abs(off[..., 2] - plane) < FLAT_STEP).all(axis=(1, 3))
+    alike &= (np.ptp(blocks[..., 5:], axis=(1, 3)) < FLAT_COLOUR).all(axis=-1)
+    alike &= chosen[:height, :width].reshape(height // 2, 2, width // 2, 2).all(axis=(1, 3))
+    single = chosen.copy()
+    single[:height, :width] &= ~alike.repeat(2, axis=0).repeat(2, axis=1)
+    merged = mean[:, 0, :, 0][alike]
+    all_fields = np.concatenate([fields[single], merged])
+    x, y, sample_disparity, sample_slope_x, sample_slope_y = all_fields[:, :5].T
+    size = np.concatenate([np.ones(int(single.sum())), np.full(len(merged), 2.0)])
+    return Samples(x, y, sample_disparity, sample_slope_x, sample_slope_y, all_fields[:, 5:], size)
+
+
+def _slope(disparity: Array, axis: int) -> Array:
+    """Gradient of the disparity: the smaller of the differences to both sides, 0 where their signs differ.
+
+    So a pixel beside an edge takes the slope of its own surface. Two pixels wide, against noise.
+    """
+    ahead = (np.roll(disparity, -2, axis) - disparity) / 2
+    behind = (disparity - np.roll(disparity, 2, axis)) / 2
+    return np.where(ahead * behind > 0, np.sign(ahead) * np.minimum(np.abs(ahead), np.abs(behind)), 0.0)
+
+
+def _gaussians(samples: Samples, camera_x: float) -> tuple[Array, Array, Array, Array]:
+    """Means, quats, log scales and sh_dc of flat discs in the samples' surfaces; each projects to a round sample.
+
+    Depth is FOCAL * BASELINE / d with d = disparity + offset, so a surface whose disparity is linear is a plane, and
+    the derivatives of the 3D point with respect to the pixel span it: the disc's covariance is their outer products.
+    """
+    shifted = samples.disparity + DISPARITY_OFFSET
+    depth = FOCAL * BASELINE / shifted
+    centre_x = CENTRE_X + (DISPARITY_OFFSET if camera_x > 0 else 0.0)
+    ray = np.stack([(samples.x - centre_x) / FOCAL, (samples.y - CENTRE_Y) / FOCAL, np.ones_like(depth)], axis=1)
+    centre = depth[:, None] * ray + [camera_x, 0.0, 0.0]
+
+    tangents = np.zeros((len(depth), 3, 2))
+    tangents[:, 0, 0] = tangents[:, 1, 1] = depth / FOCAL
+    for axis, slope in enumerate((samples.slope_x, samples.slope_y)):
+        steepest = MAX_SLOPE * shifted / FOCAL
+        depth_slope = -depth * np.clip(slope, -steepest, steepest) / shifted
+        tangents[:, :, axis] += depth_slope[:, None] * ray
+    radii_squared, axes = np.linalg.eigh(tangents @ tangents.transpose(0, 2, 1))  # ascending: the normal first
+    sigma = np.where(samples.size > 1, MERGED_SIGMA, PIXEL_SIGMA) * samples.size
+    radii = np.sqrt(np.maximum(radii_squared, 0)) * sigma[:, None]
+    radii[:, 0] = FLATNESS * radii[:, 1]
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
+
+    quats = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]  # w first
+    return centre, quats, np.log(radii), (samples.colour - COLOUR_OFFSET) / SH_C0
+
+
+def camera_path() -> list[dict[str, object]]:
+    """The views in the INRIA form: position, camera-to-world rotation (columns right, down, forward), focal lengths."""
+    views = []
+    for i in range(VIEWS):
+        angle = 2 * np.pi * i / VIEWS
+        middle = np.array([BASELINE / 2, 0.0, 0.0])
+        position = middle + np.array(PATH_RADIUS) * [np.cos(angle), np.sin(angle), np.sin(angle)]
+        forward = np.array(LOOK_AT) - position
+        forward /= np.linalg.norm(forward)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+        view = {"id": i, "img_name": f"view_{i:02d}", "width": VIEW_WIDTH, "height": VIEW_HEIGHT}
+        view |= {"position": position.tolist(), "rotation": rotation.tolist(), "fx": VIEW_FOCAL, "fy": VIEW_FOCAL}
+        views.append(view)
+    return views

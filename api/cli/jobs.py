@@ -1,0 +1,115 @@
+"""What `plan`, `check` and `render` do: read and check every input, work, write every output. Prints nothing.
+
+`stylize` is `worker.job`, on one rank or several.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from sgsst_core.errors import CameraError, OutputError
+from sgsst_core.features.network_weights import load_weights
+from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.images import load_image, save_png
+from sgsst_core.files.ply import read_scene
+from sgsst_core.planning.planner import Plan
+from sgsst_core.planning.survey import SEEN_COVERAGE
+from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
+from sgsst_core.quality.measure import with_measuring
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.document import plan_json, write_json
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from worker.job import SceneRequest, check_choice, check_folder, read_cameras_of
+
+# --- plan ----------------------------------------------------------------------------------------------------------
+
+
+def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settings, out: Path) -> Plan:
+    """Plan a job as `sgsst stylize` would, and write the plan as JSON; no step is made.
+
+    Raises:
+        InvalidInputError: in one of its forms, for the first input that cannot be used.
+    """
+    check_choice(source)
+    if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
+        raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
+    if source.cameras and out.exists() and source.cameras.exists() and os.path.samefile(out, source.cameras):
+        raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
+    check_folder(out.parent)
+    scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
+    weights = load_weights(backbone)
+    stylizer = Stylizer(scene, read_cameras_of(source, scene), load_image(style), settings, weights=weights)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    plan = with_measuring(stylizer.plan)
+    write_json(out, plan_json(plan))
+    return plan
+
+
+# --- check ---------------------------------------------------------------------------------------------------------
+
+
+def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
+    """What is extreme in a scene, its views and its style; nothing is written.
+
+    Raises:
+        InvalidInputError: scene, cameras or style cannot be used.
+    """
+    check_choice(source)
+    image = load_image(style) if style else None
+    file = read_scene(source.scene, drop_invalid=True)
+    cameras = read_cameras_of(source, file.scene)
+    rasterizer = make_rasterizer("cpu", file.scene, near=source.near)
+    found = [*check_scene(file), *check_views(file, cameras, rasterizer, near=source.near)]
+    return found if image is None else [*found, *check_style(image, cameras)]
+
+
+# --- render --------------------------------------------------------------------------------------------------------
+
+
+def render_views(
+    source: SceneRequest,
+    background: tuple[float, float, float],
+    out: Path,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Render every view into a folder as PNG, numbered in the cameras' order; all inputs are checked before.
+
+    Raises:
+        InvalidInputError: scene, cameras or folder cannot be used.
+    """
+    check_choice(source)
+    check_folder(out)
+    scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
+    cameras = read_cameras_of(source, scene)
+    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
+    if not any(float(rasterizer.coverage(camera).amax()) > SEEN_COVERAGE for camera in cameras):
+        raise CameraError(
+            f"None of the {len(cameras)} cameras sees a Gaussian. Check that cameras and scene belong together."
+        )
+    ensure_writable_folder(out)
+    paths = [out / name for name in view_file_names(cameras)]
+    for index, (camera, path) in enumerate(zip(cameras, paths, strict=True)):
+        colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+        save_png(path, rasterizer.render(colours, camera))
+        progress(index + 1, len(cameras))
+    return paths
+
+
+def view_file_names(cameras: Sequence[Camera]) -> list[str]:
+    """A file name for each view: its number, so that names sort in the cameras' order, then the camera's name.
+
+    Folders and characters that file systems may refuse become underscores.
+    """
+    digits = max(4, len(str(len(cameras) - 1)))
+    names = []
+    for index, camera in enumerate(cameras):
+        stem = re.sub(r"\.(png|jpe?g|tiff?|webp|bmp|exr)$", "", camera.name, flags=re.IGNORECASE)
+        plain = re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._")[-80:]
+        names.append(f"{index:0{digits}d}_{plain}.png" if plain else f"{index:0{digits}d}.png")
+    return names

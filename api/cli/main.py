@@ -1,0 +1,662 @@
+"""The `sgsst` command."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bar
+from rich.table import Column, Table
+
+from api.cli import service_commands
+from api.cli.interrupt import stop_on_signal
+from api.cli.values import parse_background, parse_bytes
+from sgsst_core.constants import NEAR
+from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
+from sgsst_core.settings import EVERYTHING, KeptWeights, PositionWeights, Precision, PresetName, make_settings
+
+if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
+    from sgsst_core.stylizing.loop import Progress
+    from worker.job import Outputs, Prepared, Result, StylizeRequest
+    from worker.ranks.attempts import RanksResult, WorkerOptions
+
+#: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
+BAD_INPUT, FAILURE = 2, 1
+#: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
+MAX_RESOLUTION = 16384
+#: Where the progress bar cannot be drawn (a log file), a line is printed instead, this often.
+LOG_SECONDS = 60.0
+#: Characters of tables that would be cut in a narrower terminal.
+TABLE_WIDTH = 180
+#: The demo's resolution and steps, and seconds after which it stops on a slow machine: less than five minutes with all
+#: that is around.
+DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
+
+app = typer.Typer(
+    help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_help=True)
+app.add_typer(weights_app, name="weights")
+bench_app = typer.Typer(help="Measurements to repeat on your own scene and machine.", no_args_is_help=True)
+app.add_typer(bench_app, name="bench")
+service_commands.add_to(app)
+out_console = Console(highlight=False, markup=False, soft_wrap=True)
+error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)]
+CamerasOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="cameras.json (INRIA), a COLMAP sparse model's folder, or transforms.json (nerfstudio, Blender)."
+    ),
+]
+OrbitOption = Annotated[int | None, typer.Option(min=1, help="Instead of --cameras: N views around the scene.")]
+UpOption = Annotated[
+    Literal["x", "-x", "y", "-y", "z", "-z"], typer.Option(help="Axis that points up in the scene, for --orbit.")
+]
+ViewsOption = Annotated[int | None, typer.Option(min=1, help="Take N of the cameras, spread evenly.")]
+ResolutionOption = Annotated[
+    int | None, typer.Option(min=1, max=MAX_RESOLUTION, help="Pixels of every view's longer side. [the cameras' own]")
+]
+BackgroundOption = Annotated[
+    Any, typer.Option(parser=parse_background, metavar="COLOUR", help="black, white, or R,G,B from 0 to 255.")
+]
+NearOption = Annotated[float, typer.Option(min=1e-6, help="Near plane, in the scene's units.")]
+MemoryOption = Annotated[
+    Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
+]
+CoarsestOption = Annotated[
+    int | None,
+    typer.Option(min=16, help="Shorter side of the coarsest scale in pixels, at most. [511, the method's]"),
+]
+PruneOption = Annotated[
+    float | None,
+    typer.Option(min=0, metavar="W", help="Leave out Gaussians that all views together show in less than W pixels."),
+]
+SimilarOption = Annotated[
+    float | None,
+    typer.Option(min=0, metavar="S", help="Leave out views that another, shifted by less than S of its side, shows."),
+]
+DropOption = Annotated[bool, typer.Option("--drop-invalid", help="Leave Gaussians with NaN or infinite values out.")]
+
+
+@app.callback(invoke_without_command=True)
+def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
+    if version:
+        from sgsst_core.report.document import program_version
+
+        out_console.print(f"sgsst {program_version()}")
+        raise typer.Exit()
+
+
+@app.command()
+def stylize(
+    context: typer.Context,
+    scene: SceneArgument,
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Stylized PLY to write; report and pictures go beside it.")],
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    preset: Annotated[PresetName, typer.Option(help="Where the settings below start from.")] = "standard",
+    steps_coarse: Annotated[int | None, typer.Option(min=0, help="Steps on the coarsest scale.")] = None,
+    steps_sos: Annotated[int | None, typer.Option(min=0, help="Steps on all scales.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Adam's learning rate, then constant.")] = None,
+    content_weight: Annotated[float | None, typer.Option(min=0, help="Weight of the content term. [1]")] = None,
+    position_weights: Annotated[
+        PositionWeights | None,
+        typer.Option(help="Weigh positions by coverage, so that an empty surround does not count. [auto; paper: off]"),
+    ] = None,
+    background: BackgroundOption = "black",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order of views.")] = 0,
+    precision: Annotated[Precision, typer.Option(help="Of the feature network.")] = "float32",
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: MemoryOption = None,
+    max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and write the result.")] = None,
+    target_loss: Annotated[
+        float | None,
+        typer.Option(metavar="R", help="Stop when the loss has come down to this share of the start, such as 0.05."),
+    ] = None,
+    early_stop: Annotated[
+        bool | None,
+        typer.Option("--early-stop/--no-early-stop", help="Stop when the loss has stopped falling. [by preset]"),
+    ] = None,
+    warm_start: Annotated[
+        bool | None,
+        typer.Option("--warm-start/--cold-start", help="Begin with the style's mean colour and spread. [by preset]"),
+    ] = None,
+    revive: Annotated[
+        bool | None,
+        typer.Option("--revive/--no-revive", help="Let colours that fell below black come back. [by preset]"),
+    ] = None,
+    coarsest_side: CoarsestOption = None,
+    prune_weight: PruneOption = None,
+    similar_views: SimilarOption = None,
+    kept_weights: Annotated[
+        KeptWeights | None, typer.Option(help="How blend weights are kept between steps. [auto: as memory allows]")
+    ] = None,
+    unseen: Annotated[
+        Literal["neighbours", "keep"] | None,
+        typer.Option(help="Colours of Gaussians that no view sees: their neighbours' change, or kept. [paper: keep]"),
+    ] = None,
+    keep_everything: Annotated[
+        bool, typer.Option("--keep-everything", help="Leave nothing out; slower, with the same result.")
+    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")] = False,
+    checkpoint_seconds: Annotated[
+        float, typer.Option(min=0, help="Between checkpoints: what is lost at most when a worker is.")
+    ] = 60.0,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Work on so many GPUs, or parts of the processor: here, or in RAY_ADDRESS's cluster."),
+    ] = None,
+    rank_timeout: Annotated[
+        float, typer.Option(min=1, help="Seconds without an answer after which a worker counts as lost.")
+    ] = 120.0,
+    views_per_step: Annotated[
+        int | None,
+        typer.Option(min=1, help="Average the gradients of V views in each step; groups of workers share them."),
+    ] = None,
+    rebalance: Annotated[
+        bool | None,
+        typer.Option("--rebalance/--no-rebalance", help="Give slower workers less to do, once. [--rebalance]"),
+    ] = None,
+) -> None:
+    """Give a scene the style of a picture."""
+    settings = make_settings(
+        preset,
+        steps_coarse=steps_coarse,
+        steps_sos=steps_sos,
+        learning_rate=learning_rate,
+        content_weight=content_weight,
+        position_weights=position_weights,
+        max_resolution=resolution,
+        background=background,
+        near=near,
+        seed=seed,
+        precision=precision,
+        memory_limit=memory_limit,
+        max_seconds=max_seconds,
+        unseen=unseen,
+        coarsest_side=coarsest_side,
+        warm_start=warm_start,
+        revive=revive,
+        early_stop=early_stop,
+        target_loss=target_loss,
+        prune_weight=prune_weight,
+        similar_views=similar_views,
+        kept_weights=kept_weights,
+        views_per_step=views_per_step,
+        rebalance=rebalance,
+        keep=EVERYTHING if keep_everything else None,
+    )
+    from worker.job import SceneRequest, StylizeRequest
+    from worker.ranks.attempts import WorkerOptions
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    request = StylizeRequest(source, style, images, out, backbone, resume, settings)
+    _stylize(request, context.obj, workers, WorkerOptions(rank_timeout, checkpoint_seconds))
+
+
+def _stylize(
+    request: StylizeRequest,
+    arguments: Sequence[str],
+    workers: int | None = None,
+    options: WorkerOptions | None = None,
+) -> None:
+    """Prepare, run, and tell what was decided and what came out; `arguments` are for the command to go on with."""
+    from worker.job import check_request
+    from worker.ranks.attempts import WorkerOptions
+
+    outputs = check_request(request)
+    command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
+    options = options or WorkerOptions()
+    if workers is None:
+        _stylize_here(request, outputs, command, options.checkpoint_seconds)
+    else:
+        _stylize_on_ranks(request, outputs, command, workers, options)
+
+
+def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
+    """One rank, in this process."""
+    from worker.job import describe, execute, prepare
+
+    with _status("Reading the scene and preparing its views"):
+        job = prepare(request, warn=error_console.print)
+    with stop_on_signal(_announce_stop) as stop:
+        prepared = describe(job)
+        _announce(prepared)
+        with _training_bar() as bar:
+            bar.start(prepared)
+            result = execute(
+                job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
+            )
+    if result.stopped == "interrupted":
+        _tell_interrupted(outputs, result.step, result.total, result.step, command)
+        raise typer.Exit(stop.exit_code)
+    _conclude(outputs, result, command)
+
+
+def _stylize_on_ranks(
+    request: StylizeRequest, outputs: Outputs, command: str, workers: int, options: WorkerOptions
+) -> None:
+    """Several ranks, in processes of their own."""
+    from worker.ranks.attempts import Listener, stylize_on_ranks
+
+    with stop_on_signal(_announce_stop) as stop, _training_bar() as bar:
+
+        def prepared(found: Prepared) -> None:
+            _announce(found)
+            bar.start(found)
+
+        listener = Listener(prepared, bar.show, error_console.print, error_console.print, stop)
+        ended = stylize_on_ranks(request, workers, listener, options=options)
+    if ended.interrupted:
+        _tell_interrupted(outputs, ended.step, ended.total, ended.saved, command)
+        raise typer.Exit(stop.exit_code)
+    assert ended.result is not None
+    _tell_losses(ended)
+    _conclude(outputs, ended.result, command)
+
+
+def _announce_stop() -> None:
+    error_console.print("Stopping after this step; Ctrl-C again aborts at once.")
+
+
+def _announce(prepared: Prepared) -> None:
+    for heading, line in prepared.lines:
+        out_console.print(f"{heading + ':':<22}{line}")
+
+
+def _tell_interrupted(outputs: Outputs, step: int, total: int, saved: int | None, command: str) -> None:
+    if saved is None:
+        error_console.print(f"Stopped at step {step}; nothing has been saved.")
+        return
+    there = "saved" if saved == step else f"step {saved} is saved"
+    error_console.print(
+        f"Stopped at step {step} of {total}; {there} in {outputs.checkpoint}.\nTo go on, run:\n{command}"
+    )
+
+
+def _tell_losses(ended: RanksResult) -> None:
+    for attempt in ended.attempts:
+        out_console.print(
+            f"{'lost:':<22}{attempt.reason}, at step {attempt.last_step}; on from step {attempt.saved_step} "
+            f"{attempt.seconds_to_resume:.1f} s later"
+        )
+
+
+def _conclude(outputs: Outputs, result: Result, command: str) -> None:
+    from sgsst_core.report.document import mean_loss
+
+    before, after = mean_loss(result.before), mean_loss(result.after)
+    out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    for line in _time_bought(result):
+        out_console.print(f"{'time bought:':<22}{line}")
+    paths = [("stylized scene", outputs.ply)]
+    if result.report_error is None:
+        paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
+        paths += [("the same as JSON", outputs.report)]
+    for heading, path in paths:
+        out_console.print(f"{heading + ':':<22}{path}")
+    if result.stopped in _ENDED:
+        out_console.print(f"Stopped at step {result.step} of {result.total}: {_ENDED[result.stopped]}.")
+    if result.stopped == "max-seconds":
+        out_console.print(
+            f"The time was up at step {result.step} of {result.total}. The checkpoint stays: to go on, "
+            f"give more time (--max-seconds counts from the beginning):\n{command}"
+        )
+    if result.report_error is not None:
+        error_console.print(f"The stylized scene is whole, but its report could not be written: {result.report_error}")
+        raise typer.Exit(FAILURE)
+
+
+_ENDED = {
+    "target-loss": "the loss has come down to --target-loss",
+    "converged": "the loss has stopped falling (--no-early-stop makes all steps)",
+}
+
+
+def _time_bought(result: Result) -> list[str]:
+    found = result.bought
+    if found is None:
+        return []
+    lines = [
+        f"{entry['relative']:.0%} of the loss on all scales was left after {_clock(entry['seconds'])}"
+        for entry in found["reached"]
+    ]
+    last = found["last_tenth"]
+    if last:
+        lines.append(f"the last tenth of the time changed {last['from']:.2%} to {last['to']:.2%}")
+    return lines
+
+
+@app.command()
+def plan(
+    scene: SceneArgument,
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    preset: Annotated[PresetName, typer.Option(help="As for stylize.")] = "standard",
+    coarsest_side: CoarsestOption = None,
+    prune_weight: PruneOption = None,
+    similar_views: SimilarOption = None,
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: MemoryOption = None,
+) -> None:
+    """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
+    from api.cli.jobs import make_plan
+    from worker.job import SceneRequest
+
+    settings = make_settings(
+        preset,
+        max_resolution=resolution,
+        coarsest_side=coarsest_side,
+        prune_weight=prune_weight,
+        similar_views=similar_views,
+        near=near,
+        memory_limit=memory_limit,
+    )
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    with _status("Looking at every view"):
+        made = make_plan(source, style, backbone, settings, out)
+    table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
+    for item in made.decisions:
+        saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
+        saved += [f"{item.bytes / 1e6:.1f} MB"] if item.bytes is not None else []
+        error = "" if item.error == "none" else f" Costs: {item.error}."
+        table.add_row(item.item, f"{item.decision}: {item.reason}.{error}", "\n".join(saved))
+    out_console.print(table)
+    if made.prediction:
+        seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9
+        coarse = f" ({made.prediction.seconds_coarse:.2g} s in phase 1)" if made.steps_coarse else ""
+        out_console.print(f"Expected: {seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB")
+    out_console.print(f"{'plan:':<22}{out}")
+
+
+@app.command()
+def check(
+    scene: SceneArgument,
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    style: Annotated[Path | None, typer.Option(help="Style image.")] = None,
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    near: NearOption = NEAR,
+) -> None:
+    """Tell what is extreme in a scene, its views and its style, and what is done about it."""
+    from api.cli.jobs import check_inputs
+    from worker.job import SceneRequest
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
+    with _status("Looking at the scene and every view"):
+        found = check_inputs(source, style)
+    if not found:
+        out_console.print("Nothing extreme was found.")
+        return
+    table = Table("what", Column("how many", justify="right"), "the worst", "what is done", show_lines=True)
+    for item in found:
+        table.add_row(f"{item.subject}: {item.what}", f"{item.count:,} of {item.total:,}", item.worst, item.done)
+    out_console.print(table)
+
+
+@app.command()
+def render(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the pictures, PNG.", show_default=False)],
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    background: BackgroundOption = "black",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+) -> None:
+    """Render the views of a scene."""
+    from api.cli.jobs import render_views
+    from worker.job import SceneRequest
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with _bar(*columns) as bar:
+        task = bar.add_task("", total=None)
+        paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
+    out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the scene and the results.")] = Path("demo"),
+) -> None:
+    """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
+    from api.cli.demo_scene import build_demo
+    from sgsst_core.features.network_weights import load_weights
+    from worker.job import SceneRequest, StylizeRequest, check_folder
+
+    check_folder(out)
+    try:
+        load_weights("auto")
+    except WeightsError:
+        fetch("vgg16")
+    with _status("Building the scene"):
+        files = build_demo(out)
+    source = SceneRequest(files.ply, files.cameras, None, "-y", None, DEMO_RESOLUTION, NEAR, False)
+    settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
+    request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, settings)
+    options: dict[str, object] = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
+    options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
+    options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
+    arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
+    out_console.print(f"{'command:':<22}{shlex.join(['sgsst', *arguments])}")
+    _stylize(request, arguments)
+
+
+@bench_app.command("error-time")
+def bench_error_time(
+    scene: SceneArgument,
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for table, plot, JSON and scenes.")] = Path("error_time"),
+    cameras: CamerasOption = None,
+    orbit: OrbitOption = None,
+    up: UpOption = "-y",
+    views: ViewsOption = None,
+    resolution: ResolutionOption = None,
+    variants: Annotated[str, typer.Option(help="Names with commas between. [all]")] = "",
+    seconds: Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")] = 300.0,
+    coarsest_side: CoarsestOption = None,
+    background: BackgroundOption = "black",
+    near: NearOption = NEAR,
+    drop_invalid: DropOption = False,
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: MemoryOption = None,
+) -> None:
+    """Run variants of a job for the same time each, and plot the error that is left against seconds."""
+    from api.cli.bench import ErrorTimeRequest, error_time_table, point_line, run_error_time
+    from worker.job import SceneRequest
+
+    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    settings = {"coarsest_side": coarsest_side, "background": background, "near": near, "memory_limit": memory_limit}
+    names = [name.strip() for name in variants.split(",") if name.strip()]
+    request = ErrorTimeRequest(source, style, out, names, seconds, backbone, settings)
+    curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
+    Console(width=TABLE_WIDTH).print(error_time_table(curves))
+    for curve in curves:
+        if curve.left_out:
+            out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
+    out_console.print(f"{'results:':<22}{out}")
+
+
+@bench_app.command("stability")
+def bench_stability(
+    only: Annotated[str, typer.Option(metavar="TEXT", help="Cases whose name holds this, or one group.")] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes: minutes less.")] = False,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write.")] = None,
+) -> None:
+    """Measure hard cases against float64 references; exits with 1 where one misses its bound."""
+    from api.cli.bench import run_stability, stability_table
+
+    found = run_stability(only, quick, out, lambda case: error_console.print(f"{case.group}: {case.name}"))
+    Console(width=TABLE_WIDTH).print(stability_table(found))
+    if not all(measured.result.passed for _, measured in found):
+        raise typer.Exit(FAILURE)
+
+
+@weights_app.command("list")
+def list_() -> None:
+    """Show which weights are installed, and where the others come from."""
+    from sgsst_core.features.network_weights import list_weights
+
+    for entry in list_weights():
+        state = f"installed   {entry.path}" if entry.path else f"to download from {entry.source}"
+        out_console.print(f"{entry.name:<12}{entry.size / 1e6:>6.0f} MB  {state}")
+
+
+@weights_app.command()
+def fetch(
+    name: Annotated[Literal["vgg19", "vgg16"], typer.Argument(help="Network to install.")],
+    from_: Annotated[
+        Path | None, typer.Option("--from", help="Convert this file (.pth of torchvision or of Gatys et al.) instead.")
+    ] = None,
+) -> None:
+    """Download weights, convert them, and keep them in the cache folder; does nothing where they are installed."""
+    from sgsst_core.features.network_weights import fetch_weights
+
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with _bar(*columns) as bar:
+        task = bar.add_task(name, total=None)
+        path = fetch_weights(
+            name, source=from_, progress=lambda done, total: bar.update(task, completed=done, total=total or None)
+        )
+    out_console.print(f"{name}: {path}")
+
+
+@weights_app.command()
+def path() -> None:
+    """Print the folder in which weights are kept; SGSST_CACHE names another one."""
+    from sgsst_core.features.network_weights import cache_folder
+
+    out_console.print(str(cache_folder()))
+
+
+@contextmanager
+def _status(text: str) -> Iterator[None]:
+    """A spinner on a terminal, nothing elsewhere."""
+    with error_console.status(text) if error_console.is_terminal else _nothing():
+        yield
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield
+
+
+def _bar(*columns: ProgressColumn) -> Bar:
+    """A live progress bar on a terminal; nothing elsewhere, where it could not be drawn over."""
+    return Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal)
+
+
+class _TrainingBar:
+    """A live bar, or a line a minute where there is no terminal."""
+
+    def __init__(self, bar: Bar) -> None:
+        self._bar = bar
+        self._task = bar.add_task("starting", total=None, loss="-", left="-")
+        self._last_line = time.monotonic()
+
+    def start(self, prepared: Prepared) -> None:
+        """Show where the job starts."""
+        self._bar.update(self._task, total=prepared.total, completed=prepared.step)
+
+    def show(self, progress: Progress) -> None:
+        """Show a step."""
+        stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
+        loss, left = f"{progress.loss:.3g}", _clock(progress.seconds_left)
+        self._bar.update(self._task, description=stage, completed=progress.step, loss=loss, left=left)
+        if self._bar.disable and time.monotonic() - self._last_line >= LOG_SECONDS:
+            self._last_line = time.monotonic()
+            error_console.print(f"{stage}: step {progress.step} of {progress.total}, loss {loss}, {left} left")
+
+
+@contextmanager
+def _training_bar() -> Iterator[_TrainingBar]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("loss {task.fields[loss]}"),
+        TextColumn("{task.fields[left]} left"),
+    )
+    with _bar(*columns) as bar:
+        yield _TrainingBar(bar)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; every expected error becomes one message on stderr and an exit code, without traceback."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        app(args=arguments, prog_name="sgsst", obj=arguments)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except SgsstError as error:
+        error_console.print(f"error: {error}")
+        return BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
+    except KeyboardInterrupt:
+        error_console.print("Aborted.")
+        return 130
+    except BrokenPipeError:  # `sgsst weights list | head`
+        return FAILURE
+    except (MemoryError, RuntimeError) as error:
+        if not _out_of_memory(error):
+            raise
+        error_console.print("error: out of memory. Give a smaller --resolution or fewer --views, or --memory-limit.")
+        return FAILURE
+    return 0
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """PyTorch raises a plain RuntimeError on the CPU, a subclass of it on GPUs."""
+    text = str(error)
+    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
+
+
+if __name__ == "__main__":
+    sys.exit(main())

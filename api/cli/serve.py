@@ -1,0 +1,140 @@
+"""`sgsst serve`: API and dispatcher on one machine, each a process that is started again when it dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import FrameType
+
+from service.settings import ServiceSettings
+from service.store import open_store
+from sgsst_core.errors import InvalidInputError
+
+#: A process that lived shorter than this is started again only after a wait, which doubles up to the longest.
+_SHORT_LIFE, _LONGEST_WAIT = 5.0, 10.0
+_LOOK_SECONDS = 0.2
+#: On top of the time that jobs have for saving their state.
+_LAST_SECONDS = 15.0
+_BACKLOG = 1024
+
+
+class ServeError(InvalidInputError):
+    """The service cannot be started like this."""
+
+    code = "cannot-serve"
+
+
+@dataclass
+class _Child:
+    """A process that is to live as long as the service."""
+
+    name: str
+    command: list[str]
+    descriptors: tuple[int, ...] = ()
+    process: subprocess.Popen[bytes] | None = None
+    started: float = 0.0
+    wait: float = 0.0
+    not_before: float = field(default=0.0)
+
+    def start(self) -> None:
+        """Start it; it dies with this process, and Ctrl-C in a terminal is not for it."""
+        self.process = subprocess.Popen(
+            self.command,
+            pass_fds=self.descriptors,
+            env={**os.environ, "SGSST_DIE_WITH_PARENT": "1"},
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self.started = time.monotonic()
+
+    def look(self, say: Callable[[str], None]) -> None:
+        """Start it again where it has died."""
+        now = time.monotonic()
+        if self.process is not None and self.process.poll() is not None:
+            lived = now - self.started
+            self.wait = 0.0 if lived > _SHORT_LIFE else min(_LONGEST_WAIT, max(0.5, 2 * self.wait))
+            self.not_before = now + self.wait
+            say(f"The {self.name} ended with code {self.process.returncode}; it is started again.")
+            self.process = None
+        if self.process is None and now >= self.not_before:
+            self.start()
+
+
+def serve(settings: ServiceSettings, say: Callable[[str], None]) -> None:
+    """Run API and dispatcher until SIGTERM or Ctrl-C; running jobs save their state then. A second one ends at once.
+
+    The listening socket is this process': while the API is started again, connections wait instead of being refused.
+
+    Raises:
+        ServeError: the address is taken, or others could use the service and there is no key.
+    """
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    store = open_store(settings)
+    if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
+        raise ServeError(
+            f"{settings.host} can be reached from other machines, and there is no API key yet. Make one first: "
+            "`sgsst keys create NAME`. Or serve this machine alone: --host 127.0.0.1."
+        )
+    store.close()
+    with _listen(settings) as listener:
+        api = _Child(
+            "API", [sys.executable, "-m", "api.http.server", "--fd", str(listener.fileno())], (listener.fileno(),)
+        )
+        dispatcher = _Child("dispatcher", [sys.executable, "-m", "service.scheduling.dispatcher"])
+        if subprocess.run([sys.executable, "-m", "service.ensure_weights"], check=False).returncode:
+            raise ServeError("Without a feature network no job can run. `sgsst weights list` shows where to get one.")
+        _run([api, dispatcher], settings, say, _address(settings, listener))
+
+
+def _listen(settings: ServiceSettings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.host, settings.port))
+        listener.listen(_BACKLOG)
+    except OSError as error:
+        listener.close()
+        raise ServeError(
+            f"{settings.host}:{settings.port} cannot be used: {error.strerror}. --port names another one."
+        ) from error
+    return listener
+
+
+def _address(settings: ServiceSettings, listener: socket.socket) -> str:
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    return f"http://{host}:{listener.getsockname()[1]}"
+
+
+def _run(children: list[_Child], settings: ServiceSettings, say: Callable[[str], None], address: str) -> None:
+    signals: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        signals.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
+    for child in children:
+        child.start()
+    say(f"Serving at {address} (documentation: {address}/docs). Data: {settings.folder}. Ctrl-C stops.")
+    while not signals:
+        for child in children:
+            child.look(say)
+        time.sleep(_LOOK_SECONDS)
+    say("Stopping; running jobs save their state. Ctrl-C again ends at once.")
+    processes = [child.process for child in children if child.process is not None]
+    for process in processes:
+        process.send_signal(signal.SIGTERM)
+    deadline = time.monotonic() + settings.stop_seconds + _LAST_SECONDS
+    while any(process.poll() is None for process in processes) and len(signals) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+            process.wait()

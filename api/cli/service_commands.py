@@ -1,0 +1,378 @@
+"""Commands of the service: `serve`, `keys`, and those of its clients. They import no PyTorch."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+from rich.table import Table
+
+from api.cli.values import parse_background, parse_bytes
+from sgsst_core.settings import PresetName
+
+if TYPE_CHECKING:
+    from api.client.client import Client, Job
+
+out_console = Console(highlight=False, markup=False, soft_wrap=True)
+error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+
+#: Exit code of a command whose job has failed or was canceled.
+_JOB_FAILED = 1
+
+UrlOption = Annotated[
+    str | None, typer.Option("--url", help="Address of the service. [SGSST_URL, else http://127.0.0.1:8000]")
+]
+KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [SGSST_KEY]")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.", show_default=False)]
+DataOption = Annotated[Path | None, typer.Option(help="Folder of the service. [SGSST_DATA, else ./sgsst-data]")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add all commands of this module."""
+    for command in (serve, submit, status, watch, download, cancel, retry, delete, jobs):
+        app.command()(command)
+    keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
+    keys_app.command("create")(create_key)
+    keys_app.command("list")(list_keys)
+    keys_app.command("revoke")(revoke_key)
+    app.add_typer(keys_app, name="keys")
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on. [127.0.0.1: this machine only]")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="[8000]")] = None,
+    data: DataOption = None,
+) -> None:
+    """Run the service on this machine: HTTP API and dispatcher. Settings are environment variables, SGSST_..."""
+    chosen = {"SGSST_HOST": host, "SGSST_PORT": port, "SGSST_DATA": data.absolute() if data else None}
+    os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
+    from api.cli.serve import serve as run
+
+    run(_service_settings(), error_console.print)
+
+
+def submit(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)],
+    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
+    orbit: Annotated[int | None, typer.Option(min=1, help="Instead of --cameras: N views around the scene.")] = None,
+    up: Annotated[Literal["x", "-x", "y", "-y", "z", "-z"] | None, typer.Option(help="Axis that points up.")] = None,
+    images: Annotated[Path | None, typer.Option(help="Photos for the content term.")] = None,
+    views: Annotated[int | None, typer.Option(min=1, help="Take N of the cameras, spread evenly.")] = None,
+    resolution: Annotated[int | None, typer.Option(min=1, help="Pixels of every view's longer side.")] = None,
+    preset: Annotated[PresetName, typer.Option(help="Where the settings below start from.")] = "standard",
+    steps_coarse: Annotated[int | None, typer.Option(min=0, help="Steps on the coarsest scale.")] = None,
+    steps_sos: Annotated[int | None, typer.Option(min=0, help="Steps on all scales.")] = None,
+    content_weight: Annotated[float | None, typer.Option(min=0, help="Weight of the content term.")] = None,
+    background: Annotated[
+        Any, typer.Option(parser=parse_background, metavar="COLOUR", help="black, white, or R,G,B from 0 to 255.")
+    ] = None,
+    drop_invalid: Annotated[bool, typer.Option("--drop-invalid", help="Leave invalid Gaussians out.")] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the order of views.")] = None,
+    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
+    memory_limit: Annotated[Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Such as 8GB.")] = None,
+    max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and take what is there.")] = None,
+    target_loss: Annotated[float | None, typer.Option(help="Stop at this share of the loss at the start.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Ranks to spread the job over.")] = None,
+    name: Annotated[str | None, typer.Option(help="For people.")] = None,
+    parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
+    webhook: Annotated[str | None, typer.Option(help="URL that is told when the job has ended.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Wait for the end, and write the stylized PLY here.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and plan, but queue nothing.")] = False,
+    as_json: JsonOption = False,
+    url: UrlOption = None,
+    key: KeyOption = None,
+) -> None:
+    """Send a job to a service. Options are those of stylize; with --out, wait for the result."""
+    chosen = {
+        "orbit": orbit,
+        "up": up,
+        "views": views,
+        "resolution": resolution,
+        "preset": preset,
+        "steps_coarse": steps_coarse,
+        "steps_sos": steps_sos,
+        "content_weight": content_weight,
+        "background": background,
+        "drop_invalid": drop_invalid or None,
+        "seed": seed,
+        "backbone": backbone,
+        "memory_limit": memory_limit,
+        "max_seconds": max_seconds,
+        "target_loss": target_loss,
+        "workers": workers,
+        "name": name if name is not None else scene.stem,
+        **_further(parameters),
+    }
+    with _client(url, key) as client:
+        if dry_run:
+            plan = client.plan(scene, style, cameras=cameras, photos=images, **chosen)
+            out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
+            return
+        with _transfer("sending") as progress:
+            job = client.submit(
+                scene, style, cameras=cameras, photos=images, webhook=webhook, progress=progress, **chosen
+            )
+        if out is None:
+            out_console.print(json.dumps(job.data) if as_json else job.id)
+            if not as_json:
+                error_console.print(f"Watch it: sgsst watch {job.id}    Result: sgsst download {job.id}")
+            return
+        if not as_json:
+            error_console.print(job.id)
+        _conclude(client, _follow(client, job.id, as_json), out, as_json)
+
+
+def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
+    """Tell how a job is."""
+    with _client(url, key) as client:
+        found = client.job(job)
+    out_console.print(json.dumps(found.data) if as_json else _job_text(found))
+
+
+def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
+    """Show a job's progress until it has ended; exits with 1 where it has not succeeded."""
+    with _client(url, key) as client:
+        found = _follow(client, job, as_json)
+    if not as_json:
+        out_console.print(_job_text(found))
+    if found.status != "succeeded":
+        raise typer.Exit(_JOB_FAILED)
+
+
+def download(
+    job: JobArgument,
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="File to download; 'all' for all of them.")] = (
+        "stylized.ply"
+    ),
+    out: Annotated[Path | None, typer.Option(help="File to write, or folder for all. [the file's own name]")] = None,
+    as_json: JsonOption = False,
+    url: UrlOption = None,
+    key: KeyOption = None,
+) -> None:
+    """Download a job's result, or another of its files; what was cut off goes on where it stopped."""
+    with _client(url, key) as client:
+        names = [entry["name"] for entry in client.artifacts(job)] if name == "all" else [name]
+        written = []
+        for each in names:
+            target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with _transfer(each) as progress:
+                written.append(str(client.download(job, target, each, progress)))
+    out_console.print(json.dumps(written) if as_json else "\n".join(written))
+
+
+def cancel(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
+    """Cancel a job."""
+    with _client(url, key) as client:
+        found = client.cancel(job)
+    out_console.print(json.dumps(found.data) if as_json else _job_text(found))
+
+
+def retry(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
+    """Queue a job again that failed or was canceled."""
+    with _client(url, key) as client:
+        found = client.retry(job)
+    out_console.print(json.dumps(found.data) if as_json else _job_text(found))
+
+
+def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
+    """Remove a job that has ended, with its results."""
+    with _client(url, key) as client:
+        client.delete(job)
+
+
+def jobs(
+    status: Annotated[list[str] | None, typer.Option(help="Only these; may be given several times.")] = None,
+    limit: Annotated[int, typer.Option(min=1, help="At most so many.")] = 20,
+    as_json: JsonOption = False,
+    url: UrlOption = None,
+    key: KeyOption = None,
+) -> None:
+    """List jobs, the newest first."""
+    with _client(url, key) as client:
+        found = list(client.jobs(status=status or (), limit=limit))
+    if as_json:
+        out_console.print(json.dumps([job.data for job in found]))
+        return
+    table = Table("id", "name", "status", "progress", "created")
+    for job in found:
+        created = datetime.fromisoformat(job.data["created_at"]).astimezone()
+        table.add_row(job.id, job.data["name"], job.status, _progress_text(job), f"{created:%Y-%m-%d %H:%M}")
+    Console(width=None if out_console.is_terminal else 140, highlight=False, markup=False).print(table)
+
+
+# --- keys ----------------------------------------------------------------------------------------------------------
+
+
+def create_key(
+    name: Annotated[str, typer.Argument(help="Whose it is, for people.", show_default=False)],
+    priority: Annotated[int, typer.Option(help="Jobs of a higher one go first.")] = 0,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make an API key and print it; it is stored as a digest only, and cannot be shown again."""
+    row, text = _store(data).keys.create(name, priority)
+    if as_json:
+        out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
+        return
+    error_console.print(f"Key {row.id} of {row.name!r}. It is shown only now:")
+    out_console.print(text)
+
+
+def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
+    """List API keys, without the keys themselves."""
+    rows = _store(data).keys.all()
+    if as_json:
+        shown = [
+            {"id": row.id, "name": row.name, "priority": row.priority, "revoked": bool(row.revoked_at)} for row in rows
+        ]
+        out_console.print(json.dumps(shown))
+        return
+    table = Table("id", "name", "priority", "state")
+    for row in rows:
+        table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
+    Console(highlight=False, markup=False).print(table)
+
+
+def revoke_key(
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="As shown by keys list.", show_default=False)],
+    data: DataOption = None,
+) -> None:
+    """Make an API key useless from now on."""
+    row = _store(data).keys.revoke(key_id)
+    error_console.print(f"Key {row.id} of {row.name!r} is revoked.")
+
+
+# --- shared --------------------------------------------------------------------------------------------------------
+
+
+def _service_settings() -> Any:
+    from pydantic import ValidationError
+
+    from service.settings import ServiceSettings
+    from sgsst_core.errors import SettingsError
+
+    try:
+        return ServiceSettings()
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "SGSST_" + ".".join(str(part) for part in first["loc"]).upper()
+        raise SettingsError(f"Environment variable {name} = {first['input']!r}: {first['msg']}.") from error
+
+
+def _store(data: Path | None) -> Any:
+    if data is not None:
+        os.environ["SGSST_DATA"] = str(data.absolute())
+    from service.store import open_store
+
+    return open_store(_service_settings())
+
+
+def _client(url: str | None, key: str | None) -> Client:
+    from api.client.client import Client
+
+    return Client(url, key)
+
+
+def _further(text: str) -> dict[str, Any]:
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--parameters is not JSON: {error}") from error
+    if not isinstance(values, dict):
+        raise typer.BadParameter("--parameters is not a JSON object.")
+    return values
+
+
+@contextmanager
+def _transfer(what: str) -> Iterator[Any]:
+    """A bar for bytes on a terminal, nothing elsewhere."""
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total or None)
+
+
+def _follow(client: Client, job_id: str, as_json: bool) -> Job:
+    """Show events until the job has ended: a live bar on a terminal, lines elsewhere, or JSON lines."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+    live = error_console.is_terminal and not as_json
+    with Bar(*columns, console=error_console, transient=True, disable=not live) as bar:
+        task = bar.add_task("waiting", total=1.0, text="")
+        for event in client.watch(job_id):
+            if as_json:
+                out_console.print(json.dumps({"id": event.id, "event": event.kind, **event.data}))
+            elif event.kind == "status":
+                bar.update(task, description=event.data["status"])
+                if not live:
+                    error_console.print(f"{event.data['status']} (attempt {event.data['attempt']})")
+            elif event.kind == "progress":
+                text = _step_text(event.data)
+                bar.update(task, completed=event.data["fraction"], text=text)
+                if not live:
+                    error_console.print(text)
+    return client.job(job_id)
+
+
+def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
+    if job.status != "succeeded":
+        error_console.print(_job_text(job))
+        raise typer.Exit(_JOB_FAILED)
+    with _transfer(out.name) as progress:
+        client.download(job.id, out, progress=progress)
+    out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
+
+
+def _step_text(progress: Any) -> str:
+    if not progress.get("total"):
+        return str(progress["stage"])
+    text = f"{progress['stage']}: step {progress['step']} of {progress['total']}"
+    if progress.get("loss") is not None:
+        text += f", loss {progress['loss']:.3g}"
+    if progress.get("eta_s") is not None:
+        text += f", {_clock(progress['eta_s'])} left"
+    return text
+
+
+def _progress_text(job: Job) -> str:
+    if job.status == "queued" and job.data.get("queue_position"):
+        return f"number {job.data['queue_position']} in the queue"
+    return _step_text(job.progress) if job.progress and not job.finished else ""
+
+
+def _job_text(job: Job) -> str:
+    lines = [f"{'job:':<12}{job.id}", f"{'name:':<12}{job.data['name']}", f"{'status:':<12}{job.status}"]
+    if _progress_text(job):
+        lines.append(f"{'progress:':<12}{_progress_text(job)}")
+    result = job.data.get("result")
+    if result:
+        before, after = result["loss_before"], result["loss_after"]
+        lines.append(f"{'loss:':<12}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    if job.error:
+        lines.append(f"{'error:':<12}{job.error['message']}")
+    return "\n".join(lines)
+
+
+def _plan_text(plan: Any) -> str:
+    lines = [f"{plan['gaussians']:,} Gaussians, {plan['views']} views, {plan['pixels']:,} pixels"]
+    lines += [f"{item['item']}: {item['decision']}: {item['reason']}" for item in plan["plan"]["decisions"]]
+    if plan["estimated_seconds"]:
+        lines.append(f"expected: {_clock(plan['estimated_seconds'])} for all steps")
+    return "\n".join(lines)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -1,0 +1,118 @@
+"""The API as an ASGI app. The process that serves it never imports Ray or PyTorch."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import anyio.to_thread
+from fastapi import FastAPI
+from fastapi.responses import RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from api.http.context import Context
+from api.http.documentation import complete
+from api.http.hub import Hub
+from api.http.metrics import Metrics
+from api.http.problems import METHODS, Problem, add_handlers
+from api.http.routes import artifacts, events, jobs, operations, uploads
+from api.http.schemas import ANSWERS
+from api.http.submission import JobFromUploads
+from service.files.artifacts import Artifacts
+from service.files.blobs import BlobFolder
+from service.inspection.inspector import Inspector
+from service.settings import ServiceSettings
+from service.store import open_store
+
+#: Requests that read the store or the disk side by side.
+_THREADS = 40
+
+_access = logging.getLogger("api.access")
+
+_DESCRIPTION = """
+Style transfer for 3D Gaussian Splatting scenes. Send a scene, its cameras and a style image to `POST /v1/jobs`, watch
+the job, and download `stylized.ply`. Errors are problem documents (RFC 9457) with a stable `code`.
+"""
+
+
+def create_app(settings: ServiceSettings) -> FastAPI:
+    """The app on the settings' store and folders."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        store = open_store(settings)
+        context = Context(
+            settings=settings,
+            store=store,
+            blobs=BlobFolder(settings.folder, store.inputs, settings.min_free_bytes),
+            artifacts=Artifacts(settings.artifacts_url),
+            inspector=Inspector(settings, store),
+            hub=Hub(store),
+            metrics=Metrics(store),
+        )
+        app.state.context = context
+        anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
+        context.hub.start()
+        yield
+        await context.hub.close()
+        await context.inspector.close()
+        store.close()
+
+    app = FastAPI(title="sgsst", version=_version(), description=_DESCRIPTION, lifespan=lifespan)
+    for module in (jobs, events, artifacts, uploads, operations):
+        app.include_router(module.router)
+    add_handlers(app)
+    app.add_middleware(Observed, state=app.state)
+
+    @app.get("/", include_in_schema=False)
+    def root() -> RedirectResponse:
+        return RedirectResponse("/docs")
+
+    plain = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if not app.openapi_schema:
+            complete(plain(), (Problem, JobFromUploads, *ANSWERS))
+        return app.openapi_schema or {}
+
+    app.openapi = openapi  # type: ignore[method-assign]
+    return app
+
+
+class Observed:
+    """Middleware: counts and logs requests by their route, not by their path."""
+
+    def __init__(self, app: ASGIApp, state: Any) -> None:
+        self._app, self._state = app, state
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = time.perf_counter()
+
+        async def observed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                self._note(scope, message["status"], time.perf_counter() - started)
+            await send(message)
+
+        await self._app(scope, receive, observed)
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", "(none)")
+        method = scope["method"] if scope["method"] in METHODS else "(other)"
+        self._state.context.metrics.observe(method, route, status, seconds)
+        extra = {"method": scope["method"], "path": scope["path"], "status": status, "seconds": round(seconds, 4)}
+        _access.info("request", extra=extra)
+
+
+def _version() -> str:
+    try:
+        return version("sgsst-service")
+    except PackageNotFoundError:
+        return "0"

@@ -1,0 +1,137 @@
+"""What the OpenAPI document says beside the routes' own types: headers of answers, and what is refused, with examples.
+
+Examples of bodies stand with their models (`api.http.schemas`, `api.http.submission`, `service.parameters`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from api.http.context import ForeignSiteError, NoKeyError
+from api.http.problems import (
+    MEDIA_TYPE,
+    HeadTooLargeError,
+    InternalError,
+    MalformedRequestError,
+    from_service,
+)
+from api.http.schemas import JOB_ID, SHA256
+from service.errors import RefusedInputError, ServiceError
+
+Responses = dict[int | str, dict[str, Any]]
+
+_TEXT: dict[str, Any] = {"type": "string"}
+_COUNT: dict[str, Any] = {"type": "integer", "minimum": 0}
+_DATE = {"type": "string", "pattern": "GMT$"}
+
+#: Headers of answers: what they say, their form, an example.
+_HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
+    "Accept-Ranges": ("Parts can be asked for.", {"const": "bytes"}, "bytes"),
+    "Cache-Control": ("Answers belong to one key, and change.", _TEXT, "private, no-cache"),
+    "Content-Disposition": ("A name for the file.", _TEXT, 'attachment; filename="plush-stylized.ply"'),
+    "Content-Length": ("Bytes of the body.", _COUNT, 42301),
+    "Content-Range": ("Which part this is, of how many bytes.", _TEXT, "bytes 0-1023/42301"),
+    "Content-Security-Policy": ("Pages of results are shown in a sandbox.", _TEXT, "sandbox allow-scripts"),
+    "ETag": ("Of this state, for `If-None-Match`.", {"type": "string", "pattern": '^"[0-9a-f]+"$'}, f'"{SHA256}"'),
+    "Idempotency-Replayed": ("Nothing was made: it was there already.", {"const": "true"}, "true"),
+    "Location": ("Where what was made is.", _TEXT, f"/v1/jobs/{JOB_ID}"),
+    "Retry-After": ("Seconds after which to ask again.", _COUNT, 2),
+    "Tus-Checksum-Algorithm": ("For `Upload-Checksum`.", _TEXT, "sha256,sha1,md5"),
+    "Tus-Extension": ("What is spoken beside the protocol's core.", _TEXT, "creation,expiration,checksum,termination"),
+    "Tus-Max-Size": ("Bytes that a file may have.", _COUNT, 16_000_000_000),
+    "Tus-Resumable": ("The protocol's version.", {"const": "1.0.0"}, "1.0.0"),
+    "Tus-Version": ("Versions that are spoken.", _TEXT, "1.0.0"),
+    "Upload-Expires": ("When it is removed, unless more comes.", _DATE, "Sun, 22 Nov 2026 14:02:11 GMT"),
+    "Upload-Length": ("Bytes of the whole file.", _COUNT, 42301),
+    "Upload-Metadata": ("As it was given.", _TEXT, "filename c2NlbmUucGx5"),
+    "Upload-Offset": ("Bytes that are there: where to go on.", _COUNT, 16384),
+    "WWW-Authenticate": ("How to show who is asking.", _TEXT, "Bearer"),
+    "X-Accel-Buffering": ("Proxies hand events on at once.", {"const": "no"}, "no"),
+    "X-Content-Type-Options": ("Browsers do not guess.", {"const": "nosniff"}, "nosniff"),
+}
+
+
+def headers(*names: str, maybe: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Headers that an answer has always, and those that it may have."""
+    found = {}
+    for name in (*names, *maybe):
+        description, schema, example = _HEADERS[name]
+        found[name] = {
+            "description": description,
+            "required": name in names,
+            "schema": {"type": "string", **schema},
+            "example": example,
+        }
+    return found
+
+
+#: What any request may be refused with, and what one for whose answer a key may be needed.
+_ANYWHERE: tuple[ServiceError, ...] = (
+    MalformedRequestError("The request is not HTTP as it should be: its first line, a header or a chunk is wrong."),
+    HeadTooLargeError("The request's line and headers have more than 131,072 bytes."),
+    InternalError(),
+)
+_WITH_KEY: tuple[ServiceError, ...] = (
+    NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'."),
+    ForeignSiteError("Pages of 'https://example.com' may not use this service without an API key."),
+)
+
+
+def problems(*errors: ServiceError, key: bool = True) -> Responses:
+    """What an operation may refuse with: each error as it is answered, under its status.
+
+    Args:
+        errors: one for each `code` of this operation; those of every operation are added.
+        key: whether a key may be needed.
+    """
+    found: Responses = {}
+    for error in (*_ANYWHERE, *(_WITH_KEY if key else ()), *errors):
+        answer = from_service(error)
+        example = json.loads(bytes(answer.body))
+        shown = found.setdefault(error.status, _no_problem_yet(error.status, example["title"]))
+        content = shown["content"][MEDIA_TYPE]
+        content["schema"]["allOf"][1]["properties"]["code"]["enum"].append(error.code)
+        content["examples"][error.code] = {"value": example}
+        sent = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
+        shown.setdefault("headers", {}).update(headers(*sent))
+    return found
+
+
+def _no_problem_yet(status: int, title: str) -> dict[str, Any]:
+    known = {"properties": {"status": {"const": status}, "code": {"enum": []}}}
+    schema = {"allOf": [{"$ref": "#/components/schemas/Problem"}, known]}
+    return {"description": f"{title}: see `code`.", "content": {MEDIA_TYPE: {"schema": schema, "examples": {}}}}
+
+
+def invalid(at: str, message: str) -> ServiceError:
+    """A header or parameter of a wrong form, as an example."""
+    return RefusedInputError(f"{at}: {message}", "invalid-request", errors=[{"at": at, "message": message}])
+
+
+def links(*operations: str, **parameters: str) -> dict[str, Any]:
+    """Where an answer leads: operations that take these parameters from it."""
+    return {name: {"operationId": name, "parameters": parameters} for name in operations}
+
+
+def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> None:
+    """Mend FastAPI's document: it lacks models that no route takes as an argument, drops nulls from examples, and has
+    forms of its own for errors."""
+    schemas = document["components"]["schemas"]
+    for model in models:
+        made = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas |= made.pop("$defs", {})
+        schemas[model.__name__] = made
+    for path in document["paths"].values():
+        for method, operation in path.items():
+            answers = operation["responses"]
+            if "application/json" in answers.get("422", {}).get("content", {}):
+                del answers["422"]  # FastAPI's own form, where nothing can be wrong with a request's parameters
+            for answer in answers.values():
+                if method == "head":
+                    answer.pop("content", None)
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)

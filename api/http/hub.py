@@ -1,0 +1,154 @@
+"""Job events to any number of watchers: one task looks into the store for all of them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections import deque
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+
+from pydantic_core import to_jsonable_python
+
+from api.http.schemas import utc
+from service.store import Store
+from service.store.jobs import FINISHED
+from service.store.tables import EventRow
+
+#: Seconds between two looks into the store; a watcher learns of an event after half of it on average.
+_POLL_SECONDS = 0.3
+#: Seconds of silence after which a comment is sent, so that proxies do not take the connection for dead.
+_HEARTBEAT_SECONDS = 15.0
+#: Events of a watched job that are kept for its watchers; who is farther behind reads the store.
+_KEPT = 300
+_ENDED = (*FINISHED, "expired")
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Item:
+    """An event as it is sent."""
+
+    id: int
+    text: bytes
+    ends: bool
+
+
+@dataclass
+class _Channel:
+    """The watchers of one job."""
+
+    base: int
+    last: int
+    items: deque[Item] = field(default_factory=deque)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    watchers: int = 0
+    gone: bool = False
+
+
+class Hub:
+    """Looks for events of jobs that are watched, and wakes their watchers."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._channels: dict[str, _Channel] = {}
+        self._task: asyncio.Task[None] | None = None
+        self._closing = asyncio.Event()
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._task = asyncio.create_task(self._poll())
+
+    async def close(self) -> None:
+        """End all streams; watchers come back with the id of their last event."""
+        self._closing.set()
+        for channel in self._channels.values():
+            channel.changed.set()
+        if self._task is not None:
+            self._task.cancel()
+
+    async def ended(self, job_id: str, after: int) -> bool:
+        """Whether there is nothing to tell after that event, and never will be."""
+        last = (await asyncio.to_thread(self._store.jobs.last_events, [job_id])).get(job_id)
+        if last is None or last > after:
+            return False
+        rows = await asyncio.to_thread(self._store.jobs.events, job_id, last - 1, 1)
+        return bool(rows) and _item(rows[0]).ends
+
+    async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
+        """Events of a job after one, as text, until the job has ended."""
+        channel = self._channels.get(job_id)
+        if channel is None:
+            channel = self._channels.setdefault(job_id, _Channel(0, 0))
+        channel.watchers += 1
+        try:
+            yield b"retry: 2000\n\n"
+            while not self._closing.is_set() and not channel.gone:
+                changed = channel.changed
+                items = await self._after(job_id, channel, after)
+                for item in items:
+                    yield item.text
+                    after = item.id
+                if items and items[-1].ends and channel.last <= after:
+                    return
+                if items:
+                    continue
+                try:
+                    await asyncio.wait_for(changed.wait(), _HEARTBEAT_SECONDS)
+                except TimeoutError:
+                    yield b": still here\n\n"
+        finally:
+            channel.watchers -= 1
+            if not channel.watchers:
+                self._channels.pop(job_id, None)
+
+    async def _after(self, job_id: str, channel: _Channel, after: int) -> list[Item]:
+        if channel.last and after >= channel.base:
+            return [item for item in channel.items if item.id > after]
+        rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
+        return [_item(row) for row in rows]
+
+    async def _poll(self) -> None:
+        while True:
+            await asyncio.sleep(_POLL_SECONDS)
+            if not self._channels:
+                continue
+            try:
+                await self._look()
+            except Exception:  # the store is away: watchers wait, and hear of it when it is back
+                _log.exception("events could not be read")
+
+    async def _look(self) -> None:
+        watched = dict(self._channels)
+        newest = await asyncio.to_thread(self._store.jobs.last_events, list(watched))
+        for job_id, channel in watched.items():
+            number = newest.get(job_id)
+            if number is None:  # the job was deleted
+                channel.gone = True
+                _wake(channel)
+                continue
+            if not channel.last:
+                channel.base = channel.last = number
+                _wake(channel)
+            elif number > channel.last:
+                rows = await asyncio.to_thread(self._store.jobs.events, job_id, channel.last)
+                channel.items.extend(_item(row) for row in rows)
+                channel.last = rows[-1].id if rows else channel.last
+                while len(channel.items) > _KEPT:
+                    channel.base = channel.items.popleft().id
+                _wake(channel)
+
+
+def _wake(channel: _Channel) -> None:
+    changed, channel.changed = channel.changed, asyncio.Event()
+    changed.set()
+
+
+def _item(row: EventRow) -> Item:
+    data = row.data
+    if row.kind == "progress":  # as the job's own view says it
+        data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
+    text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
+    return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in _ENDED)

@@ -1,0 +1,321 @@
+"""A job's files in one multipart request: written to disk as they come, in constant memory."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import ClientDisconnect
+
+from service.errors import RefusedInputError, ServiceError, TooLargeError
+from service.files.blobs import BlobFolder, Receiver
+from service.files.staging import MAX_CAMERA_FILES, ROLES, clean_name
+from service.settings import ServiceSettings
+from sgsst_core.errors import SceneError
+from sgsst_core.files.ply_header import read_header
+
+#: Bytes of a text field, which is JSON of parameters or an id.
+_MAX_TEXT = 1 << 16
+_TEXT_FIELDS = ("parameters", "webhook")
+#: Of one part, and bytes of each of them: they tell its role and its file's name.
+_MAX_HEADERS, _MAX_HEADER = 8, 4224
+#: What comes is gathered to blocks of this size: each is one step to another thread and back.
+_BLOCK = 1 << 18
+#: Bytes per second at which a body comes at least, once it has come for longer than it may stand still.
+_LEAST_RATE = 1000
+#: After a refusal, so much more is read and thrown away: a client that still sends would not see the answer otherwise.
+_DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
+
+
+class BadRequestError(ServiceError):
+    """The body is not what its headers say."""
+
+    code, status = "malformed-body", 400
+
+
+class MediaTypeError(ServiceError):
+    """Not a media type, or an encoding, that is read here."""
+
+    code, status = "unsupported-media-type", 415
+
+
+class TooSlowError(ServiceError):
+    """The body has stopped coming."""
+
+    code, status = "too-slow", 408
+
+
+@dataclass
+class Received:
+    """What a request brought.
+
+    Attributes:
+        files: `role`, `name`, `sha256`, `size` of each file.
+        uploads: role and id where an upload was named instead.
+        texts: the text fields.
+    """
+
+    files: list[dict[str, Any]] = field(default_factory=list)
+    uploads: list[tuple[str, str]] = field(default_factory=list)
+    texts: dict[str, str] = field(default_factory=dict)
+
+
+async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncIterator[bytes]:
+    """The body in blocks.
+
+    Raises:
+        MediaTypeError, TooLargeError, TooSlowError, BadRequestError: it is compressed, too long, stands still or hardly
+            moves, or was cut off.
+    """
+    limit = settings.max_request_bytes
+    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
+        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
+    declared = request.headers.get("content-length", "")
+    if declared.isdigit() and int(declared) > limit:
+        raise TooLargeError(f"The request has {int(declared):,} bytes; {limit:,} may be. Use uploads.", limit=limit)
+    total = 0
+    block = bytearray()
+    stream = aiter(request.stream())
+    started = time.monotonic()
+    while True:
+        # who sends a byte now and then does not stand still, but would hold the connection for ever
+        allowed = settings.receive_seconds + total / _LEAST_RATE - (time.monotonic() - started)
+        try:
+            part = await asyncio.wait_for(anext(stream), max(0.0, min(allowed, settings.receive_seconds)))
+        except StopAsyncIteration:
+            break
+        except TimeoutError as error:
+            if block:
+                yield bytes(block)  # an upload keeps what has come
+            raise TooSlowError(
+                f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second.",
+                headers={"Connection": "close"},  # the rest of the body may never come
+            ) from error
+        except ClientDisconnect as error:
+            if block:
+                yield bytes(block)
+            raise BadRequestError("The request was cut off.") from error
+        total += len(part)
+        if total > limit:
+            raise TooLargeError(f"The request has more than {limit:,} bytes. Use uploads.", limit=limit)
+        block += part
+        if len(block) >= _BLOCK:
+            yield bytes(block)
+            block.clear()
+    if block:
+        yield bytes(block)
+
+
+async def receive(request: Request, blobs: BlobFolder, settings: ServiceSettings) -> Received:
+    """Read a multipart request to its end; its files are blobs when this returns.
+
+    Raises:
+        ServiceError: in one of its forms; what had arrived is removed.
+    """
+    kind, options = parse_options_header(request.headers.get("content-type", ""))
+    boundary = options.get(b"boundary")
+    if kind != b"multipart/form-data":
+        raise MediaTypeError("The body must be multipart/form-data or application/json.")
+    if not boundary:
+        raise BadRequestError("The Content-Type multipart/form-data must name a boundary.")
+    form = _Form(boundary, blobs, settings)
+    blocks = body_blocks(request, settings)
+    try:
+        async for block in blocks:
+            await asyncio.to_thread(form.feed, block)
+        await asyncio.to_thread(form.finish)
+    except BaseException as error:
+        form.discard()
+        if isinstance(error, ServiceError) and not isinstance(error, TooSlowError | TooLargeError):
+            await _drain(blocks)
+        raise
+    return form.received
+
+
+async def _drain(blocks: AsyncIterator[bytes]) -> None:
+    left = _DRAIN_BYTES
+
+    async def drain() -> None:
+        nonlocal left
+        async for block in blocks:
+            left -= len(block)
+            if left < 0:
+                return
+
+    try:
+        await asyncio.wait_for(drain(), _DRAIN_SECONDS)
+    except (TimeoutError, ServiceError):
+        return
+
+
+class _Form:
+    """The parser's callbacks: which part is open, and where its bytes go."""
+
+    def __init__(self, boundary: bytes, blobs: BlobFolder, settings: ServiceSettings) -> None:
+        self.received = Received()
+        self._blobs, self._settings = blobs, settings
+        self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
+        self._parts = 0
+        self._headers: dict[bytes, bytes] = {}
+        self._role = self._name = ""
+        self._file: Receiver | None = None
+        self._text = bytearray()
+        self._done = False
+        self._closed: list[Receiver] = []
+        callbacks: dict[str, Callable[..., None]] = {
+            "on_part_begin": self._begin,
+            "on_header_field": lambda data, start, end: self._header[0].extend(data[start:end]),
+            "on_header_value": lambda data, start, end: self._header[1].extend(data[start:end]),
+            "on_header_end": self._header_end,
+            "on_headers_finished": self._open,
+            "on_part_data": self._data,
+            "on_part_end": self._end,
+            "on_end": self._finished,
+        }
+        try:
+            self._parser = MultipartParser(
+                boundary,
+                callbacks,  # type: ignore[arg-type]
+                max_header_count=_MAX_HEADERS,
+                max_header_size=_MAX_HEADER,
+            )
+        except FormParserError as error:
+            raise BadRequestError(f"The multipart boundary cannot be used: {error}.") from error
+
+    def feed(self, block: bytes) -> None:
+        """Take a block of the body in."""
+        try:
+            self._parser.write(block)
+        except FormParserError as error:
+            raise BadRequestError(f"The multipart body makes no sense: {error}.") from error
+
+    def finish(self) -> None:
+        """Prove that the body was whole."""
+        if not self._done:
+            raise BadRequestError("The multipart body ends before its last boundary: it was cut off.")
+
+    def discard(self) -> None:
+        """Remove what has arrived of the file that is open."""
+        if self._file is not None:
+            self._file.discard()
+            self._file = None
+
+    def _begin(self) -> None:
+        self._parts += 1
+        if self._parts > self._settings.max_photos + MAX_CAMERA_FILES + 2 + len(_TEXT_FIELDS):
+            raise RefusedInputError(f"There are more than {self._parts - 1} fields.", "too-many-files")
+        self._headers = {}
+        self._clear_header()
+
+    def _clear_header(self) -> None:
+        self._header[0].clear()
+        self._header[1].clear()
+
+    def _header_end(self) -> None:
+        self._headers[bytes(self._header[0]).lower()] = bytes(self._header[1])
+        self._clear_header()
+
+    def _open(self) -> None:
+        _, options = parse_options_header(self._headers.get(b"content-disposition", b""))
+        self._role = options.get(b"name", b"").decode("utf-8", "replace")
+        filename = options.get(b"filename")
+        self._text.clear()
+        if self._role not in (*ROLES, *_TEXT_FIELDS):
+            known = ", ".join((*ROLES, *_TEXT_FIELDS))
+            raise RefusedInputError(f"There is a field {self._role[:60]!r}; known are {known}.", "invalid-request")
+        if filename is None or self._role in _TEXT_FIELDS:
+            return
+        count = len(self.received.files)
+        if count >= self._settings.max_photos + MAX_CAMERA_FILES + 2:
+            raise RefusedInputError(f"There are more than {count} files.", "too-many-files")
+        self._name = clean_name(self._role, filename.decode("utf-8", "replace"), count)
+        self._file = self._blobs.receive(self._settings.max_upload_bytes)
+
+    def _data(self, data: bytes, start: int, end: int) -> None:
+        if self._file is not None:
+            self._file.write(data[start:end])
+            return
+        self._text += data[start:end]
+        if len(self._text) > _MAX_TEXT:
+            raise RefusedInputError(f"The field {self._role!r} has more than {_MAX_TEXT} bytes.", "invalid-request")
+
+    def _end(self) -> None:
+        if self._file is not None:
+            file, self._file = self._file, None
+            sha256 = file.close()
+            try:
+                check_file(self._role, self._name, file.path, file.size, self._settings)
+            except ServiceError:
+                file.discard()
+                raise
+            self._blobs.keep(file.path, sha256, file.size)
+            entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": file.size}
+            self.received.files.append(entry)
+            return
+        text = self._text.decode("utf-8", "replace")
+        if self._role not in _TEXT_FIELDS:
+            self.received.uploads.append((self._role, text.strip()))
+        elif self._role in self.received.texts:
+            raise RefusedInputError(f"The field {self._role!r} is there twice.", "invalid-request")
+        else:
+            self.received.texts[self._role] = text
+
+    def _finished(self) -> None:
+        self._done = True
+
+
+def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSettings) -> None:
+    """What can be told of a file at once, without its reader: the rest is the inspecting process'.
+
+    Raises:
+        RefusedInputError: it cannot be used.
+    """
+    if not size:
+        raise RefusedInputError(f"{name}: is empty. Send the file's content.", f"invalid-{_kind(role)}", input=role)
+    if role != "scene":
+        return
+    try:
+        header = read_header(path)
+    except SceneError as error:
+        raise RefusedInputError(str(error).replace(os.fspath(path), name), error.code, input=role) from error
+    least = sum(element.count * element.least_row_bytes(header.text) for element in header.elements)
+    if len(header.raw) + least - (1 if header.text else 0) > size:
+        raise RefusedInputError(
+            f"{name}: the header declares data of at least {least} bytes, but only {size - len(header.raw)} follow it: "
+            "the file is truncated or its header is wrong. Copy or export it again.",
+            "invalid-scene",
+            input=role,
+        )
+    count = header.vertex.count if "vertex" in header.names else 0
+    if count > settings.max_gaussians:
+        raise RefusedInputError(
+            f"The scene has {count:,} Gaussians; {settings.max_gaussians:,} may be.",
+            "too-many-gaussians",
+            input=role,
+            limit=settings.max_gaussians,
+        )
+
+
+def _kind(role: str) -> str:
+    return {"style": "image", "photos": "image"}.get(role, role)
+
+
+def parse_json(text: str, what: str) -> Any:
+    """JSON of a field or body.
+
+    Raises:
+        RefusedInputError: it is none.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RefusedInputError(f"{what}: is not JSON: {error}.", "invalid-request", input=what) from error

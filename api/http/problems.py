@@ -1,0 +1,143 @@
+"""Errors as HTTP has them: RFC 9457 problem documents with a stable `code`."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from starlette.exceptions import HTTPException
+from starlette.routing import Match
+
+from service.errors import ServiceError
+from sgsst_core.errors import InvalidInputError
+
+MEDIA_TYPE = "application/problem+json"
+#: 460 is the tus protocol's own.
+_TITLES = {460: "Checksum Mismatch"}
+METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
+#: Letters of an input value that a problem repeats.
+_SHOWN = 100
+
+_log = logging.getLogger(__name__)
+
+
+class Problem(BaseModel):
+    """RFC 9457. Programs read `code` and `status`; people read `detail`, which says what to do."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "about:blank",
+                    "title": "Unprocessable Content",
+                    "status": 422,
+                    "code": "invalid-scene",
+                    "detail": "scene.ply: has no PLY header (it does not start with 'ply'). Give a 3DGS scene.",
+                    "input": "scene",
+                }
+            ]
+        },
+    )
+
+    type: str = "about:blank"
+    title: str = Field(description="The status in words.")
+    status: int
+    code: str = Field(description="Stable identifier of the kind of error.")
+    detail: str = Field(description="What was wrong and what to do, for people.")
+
+
+class MalformedRequestError(ServiceError):
+    """Bytes that are no HTTP request; said by `api.http.connection`, below the app."""
+
+    code, status = "malformed-request", 400
+
+
+class HeadTooLargeError(ServiceError):
+    """A request's line and headers without end; said by `api.http.connection`, below the app."""
+
+    code, status = "head-too-large", 431
+
+
+class InternalError(ServiceError):
+    """A fault of the service itself."""
+
+    code, status = "internal", 500
+
+    def __init__(self) -> None:
+        super().__init__("Something went wrong on the service's side; its log says what.")
+
+
+def problem(
+    status: int, code: str, detail: str, headers: dict[str, str] | None = None, **extra: object
+) -> JSONResponse:
+    """A problem document as a response."""
+    title = _TITLES.get(status) or HTTPStatus(status).phrase
+    body = Problem(title=title, status=status, code=code, detail=detail, **extra)  # type: ignore[arg-type]
+    return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
+
+
+def add_handlers(app: FastAPI) -> None:
+    """Turn every error of the app into a problem document."""
+    app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(InvalidInputError, _invalid_input)
+    app.add_exception_handler(RequestValidationError, _invalid_request)
+    app.add_exception_handler(ValidationError, _invalid_request)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def from_service(error: ServiceError) -> JSONResponse:
+    """The problem document of an error of the service."""
+    extra = dict(error.extra)
+    headers: dict[str, str] = dict(extra.pop("headers", {}))  # type: ignore[call-overload]
+    if "retry_after" in extra or error.status in (429, 503, 507):
+        headers["Retry-After"] = str(extra.pop("retry_after", 30))
+    if error.status == 401:
+        headers["WWW-Authenticate"] = "Bearer"
+    return problem(error.status, error.code, str(error), headers, **extra)
+
+
+async def _service_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ServiceError)
+    return from_service(error)
+
+
+async def _invalid_input(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, InvalidInputError)
+    return problem(422, error.code, str(error))
+
+
+async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError | ValidationError)
+    errors = [
+        {"at": ".".join(str(part) for part in entry["loc"])[:_SHOWN], "message": entry["msg"]}
+        for entry in error.errors()[:20]
+    ]
+    first = errors[0] if errors else {"at": "", "message": "invalid"}
+    return problem(422, "invalid-request", f"{first['at']}: {first['message']}", errors=errors)
+
+
+async def _http_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    code = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http-error")
+    headers = dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(_allowed(request))  # the router names those of the first route alone
+    return problem(error.status_code, code, str(error.detail), headers)
+
+
+def _allowed(request: Request) -> list[str]:
+    """The methods that some route of this path has."""
+    routes = request.app.router.routes
+    scopes = {method: {**request.scope, "method": method} for method in METHODS}
+    return [method for method in METHODS if any(route.matches(scopes[method])[0] is Match.FULL for route in routes)]
+
+
+async def _unexpected(request: Request, error: Exception) -> JSONResponse:
+    _log.exception("%s %s broke", request.method, request.url.path, exc_info=error)
+    return from_service(InternalError())

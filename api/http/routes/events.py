@@ -1,0 +1,85 @@
+"""`/v1/jobs/{id}/events`: what happens to a job, as server-sent events."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Response
+from fastapi.responses import StreamingResponse
+
+from api.http.context import CallerDep, ContextDep
+from api.http.documentation import headers, invalid, problems
+from api.http.routes.jobs import JobId, find
+from api.http.schemas import JOB_ID, SHA256
+from service.errors import NotFoundError
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+#: Of each event of the stream, as OpenAPI 3.1 has it for want of a form for streams.
+_EVENT = {
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "pattern": "^[0-9]+$", "description": "For `Last-Event-ID`."},
+        "event": {"type": "string", "enum": ["status", "progress", "artifact"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
+_EXAMPLES = {
+    "status": {"status": "running", "attempt": 1},
+    "progress": {
+        "stage": "sos",
+        "step": 120,
+        "total": 300,
+        "fraction": 0.4,
+        "eta_s": 310.5,
+        "attempt": 1,
+        "updated_at": "2026-11-21T14:02:11Z",
+    },
+    "artifact": {"name": "previews/000100.jpg", "size": 41239, "sha256": SHA256},
+}
+
+
+@router.get(
+    "/{job_id}/events",
+    operation_id="watch_job",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Events `status`, `progress` and `artifact`, until the job has ended. Each is sent as the "
+            "lines `id: `, `event: ` and `data: ` with an empty line behind them.",
+            "headers": headers("Cache-Control", "X-Accel-Buffering"),
+            "content": {
+                "text/event-stream": {
+                    "schema": _EVENT,
+                    "examples": {
+                        kind: {"value": {"id": str(number), "event": kind, "data": json.dumps(data)}}
+                        for number, (kind, data) in enumerate(_EXAMPLES.items(), start=4)
+                    },
+                }
+            },
+        },
+        204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not come back."},
+        **problems(
+            NotFoundError(f"There is no job {JOB_ID}."),
+            invalid("header.Last-Event-ID", "Input should be greater than or equal to 0"),
+        ),
+    },
+)
+async def watch_job(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    last_event_id: Annotated[
+        int | None,
+        Header(alias="Last-Event-ID", ge=0, lt=2**62, description="Go on after this event.", examples=[42]),
+    ] = None,
+) -> Response:
+    """Watch a job. A stream that was cut off goes on with `Last-Event-ID`; browsers' `EventSource` sends it."""
+    await asyncio.to_thread(find, context, caller, job_id)
+    if last_event_id and await context.hub.ended(job_id, last_event_id):
+        return Response(status_code=204)
+    sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(context.hub.watch(job_id, last_event_id or 0), 200, sent, "text/event-stream")

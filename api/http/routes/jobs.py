@@ -1,0 +1,380 @@
+"""`/v1/jobs`."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+
+from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
+from api.http.documentation import headers, invalid, links, problems
+from api.http.multipart import BadRequestError, Received, body_blocks, check_file, parse_json, receive
+from api.http.schemas import (
+    JOB_ID,
+    JobDetail,
+    JobPage,
+    JobView,
+    PlanView,
+    StatusName,
+    job_detail,
+    job_view,
+    poll_seconds,
+)
+from api.http.submission import BODY, REFUSALS, JobFromUploads
+from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError, TooLargeError
+from service.files.staging import check_roles, clean_name
+from service.parameters import JobParameters
+from service.scheduling.webhooks import check_url
+from service.store.jobs import Idempotency, NewJob
+from service.store.tables import JobRow, UploadRow
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+#: Bytes of a JSON body, which only names uploads.
+_MAX_JSON = 1 << 20
+
+IdempotencyHeader = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=180,
+        description="The same request with the same key creates nothing twice, for a day.",
+        examples=["5f0c9a52-9a3b-4c39-8a1c-0d9a2b8b6d1e"],
+    ),
+]
+
+
+IfNoneMatch = Annotated[
+    str | None,
+    Header(alias="If-None-Match", description="An ETag; the same one is answered with 304.", examples=['"e7d2c939"']),
+]
+JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
+#: Headers of an answer that shows a job.
+_SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
+_NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
+#: What can be done with a job.
+_NEXT = ("get_job", "cancel_job", "retry_job", "delete_job", "watch_job", "list_artifacts")
+
+
+@router.post(
+    "",
+    status_code=202,
+    response_model=JobView,
+    openapi_extra=BODY,
+    responses={
+        200: {"model": PlanView, "description": "With `dry_run`: the plan. Nothing was queued."},
+        202: {
+            "description": "The job was accepted: it will not be lost.",
+            "headers": headers("Location", "Retry-After", maybe=("Idempotency-Replayed",)),
+            "links": links(*_NEXT, job_id="$response.body#/id"),
+        },
+        **problems(*REFUSALS),
+    },
+    operation_id="create_job",
+)
+async def create_job(
+    request: Request,
+    context: ContextDep,
+    caller: CallerDep,
+    idempotency_key: IdempotencyHeader = None,
+    dry_run: Annotated[
+        bool, Query(description="Check everything and plan, but queue nothing.", examples=[True])
+    ] = False,
+) -> Response:
+    """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    parts = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
+    wanted = await asyncio.to_thread(_gather, context, caller, parts)
+    if not wanted.checked:
+        await context.inspector.inspect("check", wanted.inputs, wanted.paths, wanted.parameters)
+    if dry_run:
+        return await _plan(context, wanted.inputs, wanted.paths, wanted.parameters)
+    return await asyncio.to_thread(_queue, context, caller, wanted, idempotency_key)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """A job that somebody wants.
+
+    Attributes:
+        inputs: `role`, `name`, `sha256`, `size` of each file.
+        paths: the files by digest.
+        checked: the same files have been inspected before, and can be used.
+    """
+
+    inputs: list[dict[str, Any]]
+    paths: dict[str, FilePath]
+    parameters: JobParameters
+    webhook: str | None
+    checked: bool
+
+
+Parts = tuple[Received, JobParameters, str | None]
+
+
+def _gather(context: Context, caller: Caller, parts: Parts) -> _Wanted:
+    """Find the files of a job, and prove what can be proved without the inspecting process."""
+    received, parameters, webhook = parts
+    inputs, paths = _resolve(context, caller, received)
+    check_roles(inputs, orbit=parameters.orbit is not None)
+    if webhook:
+        check_url(webhook, context.settings)
+    checked = context.inspector.recall("check", inputs, parameters) is not None
+    if not checked:
+        for entry in inputs:
+            check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
+    return _Wanted(inputs, paths, parameters, webhook, checked)
+
+
+def _queue(context: Context, caller: Caller, wanted: _Wanted, idempotency_key: str | None) -> Response:
+    """Queue a job that has been checked, and answer."""
+    parameters, webhook = wanted.parameters, wanted.webhook
+    idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
+    values = parameters.model_dump(mode="json", exclude_unset=True)
+    new = NewJob(caller.owner, parameters.name, caller.priority, values, wanted.inputs, webhook or None)
+    jobs = context.store.jobs
+    job, created = jobs.create(new, limit=context.settings.max_jobs_per_key, idempotency=idempotency)
+    sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
+    if not created:
+        sent["Idempotency-Replayed"] = "true"
+    body = job_view(job, jobs.queue_position(job)).model_dump_json()
+    return Response(body, 202, sent, media_type="application/json")
+
+
+async def _from_form(request: Request, context: Context) -> Parts:
+    received = await receive(request, context.blobs, context.settings)
+    text = received.texts.get("parameters", "").strip() or "{}"
+    values = parse_json(text, "parameters")
+    if not isinstance(values, dict):
+        raise RefusedInputError("parameters: is not a JSON object.", "invalid-request", input="parameters")
+    parameters = JobParameters.model_validate(values)
+    parameters.settings()
+    return received, parameters, received.texts.get("webhook", "").strip() or None
+
+
+async def _from_json(request: Request, context: Context) -> Parts:
+    body = bytearray()
+    async for block in body_blocks(request, context.settings):
+        body += block
+        if len(body) > _MAX_JSON:
+            raise TooLargeError(f"A JSON body may have {_MAX_JSON:,} bytes.", limit=_MAX_JSON)
+    try:
+        text = body.decode()
+    except UnicodeDecodeError as error:
+        raise BadRequestError("The body is not UTF-8.") from error
+    job = JobFromUploads.model_validate(parse_json(text, "body"))
+    job.parameters.settings()
+    named = [("scene", job.scene), ("style", job.style)]
+    named += [("cameras", each) for each in job.cameras] + [("photos", each) for each in job.photos]
+    return Received(uploads=named), job.parameters, job.webhook
+
+
+def _resolve(context: Context, caller: Caller, received: Received) -> tuple[list[dict[str, Any]], dict[str, FilePath]]:
+    """All files of a job, those that came with it and those that were uploaded before, and where they are by digest.
+    They stay for now."""
+    inputs = list(received.files)
+    ids = [upload_id for _, upload_id in received.uploads if is_id(upload_id)]
+    uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
+    digests = []
+    for role, upload_id in received.uploads:
+        upload = uploads.get(upload_id)
+        if upload is None:
+            raise RefusedInputError(
+                f"{upload_id[:60]!r} is no id of an upload that can be used, and {role!r} came without a file name.",
+                "unknown-upload",
+                input=role,
+            )
+        digests.append(_content(context, upload, role))
+    rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
+    for number, ((role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
+        name = clean_name(role, uploads[upload_id].filename, number)
+        inputs.append({"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
+    return inputs, {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
+
+
+def _content(context: Context, upload: UploadRow, role: str) -> str:
+    """SHA-256 of an upload, which must be finished."""
+    sha256 = upload.sha256
+    if sha256 is None and upload.offset == upload.length:  # the service died before it could tell
+        sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
+    if sha256 is None:
+        raise RefusedInputError(
+            f"Upload {upload.id} has {upload.offset:,} of {upload.length:,} bytes. Finish it first.",
+            "unfinished-upload",
+            input=role,
+        )
+    return sha256
+
+
+async def _plan(
+    context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, FilePath], parameters: JobParameters
+) -> Response:
+    found = await context.inspector.inspect("plan", inputs, paths, parameters)
+    view = PlanView(**found, workers=parameters.workers)
+    return JSONResponse(view.model_dump(mode="json"))
+
+
+def _idempotency(
+    key: str | None, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters, webhook: str | None
+) -> Idempotency | None:
+    if key is None:
+        return None
+    text = json.dumps([list(inputs), parameters.model_dump(mode="json"), webhook], sort_keys=True)
+    return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
+
+
+@router.get(
+    "",
+    response_model=JobPage,
+    responses={
+        200: {"links": links(*_NEXT, job_id="$response.body#/jobs/0/id")},
+        **problems(invalid("query.limit", "Input should be less than or equal to 200")),
+    },
+    operation_id="list_jobs",
+)
+def list_jobs(
+    context: ContextDep,
+    caller: CallerDep,
+    status: Annotated[
+        list[StatusName] | None,
+        Query(description="Only these; may be given several times.", examples=[["queued", "running"]]),
+    ] = None,
+    cursor: Annotated[
+        str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.", examples=[JOB_ID])
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
+) -> JobPage:
+    """Jobs of this key, the newest first."""
+    jobs = context.store.jobs
+    found = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)
+    shown = found[:limit]
+    views = [job_view(job, jobs.queue_position(job)) for job in shown]
+    return JobPage(jobs=views, next_cursor=shown[-1].id if len(found) > limit else None)
+
+
+@router.get(
+    "/{job_id}",
+    response_model=JobDetail,
+    responses={
+        200: {"headers": _SHOWN, "links": links(*_NEXT[1:], job_id="$response.body#/id")},
+        304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
+        **problems(_NOT_THERE),
+    },
+    operation_id="get_job",
+)
+def get_job(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
+    check_id(job_id)
+    return _shown(context, caller, job_id, if_none_match)
+
+
+@router.post(
+    "/{job_id}/cancel",
+    response_model=JobDetail,
+    responses={
+        200: {
+            "headers": _SHOWN,
+            "links": links("get_job", "retry_job", "delete_job", "watch_job", job_id="$response.body#/id"),
+        },
+        **problems(_NOT_THERE, ConflictError("The job has succeeded and cannot be canceled.", job_status="succeeded")),
+    },
+    operation_id="cancel_job",
+)
+def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """Cancel a job: at once where it waits, within seconds where it runs (`canceling` until then)."""
+    check_id(job_id)
+    context.store.jobs.cancel(job_id, caller.owner)
+    return _shown(context, caller, job_id)
+
+
+@router.post(
+    "/{job_id}/retry",
+    status_code=202,
+    response_model=JobDetail,
+    responses={
+        202: {
+            "description": "It waits for its turn again.",
+            "headers": _SHOWN,
+            "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
+        },
+        **problems(
+            _NOT_THERE,
+            ConflictError(
+                "The job has status running; only one that failed or was canceled can be tried again.",
+                job_status="running",
+            ),
+            QueueFullError("There are 100 unfinished jobs of this key already.", limit=100),
+        ),
+    },
+    operation_id="retry_job",
+)
+def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
+    check_id(job_id)
+    context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
+    return _shown(context, caller, job_id, status=202)
+
+
+@router.delete(
+    "/{job_id}",
+    status_code=204,
+    responses={
+        204: {"description": "It is gone, with its results."},
+        **problems(
+            _NOT_THERE,
+            ConflictError(
+                "The job has status running. Cancel it first; delete it once it has ended.", job_status="running"
+            ),
+        ),
+    },
+    operation_id="delete_job",
+)
+def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
+    """Remove a job that has ended, with its results."""
+    find(context, caller, job_id)
+    context.store.jobs.delete(job_id, caller.owner)
+    context.artifacts.remove_job(job_id)
+
+
+def find(context: Context, caller: Caller, job_id: str) -> JobRow:
+    """The caller's job of that id.
+
+    Raises:
+        NotFoundError: there is none, or it is another's.
+    """
+    check_id(job_id)
+    return context.store.jobs.get(job_id, caller.owner)
+
+
+def check_id(job_id: str) -> None:
+    """Raise NotFoundError for what cannot be a job's id."""
+    if not is_id(job_id):
+        raise NotFoundError(f"There is no job {job_id[:60]}.")
+
+
+def _shown(
+    context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
+) -> Response:
+    job, position, attempts = context.store.jobs.detail(job_id, caller.owner)
+    view = job_detail(job, position, attempts)
+    body = view.model_dump_json().encode()
+    tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+    sent = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    wait = poll_seconds(job)
+    if wait is not None:
+        sent["Retry-After"] = str(wait)
+    if if_none_match is not None and tag in if_none_match:
+        return Response(status_code=304, headers=sent)
+    return Response(body, status, sent, media_type="application/json")

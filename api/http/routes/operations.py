@@ -1,0 +1,82 @@
+"""`/livez`, `/readyz`, `/metrics`: for those who run the service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fastapi import APIRouter, Response
+from fastapi.responses import JSONResponse, PlainTextResponse
+
+from api.http.context import ContextDep
+from api.http.documentation import problems
+from api.http.schemas import Health
+
+router = APIRouter(tags=["operations"])
+
+
+@router.get("/livez", response_model=Health, responses=problems(key=False), operation_id="livez")
+async def livez() -> Health:
+    """Whether the process answers: if not, restart it."""
+    return Health(status="ok", checks={})
+
+
+@router.get(
+    "/readyz",
+    response_model=Health,
+    operation_id="readyz",
+    responses={
+        503: {
+            "description": "Something that jobs need is away; `checks` says what.",
+            "content": {
+                "application/json": {
+                    "schema": {"$ref": "#/components/schemas/Health"},
+                    "example": {
+                        "status": "unavailable",
+                        "checks": {"database": "ok", "artifacts": "ok", "disk": "NoSpaceError"},
+                    },
+                }
+            },
+        },
+        **problems(key=False),
+    },
+)
+def readyz(context: ContextDep) -> Response:
+    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room.
+
+    Without a dispatcher they still can be, and wait in the queue: the answer is 200, its status `waiting` and its check
+    `dispatchers` "none". Otherwise this check tells how many are alive.
+    """
+    checks: dict[str, Callable[[], None]] = {
+        "database": context.store.database.ping,
+        "artifacts": context.artifacts.ping,
+        "disk": lambda: context.blobs.ensure_room(0),
+    }
+    found = {}
+    for name, check in checks.items():
+        try:
+            check()
+            found[name] = "ok"
+        except Exception as error:  # whatever it is, the answer is that it does not work
+            found[name] = f"{type(error).__name__}"
+    if not all(value == "ok" for value in found.values()):
+        return JSONResponse(Health(status="unavailable", checks=found).model_dump(), 503)
+    alive = len(context.store.operations.dispatchers())
+    view = Health(status="ok" if alive else "waiting", checks={**found, "dispatchers": str(alive or "none")})
+    return JSONResponse(view.model_dump())
+
+
+@router.get(
+    "/metrics",
+    response_class=PlainTextResponse,
+    responses={
+        200: {
+            "description": "The text form of Prometheus.",
+            "content": {"text/plain": {"example": 'sgsst_jobs{status="queued"} 3.0\n'}},
+        },
+        **problems(key=False),
+    },
+    operation_id="metrics",
+)
+def metrics(context: ContextDep) -> Response:
+    """Prometheus metrics."""
+    return Response(context.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -1,0 +1,368 @@
+"""What the API answers with."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.files.artifacts import media_type
+from service.parameters import JobParameters
+from service.store.jobs import UNFINISHED
+from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
+
+StatusName = Literal["queued", "starting", "running", "canceling", "succeeded", "failed", "canceled", "expired"]
+
+
+#: Of the examples, which tell of one job.
+JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
+UPLOAD_ID = "upl_1a1fe701a104f943e9d4d8cce5b818c"
+SHA256 = "3158b524aebf9351a4de9039a6b9b799cfc0452d9cec424a9f867085d0a9a7b5"
+_CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
+
+
+def _shown(**example: Any) -> ConfigDict:
+    """An example for the OpenAPI document."""
+    return ConfigDict(json_schema_extra={"examples": [example]})
+
+
+def _example(model: type[BaseModel]) -> dict[str, Any]:
+    """The example of a model, as a part of another's."""
+    extra = model.model_config["json_schema_extra"]
+    assert isinstance(extra, dict)
+    return extra["examples"][0]  # type: ignore[index, return-value]
+
+
+class ErrorView(BaseModel):
+    """Why a job or an attempt failed."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        json_schema_extra={
+            "examples": [{"code": "diverged", "message": "Step 41: the loss is not finite. Lower the learning rate."}]
+        },
+    )
+
+    code: str
+    message: str
+
+
+class ProgressView(BaseModel):
+    """How far a job is."""
+
+    model_config = _shown(
+        stage="sos",
+        step=120,
+        total=300,
+        fraction=0.4,
+        eta_s=310.5,
+        loss=23729174.8,
+        seconds=205.1,
+        attempt=1,
+        updated_at=_NOW,
+    )
+
+    stage: str = Field(description="`reading`, `starting`, `coarse` (coarsest scale) or `sos` (all scales).")
+    step: int
+    total: int = Field(description="Steps at most; 0 while they are not known.")
+    fraction: float = Field(description="Of the steps, 0 to 1.")
+    eta_s: float | None = Field(description="Seconds left, as far as that can be told.")
+    loss: float | None
+    seconds: float | None = Field(description="Of all steps so far.")
+    attempt: int
+    updated_at: datetime
+
+
+class InputView(BaseModel):
+    """A file that a job was created from."""
+
+    model_config = _shown(role="scene", name="scene.ply", size=42301, sha256=SHA256)
+
+    role: Literal["scene", "style", "cameras", "photos"]
+    name: str
+    size: int
+    sha256: str
+
+
+class AttemptView(BaseModel):
+    """One attempt at a job."""
+
+    model_config = _shown(number=1, started_at=_STARTED, finished_at=None, outcome=None, error=None)
+
+    number: int
+    started_at: datetime
+    finished_at: datetime | None
+    outcome: Literal["succeeded", "failed", "canceled", "released", "lost"] | None = Field(
+        description="`lost`: its dispatcher was not heard of again; `released`: it shut down and put the job back."
+    )
+    error: ErrorView | None
+
+
+class Links(BaseModel):
+    """Where to go on."""
+
+    model_config = _shown(
+        self=f"/v1/jobs/{JOB_ID}",
+        events=f"/v1/jobs/{JOB_ID}/events",
+        artifacts=f"/v1/jobs/{JOB_ID}/artifacts",
+        result=None,
+    )
+
+    self: str
+    events: str
+    artifacts: str
+    result: str | None = Field(description="The stylized PLY, once it is there.")
+
+
+class JobView(BaseModel):
+    """A job."""
+
+    model_config = _shown(
+        id=JOB_ID,
+        name="plush",
+        status="running",
+        created_at=_CREATED,
+        started_at=_STARTED,
+        finished_at=None,
+        expires_at=None,
+        attempt=1,
+        queue_position=None,
+        progress=_example(ProgressView),
+        result=None,
+        error=None,
+        parameters={"name": "plush", "preset": "standard"},
+        inputs=[
+            _example(InputView),
+            {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]},
+        ],
+        links=_example(Links),
+    )
+
+    id: str
+    name: str
+    status: StatusName
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None = Field(description="When the results are removed, or the record of an expired job.")
+    attempt: int = Field(description="Of the attempt that runs or ran last; 0 before the first.")
+    queue_position: int | None = Field(description="1 is next; null where the job is not queued.")
+    progress: ProgressView | None
+    result: dict[str, Any] | None = Field(description="Steps, why it stopped, loss before and after.")
+    error: ErrorView | None
+    parameters: JobParameters
+    inputs: list[InputView]
+    links: Links
+
+
+class JobDetail(JobView):
+    """A job with its attempts."""
+
+    model_config = _shown(**_example(JobView), attempts=[_example(AttemptView)])
+
+    attempts: list[AttemptView]
+
+
+class JobPage(BaseModel):
+    """A page of jobs, the newest first."""
+
+    model_config = _shown(jobs=[_example(JobView)], next_cursor=JOB_ID)
+
+    jobs: list[JobView]
+    next_cursor: str | None = Field(description="For the next page; null on the last one.")
+
+
+class ArtifactView(BaseModel):
+    """A file that a job has made."""
+
+    model_config = _shown(
+        name="stylized.ply",
+        size=42301,
+        sha256=SHA256,
+        media_type="application/octet-stream",
+        created_at=_NOW,
+        url=f"/v1/jobs/{JOB_ID}/artifacts/stylized.ply",
+    )
+
+    name: str
+    size: int
+    sha256: str
+    media_type: str
+    created_at: datetime
+    url: str
+
+
+class ArtifactList(BaseModel):
+    """All files that a job has made so far."""
+
+    model_config = _shown(artifacts=[_example(ArtifactView)])
+
+    artifacts: list[ArtifactView]
+
+
+class UploadView(BaseModel):
+    """A file that arrives in parts."""
+
+    model_config = _shown(
+        id=UPLOAD_ID,
+        filename="scene.ply",
+        length=42301,
+        offset=16384,
+        complete=False,
+        sha256=None,
+        expires_at="2026-11-22T14:02:11.332514Z",
+    )
+
+    id: str
+    filename: str
+    length: int
+    offset: int
+    complete: bool
+    sha256: str | None
+    expires_at: datetime
+
+
+class PlanView(BaseModel):
+    """What a job would do; nothing was queued."""
+
+    model_config = _shown(
+        gaussians=616,
+        dropped=0,
+        sh_degree=0,
+        views=3,
+        pixels=9216,
+        style=[80, 96],
+        photos=0,
+        workers=1,
+        estimated_seconds=12.4,
+        memory_bytes=946495488,
+        plan={
+            "version": 1,
+            "decisions": [
+                {
+                    "item": "network layers",
+                    "decision": "none behind relu5_1, the deepest one used",
+                    "reason": "the loss reads no deeper one",
+                    "seconds": None,
+                    "bytes": None,
+                    "error": "none",
+                }
+            ],
+        },
+    )
+
+    gaussians: int
+    dropped: int
+    sh_degree: int
+    views: int
+    pixels: int
+    style: list[int] = Field(description="Width and height.")
+    photos: int
+    workers: int | None = Field(description="As asked for; null where the service decides when the job starts.")
+    estimated_seconds: float | None = Field(description="Of all steps; null where it cannot be told.")
+    memory_bytes: int | None = Field(description="At the peak, as far as that can be told.")
+    plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
+
+
+class Health(BaseModel):
+    """Whether the service can do its work."""
+
+    model_config = _shown(status="ok", checks={"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "1"})
+
+    status: Literal["ok", "waiting", "unavailable"] = Field(
+        description="`waiting`: jobs are taken in, but nobody is there to run them yet."
+    )
+    checks: dict[str, str]
+
+
+ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health)
+
+
+def utc(seconds: float) -> datetime:
+    """A moment, given in seconds since the epoch."""
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _maybe(seconds: float | None) -> datetime | None:
+    return None if seconds is None else utc(seconds)
+
+
+def job_view(job: JobRow, queue_position: int | None) -> JobView:
+    """A job as the API shows it."""
+    return JobView(**_job_fields(job, queue_position))
+
+
+def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow]) -> JobDetail:
+    """A job with its attempts."""
+    shown = [
+        AttemptView(
+            number=row.number,
+            started_at=utc(row.started_at),
+            finished_at=_maybe(row.finished_at),
+            outcome=row.outcome,  # type: ignore[arg-type]
+            error=ErrorView(**row.error) if row.error else None,
+        )
+        for row in attempts
+    ]
+    return JobDetail(**_job_fields(job, queue_position), attempts=shown)
+
+
+def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
+    here = f"/v1/jobs/{job.id}"
+    progress = job.progress
+    return {
+        "id": job.id,
+        "name": job.name,
+        "status": job.status,
+        "created_at": utc(job.created_at),
+        "started_at": _maybe(job.started_at),
+        "finished_at": _maybe(job.finished_at),
+        "expires_at": _maybe(job.expires_at),
+        "attempt": job.attempt,
+        "queue_position": queue_position,
+        "progress": ProgressView(**{**progress, "updated_at": utc(progress["updated_at"])}) if progress else None,
+        "result": job.result,
+        "error": ErrorView(**job.error) if job.error else None,
+        "parameters": JobParameters(**job.parameters),
+        "inputs": [InputView(**entry) for entry in job.inputs],
+        "links": Links(
+            self=here,
+            events=f"{here}/events",
+            artifacts=f"{here}/artifacts",
+            result=f"{here}/artifacts/stylized.ply" if job.status == "succeeded" else None,
+        ),
+    }
+
+
+def poll_seconds(job: JobRow) -> int | None:
+    """After how many seconds it makes sense to ask again; None for a job that has ended."""
+    if job.status not in UNFINISHED:
+        return None
+    left = (job.progress or {}).get("eta_s")
+    return 2 if left is None else max(1, min(10, round(left / 10)))
+
+
+def artifact_view(row: ArtifactRow) -> ArtifactView:
+    """A result as the API shows it."""
+    return ArtifactView(
+        name=row.name,
+        size=row.size,
+        sha256=row.sha256,
+        media_type=media_type(row.name),
+        created_at=utc(row.created_at),
+        url=f"/v1/jobs/{row.job_id}/artifacts/{row.name}",
+    )
+
+
+def upload_view(row: UploadRow) -> UploadView:
+    """An upload as the API shows it."""
+    return UploadView(
+        id=row.id,
+        filename=row.filename,
+        length=row.length,
+        offset=row.offset,
+        complete=row.sha256 is not None,
+        sha256=row.sha256,
+        expires_at=utc(row.expires_at),
+    )

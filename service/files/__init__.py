@@ -1,0 +1,1 @@
+"""Files of jobs: inputs by digest, artifacts, and the folder that a job finds them in."""

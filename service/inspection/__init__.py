@@ -1,0 +1,1 @@
+"""Checks of users' files in a process that may die of them."""

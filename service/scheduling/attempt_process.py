@@ -1,0 +1,236 @@
+"""One attempt at one job, in a process of its own: `python -m service.scheduling.attempt_process FOLDER`.
+
+The folder holds the staged inputs and `task.json`; results go to its `out`. What happens is told in lines of JSON on
+stdout (`Message`), what people may want to read on stderr. SIGTERM lets the step in hand finish and saves a checkpoint.
+The process dies with the dispatcher that started it, and takes what it started along.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+from service.files.staging import Staged
+from service.parameters import JobParameters
+from worker.processes import die_with_parent
+
+if TYPE_CHECKING:
+    from sgsst_core.stylizing.loop import Progress
+    from worker.job import Prepared, Result, StylizeRequest
+
+#: A job takes every core for as long as it runs. Where that is the service's machine, requests go first; alone on its
+#: cores, a job loses nothing by it.
+_NICENESS = 5
+#: Of previews, in the attempt's folder.
+_PREVIEWS = Path("out", "previews")
+
+
+class Message(TypedDict, total=False):
+    """What the process tells: `kind` and what belongs to it."""
+
+    kind: Literal["stage", "prepared", "left-out", "progress", "preview", "done", "interrupted", "failed"]
+    stage: str
+    step: int
+    total: int
+    loss: float
+    seconds: float
+    seconds_left: float
+    path: str
+    gpus: list[str]
+    result: dict[str, Any]
+    error: dict[str, Any]
+    permanent: bool
+
+
+@dataclass(frozen=True)
+class Task:
+    """`task.json`.
+
+    Attributes:
+        staged: paths of the inputs, relative to the folder.
+        parameters: of the job.
+        workers: ranks to run it on at most; 1 for this process alone.
+        cluster: run even one rank on the Ray cluster.
+        resume: go on from the checkpoint in `out`, where it can be used.
+        checkpoint_seconds, preview_seconds: see the settings.
+    """
+
+    staged: Staged
+    parameters: JobParameters
+    workers: int
+    cluster: bool
+    resume: bool
+    checkpoint_seconds: float
+    preview_seconds: float
+
+    def save(self, folder: Path) -> None:
+        """Write it for `load`."""
+        paths = {role: str(path) if path else None for role, path in vars(self.staged).items()}
+        values = {**vars(self), "staged": paths, "parameters": self.parameters.model_dump(mode="json")}
+        (folder / "task.json").write_text(json.dumps(values))
+
+    @staticmethod
+    def load(folder: Path) -> Task:
+        """Read what `save` wrote."""
+        values = json.loads((folder / "task.json").read_text())
+        paths: dict[str, Any] = {role: Path(path) if path else None for role, path in values.pop("staged").items()}
+        staged = Staged(**paths)
+        return Task(staged, JobParameters(**values.pop("parameters")), **values)
+
+
+class Attempt:
+    """The attempt, and what it tells."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._stopping = threading.Event()
+
+    def run(self) -> None:
+        """Run to the end, whatever it is, and tell how it was."""
+        signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
+        tell({"kind": "stage", "stage": "reading"})
+        try:
+            result = self._on_ranks() if self._task.workers > 1 or self._task.cluster else self._alone()
+        except Exception as error:
+            tell(failure(error))
+            traceback.print_exc()
+            return
+        if result is None or result.stopped == "interrupted":
+            tell({"kind": "interrupted"})
+        else:
+            tell({"kind": "done", "result": summary(result)})
+
+    def _request(self) -> StylizeRequest:
+        from dataclasses import replace
+
+        from service.request import stylize_request
+
+        return replace(stylize_request(self._task.staged, self._task.parameters), resume=self._task.resume)
+
+    def _alone(self) -> Result:
+        from worker.job import Resume, describe, execute, prepare
+        from worker.previews import Previews
+
+        job = prepare(self._request(), resume=Resume(self._task.resume, required=False), warn=log)
+        self._prepared(describe(job))
+
+        return execute(
+            job,
+            progress=self._progress,
+            stop=self._stopping.is_set,
+            warn=log,
+            preview=Previews(_PREVIEWS, self._task.preview_seconds, self._preview, log),
+            checkpoint_seconds=self._task.checkpoint_seconds,
+        )
+
+    def _on_ranks(self) -> Result | None:
+        from dataclasses import replace
+
+        from worker.job import Outputs
+        from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+
+        request = self._request()
+        # a checkpoint that is not there is no error here, as it would be for a user who asks for it
+        request = replace(request, resume=request.resume and Outputs(request.out).checkpoints.exist)
+        listener = Listener(
+            self._prepared, self._progress, log, log, self._stopping.is_set, self._preview, self._left_out
+        )
+        options = WorkerOptions(
+            checkpoint_seconds=self._task.checkpoint_seconds,
+            preview_folder=_PREVIEWS,
+            preview_seconds=self._task.preview_seconds,
+        )
+        return stylize_on_ranks(request, self._task.workers, listener, options=options).result
+
+    def _prepared(self, prepared: Prepared) -> None:
+        for heading, line in prepared.lines:
+            log(f"{heading}: {line}")
+        tell({"kind": "prepared", "step": prepared.step, "total": prepared.total})
+
+    def _progress(self, now: Progress) -> None:
+        tell(
+            {
+                "kind": "progress",
+                "stage": now.stage,
+                "step": now.step,
+                "total": now.total,
+                "loss": now.loss,
+                "seconds": now.seconds,
+                "seconds_left": now.seconds_left,
+            }
+        )
+
+    def _left_out(self, gpus: Sequence[str]) -> None:
+        tell({"kind": "left-out", "gpus": list(gpus)})
+
+    def _preview(self, path: Path) -> None:
+        tell({"kind": "preview", "path": str(path)})
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """What a job's record says about its end; the report has the rest."""
+    from sgsst_core.report.document import mean_loss
+
+    before, after = mean_loss(result.before), mean_loss(result.after)
+    return {
+        "stopped": result.stopped,
+        "steps": result.step,
+        "loss_before": before,
+        "loss_after": after,
+        "report_error": result.report_error,
+    }
+
+
+def failure(error: Exception) -> Message:
+    """An error as it is told: whether the same would happen again decides whether the job is tried again."""
+    from sgsst_core.errors import DivergedError, InvalidInputError, OutputError, SgsstError
+
+    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if _memory(error) else "internal"
+    message = str(error) if isinstance(error, SgsstError) or _memory(error) else f"{type(error).__name__}: {error}"
+    permanent = isinstance(error, InvalidInputError | DivergedError) and not isinstance(error, OutputError)
+    return {"kind": "failed", "error": {"code": code, "message": message}, "permanent": permanent}
+
+
+def _memory(error: Exception) -> bool:
+    text = str(error)
+    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
+
+
+def log(line: str) -> None:
+    """A line for people."""
+    print(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}", file=sys.stderr, flush=True)
+
+
+def tell(message: Message) -> None:
+    """A line for the dispatcher."""
+    _channel.write(json.dumps(message) + "\n")
+    _channel.flush()
+
+
+#: Messages go through the stdout that the process was given; what libraries print goes to stderr from then on.
+_channel = sys.stdout
+
+
+def main() -> None:
+    """Run the task of the folder that the command line names."""
+    global _channel
+    die_with_parent()
+    if not os.environ.get("CUDA_VISIBLE_DEVICES"):  # a GPU's work is not in the way, and must not wait
+        os.nice(_NICENESS)
+    _channel = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    os.chdir(sys.argv[1])
+    Attempt(Task.load(Path())).run()
+
+
+if __name__ == "__main__":
+    main()

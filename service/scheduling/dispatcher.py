@@ -1,0 +1,240 @@
+"""The dispatcher: leases jobs from the store and runs them, each attempt in a process of its own.
+
+`python -m service.scheduling.dispatcher` is one. Any number of them may work on one store; who dies loses its leases.
+Ray is started by the process of an attempt that has more than one rank, on that process' main thread, and ends with it:
+so neither a job nor Ray can take the dispatcher along.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import shutil
+import signal
+import socket
+import threading
+import time
+from types import FrameType
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.errors import LeaseLostError
+from service.files.artifacts import Artifacts
+from service.files.blobs import BlobFolder
+from service.logs import set_up
+from service.scheduling.machine import Machine
+from service.scheduling.packing import Grant, Room
+from service.scheduling.running import RunningAttempt, sweep
+from service.scheduling.webhooks import Deliverer
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import DAY, Lease
+from service.store.tables import JobRow
+from worker.processes import ProcessId, home
+
+#: Seconds between two looks for what has expired or was left behind.
+_HOUSEKEEPING_SECONDS = 60.0
+#: Jobs that are swept at a time: leases are not renewed meanwhile.
+_SWEEPS = 20
+#: Of a lease's time that passes before it is renewed.
+_RENEW_SHARE = 1 / 3
+
+_log = logging.getLogger(__name__)
+
+
+class Dispatcher:
+    """Runs jobs until it is told to stop, side by side as long as there is room (`service.scheduling.packing`).
+
+    Args:
+        machine: what there is to run them on; None finds out.
+    """
+
+    def __init__(self, settings: ServiceSettings, store: Store, machine: Machine | None = None) -> None:
+        self._settings, self._store = settings, store
+        self._artifacts = Artifacts(settings.artifacts_url)
+        self._blobs = BlobFolder(settings.folder, store.inputs, settings.min_free_bytes)
+        self._machine = machine or Machine.find(settings)
+        self._room = Room(self._machine, settings.parallel_jobs)
+        self._running: dict[str, RunningAttempt] = {}
+        self._stop = threading.Event()
+        self.name = own_name()
+        self._work = settings.folder / "work" / self.name
+        self._renewed_at = self._kept_at = self._beat_at = float("-inf")
+        self._deliverer = Deliverer(settings, store)
+
+    def stop(self) -> None:
+        """Let `run` end: running jobs save their state and go back into the queue."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Work until `stop`."""
+        self._take_over_from_the_dead()
+        self._work.mkdir(parents=True, exist_ok=True)
+        self._deliverer.start()
+        what = "GPUs" if self._machine.gpus else "places"
+        _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
+        while not self._stop.is_set():
+            try:
+                self._round()
+            except (SQLAlchemyError, OSError):  # the database is away or locked; leases run out if it stays so
+                _log.exception("the store cannot be reached")
+                self._abandon_expired()
+                self._stop.wait(2.0)
+            self._stop.wait(self._settings.poll_seconds)
+        self._shut_down()
+
+    def _take_over_from_the_dead(self) -> None:
+        """Of dispatchers that ran on this machine and are gone, nothing needs to be waited for."""
+        known = {row.name for row in self._store.operations.dispatchers()}
+        for name in sorted(known.union(self._store.jobs.lease_owners())):
+            if is_dead(name):
+                _log.info("dispatcher %s is gone; its jobs are taken over", name)
+                self._store.jobs.end_leases(name)
+                self._store.operations.gone(name)
+        if self._work.parent.is_dir():
+            for path in self._work.parent.iterdir():
+                if is_dead(path.name):
+                    shutil.rmtree(path, ignore_errors=True)
+
+    def _round(self) -> None:
+        for job_id, attempt in list(self._running.items()):
+            if not attempt.alive:
+                del self._running[job_id]
+        self._renew()
+        self._beat()
+        while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
+            self._start(*found)
+        if time.monotonic() - self._kept_at > _HOUSEKEEPING_SECONDS:
+            self._kept_at = time.monotonic()
+            self._keep_house()
+
+    # --- room ------------------------------------------------------------------------------------------------------
+
+    def _held(self) -> list[Grant]:
+        return [attempt.grant for attempt in self._running.values()]
+
+    def next_job(self, held: list[Grant]) -> tuple[Lease, Grant] | None:
+        """Lease the next job of the queue, and decide what it gets; None where there is none, or no room for it.
+
+        Args:
+            held: what running jobs have.
+        """
+        if not (waiting := self._store.jobs.waiting()):
+            return None
+        share = -(-waiting // max(1, len(self._store.operations.dispatchers())))  # others take their part of the queue
+        grant: Grant | None = None
+
+        def fits(job: JobRow) -> bool:
+            nonlocal grant
+            grant = self._room.grant(job, held, share)
+            return grant is not None
+
+        lease = self._store.jobs.lease(self.name, fits)
+        return (lease, grant) if lease is not None and grant is not None else None
+
+    def _start(self, lease: Lease, grant: Grant) -> None:
+        folder = self._work / f"{lease.job_id}-{lease.epoch}"
+        attempt = RunningAttempt(
+            lease, grant, folder, self._store, self._blobs, self._artifacts, self._settings, self._machine.cluster
+        )
+        self._running[lease.job_id] = attempt
+        attempt.start()
+
+    # --- leases ----------------------------------------------------------------------------------------------------
+
+    def _beat(self) -> None:
+        """Let everybody know that this dispatcher is alive."""
+        if time.monotonic() - self._beat_at >= _RENEW_SHARE * self._settings.lease_seconds:
+            self._store.operations.beat(self.name, self._room.size, self._room.free(self._held()))
+            self._beat_at = time.monotonic()
+
+    def _renew(self) -> None:
+        """Hold the leases of all running attempts, and see which of their jobs are to be canceled or are lost."""
+        if not self._running:
+            self._renewed_at = time.monotonic()
+            return
+        leases = [attempt.lease for attempt in self._running.values()]
+        if time.monotonic() - self._renewed_at >= _RENEW_SHARE * self._settings.lease_seconds:
+            found = self._store.jobs.renew(leases)
+            self._renewed_at = time.monotonic()
+        else:
+            found = self._store.jobs.look(leases)
+        for job_id, status in found.items():
+            attempt = self._running[job_id]
+            if status is None and attempt.alive:
+                attempt.abandon()
+            elif status == "canceling":
+                attempt.cancel()
+
+    def _abandon_expired(self) -> None:
+        """Without a store for as long as a lease: others may have the jobs by now."""
+        if time.monotonic() - self._renewed_at > self._settings.lease_seconds:
+            for attempt in self._running.values():
+                attempt.abandon()
+
+    def _shut_down(self) -> None:
+        _log.info("shutting down: %d running jobs save their state", len(self._running))
+        for attempt in self._running.values():
+            attempt.release()
+        with contextlib.suppress(SQLAlchemyError):
+            self._store.operations.gone(self.name)
+        while any(attempt.alive for attempt in self._running.values()):
+            with contextlib.suppress(SQLAlchemyError, LeaseLostError):
+                self._renew()
+            time.sleep(0.2)
+        self._deliverer.stop()
+        shutil.rmtree(self._work, ignore_errors=True)
+
+    # --- housekeeping ----------------------------------------------------------------------------------------------
+
+    def _keep_house(self) -> None:
+        try:
+            for job_id in self._store.jobs.expire(self._settings.retention_days * DAY):
+                self._artifacts.remove_job(job_id)
+            for job_id, epoch in self._store.jobs.unswept(_SWEEPS):
+                sweep(self._store.jobs, self._artifacts, job_id, epoch)
+            self._blobs.collect()
+        except Exception:  # stores of files raise what they like; running jobs are not to suffer
+            _log.exception("not everything that is no longer needed could be removed; this is tried again")
+
+
+def own_name() -> str:
+    """Names this process for good: where it runs, its number there, and when it started."""
+    own = ProcessId.of_this()
+    return f"{socket.gethostname()[:40]}-{_home()}-{own.number}-{int(own.started)}"
+
+
+def is_dead(name: str) -> bool:
+    """Whether a dispatcher of that name ran where this process can see it, and is gone."""
+    parts = name.rsplit("-", 3)
+    if len(parts) != 4 or parts[1] != _home() or not (parts[2] + parts[3]).isdigit():
+        return False
+    return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
+
+
+def _home() -> str:
+    return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]
+
+
+def main() -> None:
+    """Run a dispatcher with the environment's settings until SIGTERM or SIGINT."""
+    from worker.processes import die_with_parent
+
+    if os.environ.get("SGSST_DIE_WITH_PARENT"):
+        die_with_parent()
+    settings = ServiceSettings()
+    set_up(settings.log_format)
+    dispatcher = Dispatcher(settings, open_store(settings))
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        dispatcher.stop()
+
+    signal.signal(signal.SIGTERM, handle)
+    signal.signal(signal.SIGINT, handle)
+    dispatcher.run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,297 @@
+"""Error against run time: variants of one job with the same time budget, judged by one exact loss.
+
+Every variant gets the same seconds of optimisation. At the same moments its colours are evaluated on all views by the
+float32 loss of all scales (`exact.ExactTwin`); evaluation does not count. Nor does preparing the views, once for each,
+which in a short budget would hide the rest; its seconds are stated. All variants are in memory at once. What lies on
+the Pareto front reaches its error sooner than anything else does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from sgsst_core.budget import default_memory_limit
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings, make_settings
+from sgsst_core.stylizing.stylizer import Phase, Stylizer, mean_loss
+
+#: The budget is cut into so many slices, and the variants take turns: where the machine is slower for a while, it is
+#: slower for all of them.
+SLICES = 32
+#: Slices after which the variants are evaluated.
+MOMENTS = (1, 2, 4, 8, 16, 32)
+#: Share of the time that phase 1 gets where a variant has one: about as much as in the standard preset.
+PHASE_1 = 0.15
+#: Of the variant with pruning: Gaussians that all views together show in less than a pixel.
+PRUNE_WEIGHT = 1.0
+
+#: Phases of a variant with n scales: (name, scale from the coarsest or None for all, share of the time).
+Shares = Callable[[int], list[tuple[str, int | None, float]]]
+
+
+def _two_phases(scales: int) -> list[tuple[str, int | None, float]]:
+    return [("coarse", 0, PHASE_1), ("sos", None, 1 - PHASE_1)] if scales > 1 else _sos(scales)
+
+
+def _sos(scales: int) -> list[tuple[str, int | None, float]]:
+    return [("sos", None, 1.0)]
+
+
+def _coarse_only(scales: int) -> list[tuple[str, int | None, float]]:
+    return [("coarse", 0, 1.0)]
+
+
+def _coarse_to_fine(scales: int) -> list[tuple[str, int | None, float]]:
+    return [(f"scale {scales - 1 - scale}", scale, 1 / scales) for scale in range(scales)]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to run the job.
+
+    Attributes:
+        name: for `--variants`.
+        what: for people.
+        shares: its phases.
+        settings: on top of the standard preset.
+    """
+
+    name: str
+    what: str
+    shares: Shares = _two_phases
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+PAPER_RATE = {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "revive": False}
+VARIANTS = {
+    variant.name: variant
+    for variant in (
+        Variant("standard", "coarsest scale first, then all scales (SOS); the standard preset"),
+        Variant("paper-rate", "the same with the paper's constant learning rate and clamp", settings=PAPER_RATE),
+        Variant("no-phase-1", "all scales from the beginning", _sos),
+        Variant("coarse-only", "the coarsest scale alone", _coarse_only),
+        Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
+        Variant("warm-start", "standard, from the style's mean colour and spread", settings={"warm_start": True}),
+        Variant("warm-no-phase-1", "warm start instead of phase 1", _sos, {"warm_start": True}),
+        Variant("no-revive", "standard; colours that fall below 0 stay there", settings={"revive": False}),
+        Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
+        Variant("half-weights", "standard with blend weights in half precision", settings={"kept_weights": "half"}),
+        Variant("no-kept-weights", "standard, blend weights computed anew", settings={"kept_weights": "none"}),
+        Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
+        Variant("pruned", "standard without hardly visible Gaussians", settings={"prune_weight": PRUNE_WEIGHT}),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """A variant's colours at one moment; losses are relative to the unstylized scene's."""
+
+    seconds: float
+    step: int
+    relative: float
+    by_scale: dict[int, float]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What a variant reached; no points where it was left out for the reason."""
+
+    variant: Variant
+    points: list[Point]
+    preparation: float = 0.0  # seconds
+    left_out: str | None = None
+    sh_dc: Tensor | None = None  # [N, 3], at the end
+
+
+class _TimedStylizer(Stylizer):
+    """A stylizer whose phases and learning rate follow the clock instead of the count of steps."""
+
+    budget: float
+    shares: list[tuple[str, int | None, float]]
+
+    @property
+    def phase(self) -> Phase:
+        """The phase that the time belongs to."""
+        end = 0.0
+        for stage, scale, share in self.shares[:-1]:
+            end += share * self.budget
+            if self.seconds < end:
+                return Phase(stage, 1, scale)
+        stage, scale, _ = self.shares[-1]
+        return Phase(stage, 1, scale)
+
+    def share_done(self) -> float:
+        """Of the time."""
+        return min(self.seconds / self.budget, 1.0)
+
+
+def choose_variants(names: Sequence[str]) -> list[Variant]:
+    """The variants of some names; all of them for none.
+
+    Raises:
+        SettingsError: no such variant.
+    """
+    unknown = [name for name in names if name not in VARIANTS]
+    if unknown:
+        raise SettingsError(f"There is no variant {', '.join(unknown)}. Choose from {', '.join(VARIANTS)}.")
+    return [VARIANTS[name] for name in names or VARIANTS]
+
+
+def error_time(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor,
+    variants: Sequence[Variant],
+    seconds: float,
+    *,
+    weights: BackboneWeights | None = None,
+    progress: Callable[[Variant, Point], None] = lambda variant, point: None,
+    **settings: Any,
+) -> list[Curve]:
+    """Run variants on one scene, each for so many seconds.
+
+    Args:
+        seconds: of optimisation, for each variant.
+        progress: called after each evaluation.
+        settings: for all variants, on top of the standard preset.
+    """
+    base = make_settings("standard", **settings)
+    share = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
+    base = base.model_copy(update={"memory_limit": share})
+    exact = ExactTwin(Stylizer(scene, cameras, style, base, weights=weights))
+    views = exact.views.covered
+    start = exact.evaluate(views, scene.sh_dc)
+    running = [_begin(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
+    for part in range(1, SLICES + 1):
+        for curve, stylizer in running:
+            if stylizer is None:
+                continue
+            while stylizer.seconds < part / SLICES * seconds:
+                stylizer.run_step()
+            if part in MOMENTS:
+                loss = exact.evaluate(views, stylizer.stylized())
+                by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
+                relative = mean_loss(loss) / mean_loss(start)
+                curve.points.append(Point(stylizer.seconds, stylizer.step, relative, by_scale))
+                progress(curve.variant, curve.points[-1])
+    return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
+
+
+def _begin(
+    variant: Variant,
+    seconds: float,
+    inputs: tuple[Scene, Sequence[Camera], Tensor],
+    base: Settings,
+    weights: BackboneWeights | None,
+) -> tuple[Curve, _TimedStylizer | None]:
+    """A variant that is ready to run, or the reason why it is left out."""
+    settings = base.model_copy(update=variant.settings)
+    stylizer = _TimedStylizer(*inputs, settings, weights=weights)
+    reason = _reason_to_leave_out(settings, stylizer)
+    if reason:
+        return Curve(variant, [], left_out=reason), None
+    stylizer.budget = seconds
+    stylizer.shares = variant.shares(max(stylizer.scale_count(index) for index in stylizer.views.covered))
+    return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
+
+
+def _prepare(stylizer: _TimedStylizer) -> float:
+    """Prepare every view and the style as the first steps would; returns the seconds."""
+    started = time.perf_counter()
+    for index in stylizer.views.covered:
+        count = stylizer.scale_count(index)
+        phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
+        stylizer.style_targets(stylizer.views.cameras[index])
+        stylizer.views.target(index, sorted({scale for phase in phases for scale in phase.scales(count)}))
+        stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
+    return time.perf_counter() - started
+
+
+def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
+    wanted = settings.precision
+    if wanted != str(stylizer.network.dtype).removeprefix("torch."):
+        return next(d.reason for d in stylizer.plan.decisions if d.item == "precision")
+    return None
+
+
+def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
+    """The points that no other point beats in both seconds and loss, by seconds."""
+    front: list[tuple[str, Point]] = []
+    points = [(curve.variant.name, point) for curve in curves for point in curve.points]
+    for name, point in sorted(points, key=lambda item: (item[1].seconds, item[1].relative)):
+        if not front or point.relative < front[-1][1].relative:
+            front.append((name, point))
+    return front
+
+
+def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
+    """For JSON."""
+    return {
+        "variants": {
+            curve.variant.name: {
+                "what": curve.variant.what,
+                "left_out": curve.left_out,
+                "preparation_seconds": round(curve.preparation, 3),
+                "points": [
+                    {
+                        "seconds": round(point.seconds, 3),
+                        "step": point.step,
+                        "relative": point.relative,
+                        "by_scale": {str(scale): value for scale, value in point.by_scale.items()},
+                    }
+                    for point in curve.points
+                ],
+            }
+            for curve in curves
+        },
+        "pareto_front": [
+            {"variant": name, "seconds": round(point.seconds, 3), "relative": point.relative}
+            for name, point in pareto_front(curves)
+        ],
+    }
+
+
+_MARKERS = "osD^vP*X<>hd"
+
+
+def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
+    """Write a PNG: loss against seconds, both axes logarithmic, the mean of the scales and each scale beside it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    shown = [curve for curve in curves if curve.points]
+    scales = sorted({scale for curve in shown for point in curve.points for scale in point.by_scale})
+    figure = Figure(figsize=(5.2 * (1 + len(scales)), 4.6), dpi=110, layout="constrained")
+    panels = figure.subplots(1, 1 + len(scales), sharey=True, squeeze=False)[0]
+    for number, axes in enumerate(panels):
+        scale = None if number == 0 else scales[number - 1]
+        for place, curve in enumerate(shown):
+            values = [point.relative if scale is None else point.by_scale.get(scale) for point in curve.points]
+            seconds = [point.seconds for point in curve.points]
+            marker = _MARKERS[place % len(_MARKERS)]
+            axes.plot(seconds, values, marker=marker, markersize=4, linewidth=1, label=curve.variant.name)
+        axes.set(xscale="log", yscale="log", xlabel="seconds of optimisation")
+        axes.grid(True, which="both", alpha=0.15)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_title("mean of all scales" if scale is None else f"scale {scale} (1/{1 << scale})", fontsize=10)
+    front = [point for _, point in pareto_front(shown)]
+    panels[0].plot([p.seconds for p in front], [p.relative for p in front], "k--", linewidth=2.5, alpha=0.35)
+    panels[0].set_ylabel("loss, relative to the unstylized scene")
+    panels[-1].legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure.suptitle(f"{title} (dashed: Pareto front)", fontsize=11)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")

@@ -1,0 +1,21 @@
+"""The hard cases, as one table that the tests and the benchmark share.
+
+Every case says what is extreme, measures an error against a float64 reference, and states the bound for it. A case
+that is refused on purpose (a limit) is one that checks the refusal.
+"""
+
+from __future__ import annotations
+
+from sgsst_core.bench.stability import gaussian_cases as gaussians
+from sgsst_core.bench.stability import optimisation_cases as optimisation
+from sgsst_core.bench.stability import picture_cases as pictures
+from sgsst_core.bench.stability import precision_cases as precision
+from sgsst_core.bench.stability import view_cases as views
+from sgsst_core.bench.stability.case import Case, CaseResult, Group, Measurement, measure
+
+__all__ = ["Case", "CaseResult", "Group", "Measurement", "all_cases", "measure"]
+
+
+def all_cases() -> list[Case]:
+    """Every case, group by group."""
+    return [case for module in (gaussians, views, pictures, optimisation, precision) for case in module.cases()]

@@ -1,0 +1,284 @@
+"""Hard cases of the Gaussians themselves, among ordinary ones whose pixels must not suffer."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgsst_core.bench.stability.case import (
+    Case,
+    CaseResult,
+    among_ordinary,
+    camera,
+    compare_rasterizers,
+    ordinary,
+    repeated,
+    without,
+)
+from sgsst_core.constants import ALPHA_MIN, NEAR, SH_C0
+from sgsst_core.errors import SceneError
+from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.projection import Outcome, project
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_directions
+
+_IMAGE = "image, coverage, gradient against float64"
+_PROPERTIES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
+
+
+def cases() -> list[Case]:
+    """All cases of this group."""
+    found = [
+        Case(f"{value} in {name}, in the file", "Gaussians", _IMAGE, partial(_invalid_in_file, name, value))
+        for name in _PROPERTIES
+        for value in ("nan", "inf", "-inf")
+    ]
+    found += [
+        Case(f"{value} in {name}, in memory", "Gaussians", _IMAGE, partial(_invalid_in_memory, name, value))
+        for name, value in [
+            ("means", "nan"),
+            ("means", "inf"),
+            ("quats", "nan"),
+            ("scales", "inf"),
+            ("opacities", "nan"),
+        ]
+    ]
+    found += [Case(name, "Gaussians", _IMAGE, partial(_rendered, make)) for name, make in _SCENES.items()]
+    return [
+        *found,
+        Case("needles, 1e6 times longer than wide, at every angle", "Gaussians", _IMAGE, _needles),
+        Case("near plane, one ulp before, on and behind it", "Gaussians", _IMAGE, _near_plane),
+        Case("equal depths blend in the order of the file", "Gaussians", "rows out of order", _equal_depths),
+        Case("world moved by 1e6", "Gaussians", "image against the same world at the origin", _moved_world),
+        Case("SH coefficients of 1e4 that cancel", "Gaussians", "colours, share of the largest", _large_harmonics),
+        Case("view direction of length 0", "Gaussians", "colours", _no_direction),
+    ]
+
+
+def _rendered(make: Callable[[], Scene], full: bool) -> CaseResult:
+    return compare_rasterizers(among_ordinary(make()), camera())
+
+
+def _columns(scene: Scene, **columns: Tensor) -> Scene:
+    return replace(scene, **columns)
+
+
+def _quaternions() -> Scene:
+    """Zero (no rotation: left out), the shortest and the longest that float32 holds, denormals."""
+    lengths = torch.tensor([0.0, 1e-45, 1e-30, 1e-4, 1.0, 1e4, 1e19, 1.9e38])
+    return _columns(repeated(8), quats=torch.tensor([0.5, 0.5, -0.5, 0.7]) * lengths[:, None])
+
+
+def _scales() -> Scene:
+    """Zero (below float64's range), 1e-20, 1e10, 1e30, and what overflows even float64 (left out)."""
+    logarithms = torch.tensor([-3e38, -1000.0, math.log(1e-20), math.log(1e10), math.log(1e30), 300.0, 1e5, 3e38])
+    return _columns(repeated(8), scales=logarithms[:, None].expand(8, 3).clone(), opacities=torch.full((8,), -2.0))
+
+
+def _flat_or_thin() -> Scene:
+    """Discs and needles whose other axes have no extent at all."""
+    none, some = -200.0, -1.0
+    axes = [[none, some, some], [some, none, some], [some, some, none], [none, none, some], [some, none, none]]
+    return _columns(ordinary(5, seed=3), scales=torch.tensor(axes))
+
+
+def _opacities_at_the_cut() -> Scene:
+    """1/255 and its float32 neighbours: there alpha reaches the cut in one pixel centre at most."""
+    cut = np.float32(math.log(ALPHA_MIN / (1 - ALPHA_MIN)))
+    values = [np.nextafter(cut, np.float32(-9)), cut, np.nextafter(cut, np.float32(9)), cut + np.float32(1e-3)]
+    # centred on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30
+    scene = repeated(4, mean=(4 * 0.7 / 30, 4 * 0.7 / 33, 4.0))
+    return _columns(scene, opacities=torch.tensor(np.array(values)))
+
+
+def _logits() -> Scene:
+    """Opacities of 0 and 1 as far as logits go."""
+    return _columns(ordinary(8, seed=4), opacities=torch.tensor([-3e38, -1e4, -100.0, -17.0, 17.0, 100.0, 1e4, 3e38]))
+
+
+def _depths() -> Scene:
+    """Depth 0, around 0, and a centre at the camera: all nearer than the near plane."""
+    scene = repeated(7, scale=0.5)
+    depths = torch.tensor([0.0, -0.0, 1e-38, -1e-38, 1e-6, -1e-6, -4.0])
+    return _columns(scene, means=torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1))
+
+
+def _off_screen() -> Scene:
+    """Centres far outside the view, footprints on it; one with a centre of a million pixels."""
+    means = torch.tensor([[-20.0, 0, 4], [20, 1, 4], [0, -15, 4], [0, 1e3, 4], [-1.3e5, 0, 4]])
+    sizes = torch.tensor([6.0, 6.0, 5.0, 400.0, 5e4]).log()
+    return _columns(repeated(5, logit=-1.0), means=means, scales=sizes[:, None].expand(5, 3).clone())
+
+
+def _stacked(count: int, logit: float) -> Scene:
+    """Many Gaussians at one point: the transmittance is a product of as many factors."""
+    return repeated(count, scale=0.02, logit=logit)
+
+
+def _sub_pixel() -> Scene:
+    """Thousands of points between the pixel centres."""
+    scene = ordinary(3000, seed=7)
+    return _columns(scene, scales=torch.full((3000, 3), math.log(1e-6)))
+
+
+def _grazing() -> Scene:
+    """Just beyond the near plane and far to the side: the largest slopes and derivatives of the perspective."""
+    scene = ordinary(60, seed=8)
+    depths = torch.full((60,), NEAR * 1.001)
+    return _columns(scene, means=torch.stack([scene.means[:, 0] * 5, scene.means[:, 1] * 5, depths], dim=1))
+
+
+_SCENES: dict[str, Callable[[], Scene]] = {
+    "quaternions of length 0, 1e-45 to 1.9e38": _quaternions,
+    "scales of 0, 1e-20, 1e10, 1e30 and beyond float64": _scales,
+    "axes without any extent": _flat_or_thin,
+    "opacities of 1/255 and one ulp to either side": _opacities_at_the_cut,
+    "logits to +-3e38": _logits,
+    "depth 0, +-1e-38, +-1e-6; a centre at the camera": _depths,
+    "centres off screen with a footprint on it": _off_screen,
+    "5000 faint Gaussians on one pixel": partial(_stacked, 5000, math.log(1.5 / 253.5)),
+    "5000 opaque Gaussians on one pixel": partial(_stacked, 5000, 5.0),
+    "thousands of Gaussians smaller than a pixel": _sub_pixel,
+    "far to the side at the near plane": _grazing,
+}
+
+
+def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
+    """Refused with the property's name; with `drop_invalid` what is left renders as if it had never been there."""
+    scene = ordinary(60, degree=1)
+    getattr(scene, name)[7] = float(value)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.ply"
+        write_scene(path, scene)
+        try:
+            read_scene(path)
+            return CaseResult(math.inf, 0.0, "the file was not refused")
+        except SceneError:
+            kept = read_scene(path, drop_invalid=True).scene
+    rows = torch.zeros(60, dtype=torch.bool)
+    rows[7] = True
+    expected, _ = without(scene, rows)
+    if not torch.equal(kept.means, expected.means):
+        return CaseResult(math.inf, 0.0, "another Gaussian was left out")
+    return replace(compare_rasterizers(kept, camera()), note="refused; --drop-invalid leaves it out")
+
+
+def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
+    """Geometry without a projection contributes nothing."""
+    scene = ordinary(60)
+    getattr(scene, name)[7] = float(value)
+    rows = torch.zeros(60, dtype=torch.bool)
+    rows[7] = True
+    expected, kept = without(scene, rows)
+    return replace(
+        compare_rasterizers(scene, camera(), expected_scene=expected, keep=kept), note="the Gaussian is left out"
+    )
+
+
+def _needles(full: bool) -> CaseResult:
+    """In float32, p r - q^2 of such a needle has no correct digit and is often negative."""
+    worst, lost = CaseResult(0.0, 0.0), 0
+    steps = 180 if full else 36
+    for step in range(steps):
+        half = math.pi * step / steps / 2
+        needle = repeated(1, logit=3.0)
+        needle.quats[0] = torch.tensor([math.cos(half), 0.05 * math.sin(3 * half), 0.0, math.sin(half)])
+        needle.scales[0] = torch.tensor([math.log(1e3), math.log(1e-3), math.log(1e-3)])
+        result = compare_rasterizers(among_ordinary(needle, count=10), camera())
+        worst = result if not result.error <= worst.error else worst
+        lost += _float32_determinant_is_lost(needle)
+    return replace(worst, note=f"p r - q^2 in float32 is off by more than 10 % or negative in {lost} of {steps}")
+
+
+def _float32_determinant_is_lost(needle: Scene) -> bool:
+    """Whether the usual formula's relative error for `needle` at depth 4 in `camera()` exceeds 0.1."""
+    found = project(needle, camera()).values
+    if not len(found):
+        return False
+    # r, det and q from what the projection stores: w_scale^2 = k / r, u_scale^2 = k r / det
+    k = 0.5 * math.log2(math.e)
+    r = k / found[0, 4] ** 2
+    det, q = k * r / found[0, 3] ** 2, found[0, 2] * r
+    p = (det + q * q) / r
+    single = np.float32(p) * np.float32(r) - np.float32(q) * np.float32(q)
+    return not abs(float(single) - det) <= 0.1 * det
+
+
+def _near_plane(full: bool) -> CaseResult:
+    """What lies on the plane is drawn, what lies one ulp nearer is not."""
+    at = np.float32(0.5)
+    below, above = np.nextafter(at, np.float32(0)), np.nextafter(at, np.float32(1))
+    scene = repeated(3, scale=0.05)
+    scene.means[:, 2] = torch.tensor(np.array([below, at, above]))
+    scene.means[:, 0] = torch.tensor([-0.1, 0.0, 0.1])
+    result = compare_rasterizers(scene, camera(), near=0.5)
+    if project(scene, camera(), near=0.5).gaussians.tolist() != [1, 2]:
+        return CaseResult(math.inf, 0.0, "the plane itself is not where it should be")
+    return replace(result, note="on the plane is drawn, one ulp nearer is not")
+
+
+def _equal_depths(full: bool) -> CaseResult:
+    scene = repeated(2000, scale=0.3, logit=-3.0)
+    scene.means[:, 0] = torch.linspace(-1, 1, 2000)
+    order = project(scene, camera()).gaussians
+    wrong = int((np.diff(order) <= 0).sum()) + (len(scene) - len(order))
+    result = compare_rasterizers(scene, camera())
+    return CaseResult(
+        float(wrong) if result.passed else math.inf, 0.0, "float32 and float64 sort the same float64 depths"
+    )
+
+
+def _moved_world(full: bool) -> CaseResult:
+    """Positions that float32 can hold at 1e6 (multiples of 1/16) give the same picture there as at the origin."""
+    scene, view = ordinary(300, seed=9), camera()
+    scene = replace(scene, means=(scene.means * 16).round() / 16)
+    offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
+    pose = view.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    moved = replace(scene, means=scene.means + offset.float())
+    colours = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
+    image = make_rasterizer("reference", scene).render(colours, view)
+    found = make_rasterizer("cpu", moved).render(colours, replace(view, world_to_camera=pose)).double()
+    error = float((found - image).abs().max()) / 2
+    return CaseResult(error, 1e-4, "float32 positions step by 0.06 there; nothing is lost beyond that")
+
+
+def _large_harmonics(full: bool) -> CaseResult:
+    """A frozen part of 1e4 against a DC part of -1e4: float32 keeps what 1e4 leaves, not more."""
+    scene = ordinary(200, seed=10, degree=3)
+    scene = replace(scene, sh_rest=scene.sh_rest * 1e4)
+    view = camera()
+    rest = rest_colours(scene.sh_rest, scene.means, view)
+    dc = (torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) - rest) / SH_C0
+    found = view_colours(dc, rest).double()
+    exact = rest_colours(scene.sh_rest.double(), scene.means.double(), view)
+    expected = (0.5 + SH_C0 * dc.double() + exact).clamp_min(0)
+    error = float((found - expected).abs().max() / exact.abs().max())
+    image = compare_rasterizers(scene, view, colours=view_colours(scene.sh_dc, rest))
+    absolute = float((found - expected).abs().max())
+    return CaseResult(max(error, 0.0 if image.passed else math.inf), 1e-6, f"colours are off by up to {absolute:.1e}")
+
+
+def _no_direction(full: bool) -> CaseResult:
+    """A Gaussian at the camera's centre: its harmonics are those of direction 0, finite, and it is never drawn."""
+    scene = replace(repeated(3), sh_rest=torch.ones(3, 15, 3))
+    means = torch.tensor([[0.0, 0, 0], [1e-45, 0, 0], [0, 1e38, 1e38]])
+    scene = replace(scene, means=means)
+    directions = view_directions(means, camera().centre)
+    lengths = directions.norm(dim=1)
+    error = float((lengths - torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)).abs().max())
+    colours = rest_colours(scene.sh_rest, means, camera())
+    drawn = project(scene, camera()).outcomes[Outcome.VISIBLE]
+    finite = bool(torch.isfinite(colours).all()) and drawn == 0
+    return CaseResult(
+        error if finite else math.inf, 1e-12, "the zero vector: finite colours, nearer than the near plane"
+    )

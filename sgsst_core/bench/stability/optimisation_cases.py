@@ -1,0 +1,208 @@
+"""Hard cases of the optimiser: gradients of all sizes, steps that are too large or too many, colours out of range."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgsst_core.bench.stability.case import Case, CaseResult, compare_losses, texture, vgg16
+from sgsst_core.constants import ALPHA_MIN, COLOUR_OFFSET, SH_C0, TRANSMITTANCE_MIN
+from sgsst_core.errors import DivergedError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import ADAM_EPS, Stylizer
+
+_END = "loss and gradient of the last picture, relative to float64"
+_SIDE = 16
+#: A Gaussian with less total blend weight than this moves no pixel of any view by a grey level.
+HARDLY_SEEN = 1.0 / 255.0
+
+
+def cases() -> list[Case]:
+    """All cases of this group."""
+    found: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
+        ("total weights from 1e-6 to 1e2 in one scene", _END, _weights),
+        ("Adam on gradients from 1e-12 to 1e3", "values against float64", _adam),
+        ("learning rate 100 times too large", _END, _large_steps),
+        ("content weighs 1e-8 of style", _END, partial(_unbalanced, 1e-4)),
+        ("content weighs 1e8 times style", _END, partial(_unbalanced, 1e12)),
+        ("colours of 1e3 and -1e3", _END, _far_colours),
+        ("colours beyond what float32 can optimise", "steps taken", _diverged),
+        ("100,000 steps", "rise of the loss above its lowest", _many_steps),
+        ("stopped and resumed in the middle", "values against an uninterrupted run", _resumed),
+    ]
+    return [Case(name, "stiff optimisation", measure, measured) for name, measure, measured in found]
+
+
+class _OnShallowLayers(Stylizer):
+    """The optimiser as it is, on two style layers: what is strained is not the network, and steps are quick."""
+
+    def _network(self, weights: BackboneWeights) -> FeatureNetwork:
+        return FeatureNetwork(weights, STYLE_LAYERS[:2])
+
+
+def _camera() -> Camera:
+    return Camera("view", _SIDE, _SIDE, 20.0, 20.0, _SIDE / 2, _SIDE / 2, torch.eye(4, dtype=torch.float64))
+
+
+def _walls(*walls: tuple[float, int]) -> Scene:
+    """Walls of (opacity's logit, Gaussians along a side), one behind the other; each fills the view."""
+    means, scales, logits = [], [], []
+    for index, (logit, columns) in enumerate(walls):
+        depth = 3.0 + index
+        side = 0.45 * depth * ((torch.arange(columns) + 0.5) * 2 / columns - 1)
+        x, y = torch.meshgrid(side, side, indexing="xy")
+        means.append(torch.stack([x, y, torch.full_like(x, depth)], dim=-1).reshape(-1, 3))
+        scales.append(torch.full((columns**2, 3), math.log(0.8 * depth / columns)))
+        logits.append(torch.full((columns**2,), logit))
+    count = sum(map(len, means))
+    return Scene(
+        means=torch.cat(means),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        scales=torch.cat(scales),
+        opacities=torch.cat(logits),
+        sh_dc=torch.randn(count, 3, generator=torch.Generator().manual_seed(1)),
+        sh_rest=torch.zeros(count, 0, 3),
+    )
+
+
+def _stylizer(scene: Scene, steps: int, *, shallow: bool = True, **values: Any) -> Stylizer:
+    values |= {"content_weight": 0} if shallow else {}
+    settings = make_settings(steps_coarse=0, steps_sos=steps, memory_limit=1 << 30, **values)
+    kind = _OnShallowLayers if shallow else Stylizer
+    return kind(scene, [_camera()], _style(), settings, weights=vgg16())
+
+
+def _style() -> Tensor:
+    return texture(48, 40, 9)
+
+
+def _last_picture(stylizer: Stylizer) -> Tensor:
+    return stylizer.views.render(0, stylizer.views.colours(0, stylizer.sh_dc.detach()))
+
+
+def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
+    if not bool(torch.isfinite(stylizer.sh_dc).all()):
+        return CaseResult(math.inf, 0.0, "colours are not finite")
+    content = stylizer.views.content(0)
+    result = compare_losses(_last_picture(stylizer), _style(), content)
+    return CaseResult(result.error, result.bound, note)
+
+
+def _outside(stylizer: Stylizer, rows: Tensor) -> float:
+    """How far the colours of some rows ([n] bool) lie outside 0..1 at most."""
+    colours = COLOUR_OFFSET + SH_C0 * stylizer.sh_dc.detach()[rows]
+    return float(torch.maximum(colours - 1, -colours).amax()) if len(colours) else 0.0
+
+
+def _weights(full: bool) -> CaseResult:
+    """Behind opaque walls, Gaussians down to nearly the smallest blend weight there is."""
+    faint = math.log(1.1 * ALPHA_MIN / (1 - 1.1 * ALPHA_MIN))
+    scene = _walls((2.0, 5), (3.0, 1), (faint, 5), (2.0, 5), (1.0, 5), (faint, 8))
+    stylizer = _stylizer(scene, 2000 if full else 200, learning_rate=0.05)
+    total = stylizer.plan.survey.total_weights[stylizer.plan.seen]
+    run(stylizer)
+    hardly, well = total < HARDLY_SEEN, total > 1
+    if float(total.min()) < ALPHA_MIN * TRANSMITTANCE_MIN:
+        return CaseResult(math.inf, 0.0, "a weight below what the cut-offs allow")
+    return _at_the_end(
+        stylizer,
+        f"total weights {float(total.min()):.1e} to {float(total.max()):.1e}; after {stylizer.step} steps colours lie "
+        f"up to {_outside(stylizer, well):.1f} outside 0..1 where the weight is above 1, and up to "
+        f"{_outside(stylizer, hardly):.1f} where it is below 1/255 ({int(hardly.sum())} of {len(total)})",
+    )
+
+
+def _adam(full: bool) -> CaseResult:
+    """Adam divides by the gradient's own size, so that all 16 orders of magnitude move alike, in either precision."""
+    sizes = torch.logspace(-12, 3, 16, dtype=torch.float64)
+    ends = []
+    for dtype in (torch.float32, torch.float64):
+        values = torch.zeros(16, dtype=dtype, requires_grad=True)
+        adam = torch.optim.Adam([values], lr=2.5e-3, eps=ADAM_EPS)
+        for _ in range(2000 if full else 600):
+            values.grad = (sizes * (values.detach().double() - 1)).to(dtype)
+            adam.step()
+        ends.append(values.detach().double())
+    error = float((ends[0] - ends[1]).abs().max())
+    spread = float(ends[1].max() - ends[1].min())
+    return CaseResult(error, 1e-4, f"all values go to 1 together: they end {spread:.1e} apart")
+
+
+def _large_steps(full: bool) -> CaseResult:
+    stylizer = _stylizer(
+        _walls((2.0, 5)), 1000 if full else 100, learning_rate=5.0, learning_rate_end=1.0, content_weight=0
+    )
+    run(stylizer)
+    colours = COLOUR_OFFSET + SH_C0 * stylizer.sh_dc.detach()
+    stuck = float((colours <= 0).float().mean())
+    losses = [record.loss for record in stylizer.history]
+    return _at_the_end(
+        stylizer,
+        f"loss {losses[-1] / losses[0]:.2g} of the first; colours up to {float(colours.max()):.0f}; {stuck:.0%} of the "
+        "values are negative: black, and without gradient for good",
+    )
+
+
+def _unbalanced(weight: float, full: bool) -> CaseResult:
+    return compare_losses(texture(32, 40, 1), texture(32, 40, 2), texture(32, 40, 3), content_weight=weight)
+
+
+def _far_colours(full: bool) -> CaseResult:
+    stylizer = _stylizer(_walls((2.0, 5)), 4, shallow=False)
+    with torch.no_grad():
+        stylizer.sh_dc.mul_(1e3 / SH_C0)
+    run(stylizer)
+    return _at_the_end(stylizer, f"colours up to {float(_last_picture(stylizer).max()):.0f}")
+
+
+def _diverged(full: bool) -> CaseResult:
+    """An error instead of NaN in the result; the colours stay what they were."""
+    stylizer = _stylizer(_walls((2.0, 5)), 3, shallow=False)
+    with torch.no_grad():
+        stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)
+    before = stylizer.sh_dc.detach().clone()
+    try:
+        run(stylizer)
+    except DivergedError as error:
+        same = torch.equal(before, stylizer.sh_dc.detach())
+        return CaseResult(float(stylizer.step) if same else math.inf, 0.0, f"refused: {error}")
+    return CaseResult(math.inf, 0.0, "was not refused")
+
+
+def _many_steps(full: bool) -> CaseResult:
+    """At a constant rate; the loss keeps to its lowest level, within what a constant rate leaves it to wander."""
+    stylizer = _stylizer(_walls((2.0, 5), (1.0, 5)), 100_000 if full else 500, learning_rate=2.5e-3)
+    run(stylizer)
+    if not bool(torch.isfinite(stylizer.sh_dc).all()):
+        return CaseResult(math.inf, 0.0, "colours are not finite")
+    window = max(stylizer.total // 50, 1)
+    losses = torch.tensor([record.loss for record in stylizer.history], dtype=torch.float64)
+    levels = losses.view(-1, window).mean(1)
+    rise = float(levels[-1] / levels.min()) - 1
+    return CaseResult(rise, 0.05, f"{stylizer.total} steps; loss {float(levels[-1] / losses[0]):.2g} of the first")
+
+
+def _resumed(full: bool) -> CaseResult:
+    whole, first, second = (_stylizer(_walls((2.0, 5)), 8, shallow=False) for _ in range(3))
+    run(whole)
+    for _ in range(3):
+        first.run_step()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "checkpoint.safetensors"
+        save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, first.start(), "run", versions()), "job")
+        second.load_state(load_checkpoint(path, "job").state)
+    run(second)
+    return CaseResult(float((whole.sh_dc - second.sh_dc).detach().abs().max()), 0.0, "the same bits")

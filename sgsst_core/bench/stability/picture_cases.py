@@ -1,0 +1,190 @@
+"""Hard cases of style and content: pictures without texture or with nothing else, and features without variance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from sgsst_core.bench.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, texture
+from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from sgsst_core.loss.terms import LayerTarget, style_loss
+
+_LOSS = "loss and pixel gradient, relative to float64"
+_HEIGHT, _WIDTH = 32, 40
+
+
+def cases() -> list[Case]:
+    """All cases of this group."""
+    found = [
+        Case(f"style: {name}", "style and content", _LOSS, partial(_style, make)) for name, make in _PICTURES.items()
+    ]
+    found += [
+        Case(f"view: {name}", "style and content", _LOSS, partial(_view, make)) for name, make in _PICTURES.items()
+    ]
+    return [
+        *found,
+        Case("style and view: the same constant", "style and content", _LOSS, _equal_constants),
+        Case("view equal to its content and its style", "style and content", _LOSS, _nothing_to_do),
+        Case("style: 8 x 8", "style and content", _LOSS, partial(_small_style, 8)),
+        Case("style: 1 x 1", "style and content", _LOSS, partial(_small_style, 1)),
+        Case("style: 10000 x 50", "style and content", "targets, relative to float64", _long_style),
+        *(
+            Case(
+                f"channels dead in {where}", "style and content", "gradient, relative to float64", partial(_dead, where)
+            )
+            for where in ("the style", "the view", "both")
+        ),
+        *(
+            Case(f"mean-to-sigma ratio of 1e{power}", "style and content", "sigma, relative", partial(_ratio, power))
+            for power in (3, 4, 5, 6)
+        ),
+        Case("gradient at a mean-to-sigma ratio of 1e4", "style and content", "gradient, relative to float64", _steep),
+    ]
+
+
+def _constant(red: float, green: float, blue: float, height: int = _HEIGHT, width: int = _WIDTH) -> Tensor:
+    return torch.tensor([red, green, blue]).expand(height, width, 3).clone()
+
+
+def _checkerboard() -> Tensor:
+    """Black and white in turn: nothing changes faster."""
+    return ((torch.arange(_HEIGHT)[:, None] + torch.arange(_WIDTH)) % 2).float()[..., None].expand(-1, -1, 3).clone()
+
+
+def _contrast() -> Tensor:
+    """Values of -100 and 100: colours are not clamped before the network."""
+    return 200 * (texture(_HEIGHT, _WIDTH, 4) > 0.5).float() - 100
+
+
+_PICTURES: dict[str, Callable[[], Tensor]] = {
+    "black": partial(_constant, 0.0, 0.0, 0.0),
+    "white": partial(_constant, 1.0, 1.0, 1.0),
+    "constant grey": partial(_constant, 0.4, 0.4, 0.4),
+    "one saturated colour": partial(_constant, 1.0, 0.0, 0.0),
+    "1-pixel checkerboard": _checkerboard,
+    "values of +-100": _contrast,
+}
+
+
+def _style(make: Callable[[], Tensor], full: bool) -> CaseResult:
+    return compare_losses(texture(_HEIGHT, _WIDTH, 1), make(), texture(_HEIGHT, _WIDTH, 3))
+
+
+def _view(make: Callable[[], Tensor], full: bool) -> CaseResult:
+    return compare_losses(make(), texture(_HEIGHT, _WIDTH, 2), texture(_HEIGHT, _WIDTH, 3))
+
+
+def _equal_constants(full: bool) -> CaseResult:
+    return compare_losses(*(_constant(0.4, 0.4, 0.4) for _ in range(3)))
+
+
+def _nothing_to_do(full: bool) -> CaseResult:
+    return compare_losses(*(texture(_HEIGHT, _WIDTH, 1) for _ in range(3)))
+
+
+def _small_style(side: int, full: bool) -> CaseResult:
+    """Layers whose cells are larger than the style image have no target and are left out of the loss."""
+    result = compare_losses(
+        texture(_HEIGHT, _WIDTH, 1), texture(side, side, 2), texture(_HEIGHT, _WIDTH, 3), untiled=False
+    )
+    return CaseResult(result.error, result.bound, f"deep layers have no cell in it and are left out; {result.note}")
+
+
+def _long_style(full: bool) -> CaseResult:
+    """200 times longer than wide: kept, brought down to the view's shorter side; targets against float64."""
+    from sgsst_core.bench.stability.case import vgg16
+    from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+    from sgsst_core.loss.sos import SosLoss
+
+    size = (50, 60) if full else (16, 20)
+    style = texture(10000, 50, 5)
+    single, double = (
+        SosLoss(FeatureNetwork(vgg16(), STYLE_LAYERS, dtype), content_weight=0, memory=memory).style_targets(
+            style.to(dtype), size
+        )[0]
+        for dtype, memory in ((torch.float32, 1 << 28), (torch.float64, 1 << 34))
+    )
+    errors = [
+        float(
+            (getattr(single[layer], name) - getattr(double[layer], name)).norm() / getattr(double[layer], name).norm()
+        )
+        for layer in STYLE_LAYERS
+        for name in ("gram", "mean", "std")
+    ]
+    worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
+    return CaseResult(worst, LOSS_BOUND, f"used at {10000 * size[0] // 50} x {size[0]} pixels, in partition tiles")
+
+
+def _features(seed: int, channels: int = 12) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn((17, 23, channels), generator=generator).relu() * 300
+
+
+def _dead(where: str, full: bool) -> CaseResult:
+    """Constant channels, zero or not; the published factor (sigma - sigma_v) / sigma is infinite for them."""
+    view, style = _features(1), _features(2)
+    for name, features in (("the view", view), ("the style", style)):
+        if where in (name, "both"):
+            features[..., :3] = 0
+            features[..., 3:6] = 123.4
+    target = LayerTarget.of(layer_statistics(style))
+    _, gradient = style_loss(layer_statistics(view), target)
+    found = gradient.apply(view)
+    exact = _autograd(view, LayerTarget.of(layer_statistics_reference(style)))
+    published = (layer_statistics(view).std() - target.std) / layer_statistics(view).std()
+    broken = int((~torch.isfinite(published)).sum())
+    error = _relative(found, exact)
+    return CaseResult(error, LOSS_BOUND, f"the published factor is not finite in {broken} of 12 channels")
+
+
+def _ratio(power: int, full: bool) -> CaseResult:
+    """Sigma of features with a mean of 10^power sigma; the one-pass formula of the published code beside it."""
+    generator = torch.Generator().manual_seed(power)
+    features = (10.0**power + torch.randn((60, 50, 16), generator=generator, dtype=torch.float64)).float()
+    exact = layer_statistics_reference(features).std()
+    error = float(((layer_statistics(features).std() - exact).abs() / exact).max())
+    flat = features.reshape(-1, 16)
+    one_pass = ((flat.T @ flat).diagonal() / len(flat) - flat.mean(0).square()).sqrt().double()
+    lost = int(torch.isnan(one_pass).sum())
+    off = float(((one_pass - exact).abs() / exact).nan_to_num(0).max())
+    return CaseResult(
+        error, LOSS_BOUND, f"one pass in float32: NaN in {lost} of 16 channels, else off by up to {off:.1e}"
+    )
+
+
+def _steep(full: bool) -> CaseResult:
+    generator = torch.Generator().manual_seed(0)
+    view, style = (
+        (1e4 + spread * torch.randn((60, 50, 8), generator=generator, dtype=torch.float64)).float() for spread in (1, 2)
+    )
+    target = LayerTarget.of(layer_statistics(style))
+    _, gradient = style_loss(layer_statistics(view), target)
+    return CaseResult(_relative(gradient.apply(view), _autograd(view, target)), 1e-4)
+
+
+def _autograd(features: Tensor, target: LayerTarget) -> Tensor:
+    """Gradient of one layer's style loss by its definition, float64; constant channels have no sigma term."""
+    x = features.double().clone().requires_grad_()
+    flat = x.reshape(-1, x.shape[-1])
+    count, channels = flat.shape
+    mean = flat.mean(0)
+    variance = (flat - mean).square().mean(0)
+    alive = variance > 1e-18
+    std = torch.where(alive, variance, 1.0).sqrt() * alive
+    loss = (
+        1e3 / channels**2 * (flat.T @ flat / count - target.gram).square().mean()
+        + 1e4 * (mean - target.mean).square().mean()
+        + 1e4 * (std - target.std).square().mean()
+    )
+    (gradient,) = torch.autograd.grad(loss, x)
+    return gradient
+
+
+def _relative(found: Tensor, exact: Tensor) -> float:
+    if not bool(torch.isfinite(found).all()):
+        return math.inf
+    return float((found.double() - exact).norm() / exact.norm())

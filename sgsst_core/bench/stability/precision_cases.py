@@ -1,0 +1,176 @@
+"""Hard cases of precision: long sums, half precision, and the order of summation over partition tiles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+
+from sgsst_core.bench.stability.case import CLOSE_TO_CUT, Case, CaseResult, camera, ordinary, texture, vgg16
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.statistics import (
+    LayerStatistics,
+    layer_statistics,
+    layer_statistics_reference,
+    merge,
+    merge_all,
+)
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.terms import LayerTarget, style_loss
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.settings import make_settings
+
+#: Results for any number of partition tiles agree to this.
+_TILES_BOUND = 1e-6
+
+
+def cases() -> list[Case]:
+    """All cases of this group."""
+    found: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
+        ("Gram matrix of 17 million pixels", "Gram, mean, sigma, relative to float64", _long_sum),
+        ("features that overflow float16", "settings that were not refused", _float16),
+        ("bfloat16 features", "pixel gradient, relative to float32", partial(_bfloat16, 1.0)),
+        ("bfloat16 features of values up to 100", "pixel gradient, relative to float32", partial(_bfloat16, 100.0)),
+        ("half-precision blend weights", "image, relative to float64", _half_weights),
+        ("statistics of 1, 2, 7 and 64 tiles", "loss and feature gradient, relative", _statistics_of_tiles),
+        ("statistics of tiles in any order", "loss and feature gradient, relative", _order_of_tiles),
+        ("whole loss of 1, 2, 7 and 64 tiles", "loss, relative", _tiles),
+    ]
+    return [Case(name, "precision", measure, measured) for name, measure, measured in found]
+
+
+def _long_sum(full: bool) -> CaseResult:
+    """67 partition tiles of 512 x 512 make a view of 5187 x 3361; beside it float32 added one term after the other."""
+    generator = torch.Generator().manual_seed(0)
+    channels = torch.linspace(1, 300, 64)
+    found, exact = LayerStatistics.zero(64), LayerStatistics.zero(64)
+    in_turn = np.float32(0)
+    for _ in range(67 if full else 3):
+        features = channels * (1 + torch.randn((512, 512, 64), generator=generator)).relu_()
+        found = merge(found, layer_statistics(features))
+        exact = merge(exact, layer_statistics_reference(features))
+        squares = features[..., -1].square().numpy().reshape(-1)
+        in_turn = np.cumsum(np.concatenate([[in_turn], squares]), dtype=np.float32)[-1]
+    pairs = [(found.gram(), exact.gram()), (found.std(), exact.std()), (found.mean, exact.mean)]
+    error = max(float(((own - wanted).abs() / wanted).max()) for own, wanted in pairs)
+    off = abs(float(in_turn) / float(exact.count * exact.gram()[-1, -1]) - 1)
+    return CaseResult(
+        error, 1e-6, f"{int(exact.count):,} positions; float32 added one after the other is off by {off:.1e}"
+    )
+
+
+def _float16(full: bool) -> CaseResult:
+    """Features reach 1e4 and Gram entries 1e8, where float16 ends at 65504: it is not offered."""
+    activations = FeatureNetwork(vgg16(), STYLE_LAYERS).forward(texture(32, 40).round(), keep=False)
+    largest = max(float(features.max()) for features in activations.features.values())
+    gram = max(float(layer_statistics(features).gram().max()) for features in activations.features.values())
+    note = f"features up to {largest:.1e}, Gram entries up to {gram:.1e}; float16 ends at 6.6e+04 and is refused"
+    try:
+        make_settings(precision="float16")
+    except SettingsError:
+        return CaseResult(0.0, 0.0, note)
+    return CaseResult(1.0, 0.0, "float16 was accepted")
+
+
+def _bfloat16(brightest: float, full: bool) -> CaseResult:
+    """As wide as float32, with 8 bits: nothing overflows, the gradient's direction is kept roughly."""
+    image, style, content = (brightest * texture(48, 64, seed) for seed in (1, 2, 3))
+    gradients = []
+    for dtype in (torch.float32, torch.bfloat16):
+        loss = SosLoss(FeatureNetwork(vgg16(), dtype=dtype))
+        gradient = loss.evaluate(image, loss.style_targets(style, (48, 64)), loss.view_target(content)).image_gradient
+        assert gradient is not None
+        gradients.append(gradient)
+    exact, found = gradients
+    error = float((found - exact).norm() / exact.norm()) if bool(torch.isfinite(found).all()) else math.inf
+    cosine = float(torch.nn.functional.cosine_similarity(found.flatten(), exact.flatten(), dim=0))
+    return CaseResult(error, 0.5, f"cosine {cosine:.3f}: for `preview`, and measured in every report that uses it")
+
+
+def _half_weights(full: bool) -> CaseResult:
+    """Weights down to 4e-7 lie below float16's normal range; they are kept scaled by 2^14, so that none is lost."""
+    scene, view = ordinary(1500, seed=2), camera(100, 60)
+    scene = replace(scene, opacities=torch.linspace(-5.5, 6.0, 1500)[torch.randperm(1500)])
+    colours = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
+    reference = ReferenceRasterizer(scene)
+    image, band = reference.render(colours, view), reference.near_cutoff(view, CLOSE_TO_CUT)
+    found = CachedRasterizer(scene, precision="half").render(colours, view).double()
+    off = ((found - image).abs() / image.clamp_min(1e-3))[~band]
+    return CaseResult(
+        float(off.max()) if bool(torch.isfinite(found).all()) else math.inf, 2**-11 + 1e-5, "bound: 2^-11"
+    )
+
+
+def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:
+    """1, 2 or 7 strips, or 8 x 8 rectangles."""
+    down, across = (8, 8) if tiles == 64 else (1, tiles)
+    rows, columns = (np.linspace(0, side, parts + 1).astype(int) for side, parts in ((height, down), (width, across)))
+    return [
+        (slice(rows[i], rows[i + 1]), slice(columns[j], columns[j + 1])) for i in range(down) for j in range(across)
+    ]
+
+
+def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], target: LayerTarget) -> CaseResult:
+    """Largest difference of loss and feature gradient between ways of adding up the same features."""
+    results = {name: style_loss(merge_all(statistics), target) for name, statistics in parts.items()}
+    losses = [terms.total for terms, _ in results.values()]
+    gradients = [gradient.apply(features) for _, gradient in results.values()]
+    error = max(abs(loss / losses[0] - 1) for loss in losses)
+    off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)
+    return CaseResult(max(error, off), _TILES_BOUND, ", ".join(parts))
+
+
+def _features() -> tuple[torch.Tensor, LayerTarget]:
+    """Real features [160, 224, 64] float32, and the target of a picture that is clearly another one.
+
+    (Where both nearly agree, the loss is a difference that magnifies every rounding by as much.)
+    """
+    network = FeatureNetwork(vgg16(), ("relu1_1",))
+    style = network.forward(texture(100, 100, 5) ** 3, keep=False).features["relu1_1"]
+    return network.forward(texture(160, 224, 4), keep=False).features["relu1_1"], LayerTarget.of(
+        layer_statistics(style)
+    )
+
+
+def _statistics_of_tiles(full: bool) -> CaseResult:
+    features, target = _features()
+    parts = {
+        f"{tiles} tile{'s' * (tiles > 1)}": [
+            layer_statistics(features[place]) for place in _split(features.shape[0], features.shape[1], tiles)
+        ]
+        for tiles in (1, 2, 7, 64)
+    }
+    return _agreement(features, parts, target)
+
+
+def _order_of_tiles(full: bool) -> CaseResult:
+    features, target = _features()
+    parts = [layer_statistics(features[place]) for place in _split(features.shape[0], features.shape[1], 64)]
+    shuffled = [parts[i] for i in torch.randperm(64, generator=torch.Generator().manual_seed(0)).tolist()]
+    return _agreement(features, {"as they come": parts, "backwards": parts[::-1], "shuffled": shuffled}, target)
+
+
+def _tiles(full: bool) -> CaseResult:
+    """Forward passes differ too: the network sees each tile by itself. A flipped max-pool decision is no error."""
+    size = (16, 1024) if full else (16, 448)
+    counts = {1: None, 2: 512, 7: 160, 64: 16} if full else {1: None, 2: 224, 7: 64}
+    image, style, content = (texture(*size, seed) for seed in (1, 2, 3))
+    losses, gradients = [], []
+    for tiles, tile_size in counts.items():
+        loss = SosLoss(FeatureNetwork(vgg16()), tile_size=tile_size)
+        if len(loss.tiles(*size)) != tiles:
+            return CaseResult(math.inf, 0.0, f"{len(loss.tiles(*size))} tiles where {tiles} were meant")
+        result = loss.evaluate(image, loss.style_targets(style, size), loss.view_target(content))
+        assert result.image_gradient is not None
+        losses.append(result.loss)
+        gradients.append(result.image_gradient)
+    error = max(abs(loss / losses[0] - 1) for loss in losses)
+    off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)
+    names = ", ".join(map(str, counts))
+    return CaseResult(error, _TILES_BOUND, f"{names} tiles; pixel gradient, with flipped decisions, within {off:.1e}")

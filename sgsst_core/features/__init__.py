@@ -1,0 +1,1 @@
+"""The feature network: its weights, the partition of a view that it takes, statistics of its features."""

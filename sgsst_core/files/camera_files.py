@@ -1,0 +1,342 @@
+"""Camera files: INRIA `cameras.json`, COLMAP sparse models, nerfstudio and Blender `transforms.json`.
+
+All become `Camera`: pinhole, world to camera, x right, y down, z forward, pixel centres at +0.5 (COLMAP's own
+convention; the JSON forms share it for the principal point).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sgsst_core.errors import CameraError, ImageError
+from sgsst_core.files.images import image_size
+from sgsst_core.scene.camera import Camera
+
+#: Largest entry of R R^T - 1 that passes for a rotation written with few digits; it is then made exact.
+ROTATION_TOLERANCE = 1e-3
+
+_FORMS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
+#: Camera's axes in OpenGL (x right, y up, z backward) to ours.
+_OPENGL = np.diag([1.0, -1.0, -1.0])
+#: COLMAP's numbers of the models without distortion, and how many parameters they have.
+_COLMAP_PINHOLES = {0: 3, 1: 4}
+_UNDISTORT = (
+    "Undistort the photos with `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT` "
+    "and give OUT/sparse"
+)
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+#: Models of transforms.json that are pinholes once their coefficients are 0.
+_PINHOLE_NAMES = (None, "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+
+def read_cameras(path: Path) -> list[Camera]:
+    """Read the cameras of a file or folder, whatever form they have.
+
+    A folder may be a COLMAP sparse model, a data set with one in sparse/0 or sparse, or one that holds
+    transforms.json or cameras.json. JSON keeps its own order, COLMAP's images are sorted by name.
+
+    nerfstudio trains in a frame of its own: a scene exported by it fits these cameras only together with the
+    `dataparser_transforms.json` of the training run. Where a file of that name lies beside the transforms.json, it
+    is applied (with `applied_transform` and `applied_scale` accounted for as nerfstudio does). Otherwise the
+    poses are taken as they are, which is right for scenes trained in the file's own frame.
+
+    Raises:
+        CameraError: missing file, unknown form, no cameras, distorted model, or a value that cannot be: the message
+            names file and camera.
+    """
+    if path.is_dir():
+        return _read_folder(path)
+    if path.suffix in (".bin", ".txt") and path.name.startswith(("cameras", "images", "points3D")):
+        return _read_colmap(path.parent)
+    content = _load_json(path)
+    if isinstance(content, list):
+        return _numbered(path, content, _inria_camera)
+    if isinstance(content, dict) and isinstance(content.get("frames"), list):
+        return _read_transforms(path, content)
+    raise CameraError(f"{path}: has no form that is known here. Give {_FORMS}.")
+
+
+def _read_folder(folder: Path) -> list[Camera]:
+    for model in (folder, folder / "sparse" / "0", folder / "sparse"):
+        if (model / "cameras.bin").is_file() or (model / "cameras.txt").is_file():
+            return _read_colmap(model)
+    for name in ("transforms.json", "cameras.json"):
+        if (folder / name).is_file():
+            return read_cameras(folder / name)
+    raise CameraError(f"{folder}: holds no cameras that are known here. Give {_FORMS}.")
+
+
+def _load_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {_FORMS}.") from error
+    except (ValueError, RecursionError) as error:  # bad JSON, or bytes that are no UTF-8
+        raise CameraError(f"{path}: is neither JSON nor a COLMAP model ({error}). Give {_FORMS}.") from error
+
+
+def _numbered(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
+    """Convert the entries of a JSON list, and say which one if one is wrong."""
+    if not entries:
+        raise CameraError(f"{path}: holds no cameras. Export them again.")
+    cameras = []
+    for index, entry in enumerate(entries):
+        where = f"{path}: camera {index}"
+        if not isinstance(entry, dict):
+            raise CameraError(f"{where}: is not an object with named values. Give {_FORMS}.")
+        cameras.append(convert(where, entry))
+    return cameras
+
+
+def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
+    name = _name(where, entry, "img_name", "id")
+    where = f"{where} ({name!r})"
+    pose = np.eye(4)
+    pose[:3, :3] = _array(where, entry, "rotation", (3, 3))
+    pose[:3, 3] = _array(where, entry, "position", (3,))
+    width, height = _size(where, entry, "width", "height")
+    fx, fy = (_number(where, entry, key) for key in ("fx", "fy"))
+    return _camera(where, name, (width, height), (fx, fy, width / 2, height / 2), _inverse(where, pose))
+
+
+def _read_transforms(path: Path, content: Mapping[str, Any]) -> list[Camera]:
+    frame_change = _dataparser_change(path, content)
+
+    def convert(where: str, frame: Mapping[str, Any]) -> Camera:
+        name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
+        where = f"{where} ({name!r})"
+        values = {**content, **frame}  # a frame's own values go first
+        _refuse_distortion(where, values)
+        size = _transforms_size(where, path.parent / name, values)
+        pose = np.eye(4)
+        matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))
+        pose[:3] = matrix[:3]
+        pose = frame_change(pose)
+        pose[:3, :3] = pose[:3, :3] @ _OPENGL
+        return _camera(where, name, size, _transforms_intrinsics(where, values, size), _inverse(where, pose))
+
+    return _numbered(path, content["frames"], convert)
+
+
+def _refuse_distortion(where: str, values: Mapping[str, Any]) -> None:
+    model = values.get("camera_model")
+    bent = [key for key in _DISTORTION if values.get(key) and _number(where, values, key) != 0]
+    if model not in _PINHOLE_NAMES or values.get("is_fisheye") or bent:
+        what = f"distortion {', '.join(bent)}" if bent else f"camera model {model or 'fisheye'}"
+        raise CameraError(f"{where}: has {what}, but only pinhole cameras are handled. {_UNDISTORT}.")
+
+
+def _transforms_size(where: str, image: Path, values: Mapping[str, Any]) -> tuple[int, int]:
+    """Width and height as given, else those of the image file (Blender's form has neither, nor the file's suffix)."""
+    if "w" in values and "h" in values:
+        return _size(where, values, "w", "h")
+    for candidate in (image, *(image.with_name(image.name + suffix) for suffix in (".png", ".jpg", ".jpeg"))):
+        if candidate.is_file():
+            try:
+                return image_size(candidate)
+            except ImageError as error:
+                raise CameraError(f"{where}: gives no size, and its image does not either: {error}") from error
+    raise CameraError(f"{where}: gives no size, and there is no image {image}. Add the sizes as 'w' and 'h'.")
+
+
+def _transforms_intrinsics(
+    where: str, values: Mapping[str, Any], size: tuple[int, int]
+) -> tuple[float, float, float, float]:
+    focals: list[float | None] = []
+    for focal, angle, side in (("fl_x", "camera_angle_x", size[0]), ("fl_y", "camera_angle_y", size[1])):
+        if focal in values:
+            focals.append(_number(where, values, focal))
+        elif angle in values:
+            opening = _number(where, values, angle)
+            if not 0 < opening < math.pi:
+                raise CameraError(f"{where}: {angle} is {opening}; an angle of view lies between 0 and pi. Correct it.")
+            focals.append(side / 2 / math.tan(opening / 2))
+        else:
+            focals.append(None)
+    fx, fy = focals
+    if fx is None:
+        raise CameraError(f"{where}: gives neither fl_x nor camera_angle_x. Add one.")
+    cx = _number(where, values, "cx") if "cx" in values else size[0] / 2
+    cy = _number(where, values, "cy") if "cy" in values else size[1] / 2
+    return fx, fx if fy is None else fy, cx, cy
+
+
+def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
+    """The step from the file's poses [4, 4] to those that nerfstudio trained with.
+
+    nerfstudio stores T = T0 A and S = s0 a, where A and a (`applied_transform`, `applied_scale`) are in the file's
+    poses already; the training poses are s0 T0 pose.
+    """
+    companion = path.with_name("dataparser_transforms.json")
+    if not companion.is_file():
+        return lambda pose: pose
+    values = _load_json(companion)
+    if not isinstance(values, dict):
+        raise CameraError(f"{companion}: is not what nerfstudio writes ('transform' and 'scale'). Copy it again.")
+    applied, stored = np.eye(4), np.eye(4)
+    stored[:3] = _array(str(companion), values, "transform", (3, 4))
+    if "applied_transform" in content:
+        applied[:3] = _array(str(path), content, "applied_transform", (3, 4), (4, 4))[:3]
+    scale = _number(str(companion), values, "scale")
+    if "applied_scale" in content:
+        scale /= _positive(str(path), "applied_scale", _number(str(path), content, "applied_scale"))
+    change = stored @ np.linalg.inv(_exact_rotation(f"{path}: applied_transform", applied))
+    _positive(str(companion), "scale", scale)
+
+    def apply(pose: NDArray) -> NDArray:
+        moved = change @ pose
+        moved[:3, 3] *= scale
+        return moved
+
+    return apply
+
+
+def _read_colmap(folder: Path) -> list[Camera]:
+    import pycolmap  # loads a large library that the JSON forms do not need
+
+    if (folder / "cameras.bin").is_file():
+        _check_binary_model(folder)
+    try:
+        model = pycolmap.Reconstruction(os.fspath(folder))
+    except Exception as error:  # pycolmap passes on whatever its C++ side throws
+        raise CameraError(f"{folder}: cannot be read as COLMAP model: {error}. Export it again.") from error
+    cameras = []
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        where = f"{folder}: image {image.name!r}"
+        lens = model.cameras[image.camera_id]
+        values = [float(value) for value in lens.params]
+        if lens.model.name == "SIMPLE_PINHOLE":
+            values.insert(0, values[0])
+        elif lens.model.name != "PINHOLE":
+            raise CameraError(f"{where}: has camera model {lens.model.name}, which is distorted. {_UNDISTORT}.")
+        pose = image.cam_from_world
+        matrix = np.eye(4)
+        matrix[:3] = (pose() if callable(pose) else pose).matrix()  # a property before pycolmap 3.12
+        size = (int(lens.width), int(lens.height))
+        cameras.append(_camera(where, image.name, size, (values[0], values[1], values[2], values[3]), matrix))
+    if not cameras:
+        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.")
+    return sorted(cameras, key=lambda camera: camera.name)
+
+
+def _check_binary_model(folder: Path) -> None:
+    """Step through cameras.bin and images.bin: pycolmap takes whatever memory holds for what a short file lacks."""
+    for name, step in (("cameras.bin", _after_camera), ("images.bin", _after_image)):
+        try:
+            data = (folder / name).read_bytes()
+            position = 8
+            for _ in range(struct.unpack_from("<Q", data)[0]):
+                position = step(data, position)
+                if position > len(data):
+                    raise EOFError
+        except OSError as error:
+            raise CameraError(f"{folder / name}: cannot be read: {error.strerror}. Copy the model again.") from error
+        except (struct.error, EOFError, ValueError) as error:
+            raise CameraError(f"{folder / name}: is truncated or corrupt. Copy the model again.") from error
+        except KeyError:
+            return  # another lens model: pycolmap knows its name
+
+
+def _after_camera(data: bytes, position: int) -> int:
+    """Fields: camera (uint32), model (int32), width and height (uint64), parameters (float64)."""
+    return position + 24 + 8 * _COLMAP_PINHOLES[struct.unpack_from("<Ii", data, position)[1]]
+
+
+def _after_image(data: bytes, position: int) -> int:
+    """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, 24 bytes each)."""
+    end_of_name = data.index(b"\0", position + 64)
+    return end_of_name + 9 + 24 * struct.unpack_from("<Q", data, end_of_name + 1)[0]
+
+
+def _camera(
+    where: str,
+    name: str,
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],
+    world_to_camera: NDArray,
+) -> Camera:
+    """The camera, after every check that all forms share."""
+    fx, fy, cx, cy = intrinsics
+    for key, value in (("width", size[0]), ("height", size[1]), ("focal length x", fx), ("focal length y", fy)):
+        _positive(where, key, value)
+    if not (np.isfinite(world_to_camera).all() and np.isfinite(intrinsics).all()):
+        raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
+    matrix = torch.from_numpy(_exact_rotation(where, world_to_camera))
+    return Camera(name, size[0], size[1], fx, fy, cx, cy, matrix)
+
+
+def _exact_rotation(where: str, matrix: NDArray) -> NDArray:
+    """`matrix` [4, 4] with the rotation nearest to its upper left 3x3 (polar decomposition), which must be close."""
+    rotation = matrix[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not error <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        what = "mirrors" if error <= ROTATION_TOLERANCE else f"is {error:.2g} off a rotation (allowed: 1e-3)"
+        raise CameraError(f"{where}: its 3x3 matrix {what}. Export the cameras again, without scale or shear.")
+    left, _, right = np.linalg.svd(rotation)
+    exact = matrix.copy()
+    exact[:3, :3] = left @ right
+    return exact
+
+
+def _inverse(where: str, pose: NDArray) -> NDArray:
+    """World to camera of camera to world; the position stays exact while the rotation is made so."""
+    if not np.isfinite(pose).all():
+        raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
+    rotation = _exact_rotation(where, pose)[:3, :3]
+    inverse = np.eye(4)
+    inverse[:3, :3] = rotation.T
+    inverse[:3, 3] = -rotation.T @ pose[:3, 3]
+    return inverse
+
+
+def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
+    name = next((str(entry[key]) for key in keys if key in entry), "")
+    if not name:
+        raise CameraError(f"{where}: has no name ({' or '.join(map(repr, keys))}). Give {_FORMS}.")
+    return name
+
+
+def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray:
+    try:
+        array = np.array(values[key], dtype=np.float64)
+    except KeyError:
+        raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.") from None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CameraError(f"{where}: {key!r} is not an array of numbers. Export the cameras again.") from error
+    if array.shape not in shapes:
+        raise CameraError(f"{where}: {key!r} has shape {array.shape}, not {' or '.join(map(str, shapes))}.")
+    return array
+
+
+def _number(where: str, values: Mapping[str, Any], key: str) -> float:
+    if key not in values:
+        raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.")
+    value = values[key]
+    # beyond 1e100 there is no length or angle, and an integer of JSON may be too long for a float
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e100:
+        raise CameraError(f"{where}: {key!r} is {str(value)[:40]}, not a finite number. Export the cameras again.")
+    return float(value)
+
+
+def _size(where: str, values: Mapping[str, Any], *keys: str) -> tuple[int, int]:
+    width, height = (_number(where, values, key) for key in keys)
+    if width != int(width) or height != int(height):
+        raise CameraError(f"{where}: a size of {width} x {height} is not in whole pixels. Correct it.")
+    return int(width), int(height)
+
+
+def _positive(where: str, key: str, value: float) -> float:
+    if not (math.isfinite(value) and value > 0):
+        raise CameraError(f"{where}: {key} is {value}; it must be positive. Export the cameras again.")
+    return value

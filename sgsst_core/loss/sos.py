@@ -1,0 +1,480 @@
+"""The SOS loss of one view, E = (1/n_s) sum_s E_transfer(scale s), and its gradient with respect to the pixels.
+
+Each scale goes through the network in partition tiles, in two passes: statistics of the whole scale first, then
+back-propagation of the loss that they give. Activations of the first pass are kept as far as the memory budget
+reaches; only tiles beyond it are computed twice. Of several ranks, each has its share of the tiles (`division`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
+from sgsst_core.features.partition import (
+    PartitionTile,
+    Rectangle,
+    choose_tile_size,
+    covered_region,
+    kept_tiles,
+    partition,
+)
+from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
+from sgsst_core.features.vgg import (
+    CONTENT_LAYER,
+    STYLE_LAYERS,
+    Activations,
+    FeatureGradient,
+    FeatureNetwork,
+    layer_stride,
+)
+from sgsst_core.loss.terms import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
+from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
+from sgsst_core.parallel.division import Piece, Size, divide, rounds
+from sgsst_core.scene.pyramid import (
+    add_upscaled_,
+    coverage_pyramid,
+    downscale,
+    scale_count,
+    style_size,
+)
+from sgsst_core.timing import Timer
+
+ScaleTarget = Mapping[str, LayerTarget]
+#: Bytes for activations where the caller names no budget: leaves most of a laptop to others.
+DEFAULT_MEMORY = 4 << 30
+
+
+@dataclass(frozen=True)
+class SosResult:
+    """What one evaluation gives.
+
+    Attributes:
+        terms: the split loss of each scale that was evaluated.
+        image_gradient: dE/dimage [H, W, 3], of which every rank has a part: they add up to the whole. None if only the
+            loss was asked for.
+    """
+
+    terms: dict[int, LossTerms]
+    image_gradient: Tensor | None
+
+    @property
+    def loss(self) -> float:
+        """E, the mean over the scales that were evaluated."""
+        return sum(terms.total for terms in self.terms.values()) / len(self.terms)
+
+
+@dataclass(frozen=True)
+class Share:
+    """How some scales of a view are shared out.
+
+    Attributes:
+        pieces: scale to every rank's pieces of it; the same on every rank.
+        tiles: scale to the partition tiles of this rank.
+    """
+
+    pieces: dict[int, tuple[tuple[Piece, ...], ...]]
+    tiles: dict[int, list[PartitionTile]]
+
+    def cost(self, rank: int, halo: int) -> int:
+        """Pixels through the network on a rank."""
+        return sum(piece.cost(halo) for every in self.pieces.values() for piece in every[rank])
+
+
+#: Content features [h, w, 512] of the cells that each of this rank's partition tiles owns.
+ContentFeatures = dict[PartitionTile, Tensor]
+
+
+@dataclass
+class ViewTarget:
+    """What a view is compared with, apart from the style.
+
+    Attributes:
+        content: scale to content features, as far as they are kept.
+        content_image: [H, W, 3], from which they can be computed again.
+        coverage: position weights at powers of two, [H >> k, W >> k] each; None for equal weights.
+        share: for which the content was prepared; None for one rank, whose share is always everything.
+    """
+
+    content_image: Tensor | None = None
+    content: dict[int, ContentFeatures] = field(default_factory=dict)
+    coverage: list[Tensor] | None = None
+    share: Share | None = None
+
+
+class SosLoss:
+    """Evaluates the SOS loss of views against one style.
+
+    Args:
+        network: the feature network; it must report the style layers, and the content layer if it is used.
+        content_weight: lambda_c; 0 leaves the content branch out.
+        memory: bytes that activations may take.
+        tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
+        coarsest: pixels of the coarsest scale's shorter side at most.
+        leave_out: pixels without weight do not go through the network; False for comparison.
+        keep_activations: as many as fit between the two passes; False computes each tile twice, for comparison.
+        timer: receives the seconds of `vgg_forward`, `vgg_backward`, `statistics` and `communication`.
+        collectives: of the ranks that evaluate each view together; all call the same methods with the same arguments.
+
+    Attributes:
+        speeds: of these ranks, in any unit: work is shared out in proportion.
+    """
+
+    def __init__(
+        self,
+        network: FeatureNetwork,
+        *,
+        content_weight: float = 1.0,
+        memory: int = DEFAULT_MEMORY,
+        tile_size: int | None = None,
+        coarsest: int = COARSEST_SHORTER_SIDE,
+        leave_out: bool = True,
+        keep_activations: bool = True,
+        timer: Timer | None = None,
+        collectives: Collectives = ALONE,
+    ) -> None:
+        self.network = network
+        self.content_weight = content_weight
+        self.memory = memory
+        self.tile_size = tile_size
+        self.coarsest = coarsest
+        self.leave_out = leave_out
+        self.keep_activations = keep_activations
+        self.timer = timer or Timer()
+        self.collectives = collectives
+        self.speeds = (1.0,) * collectives.size
+        self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
+
+    def scale_count(self, height: int, width: int) -> int:
+        """n_s of views of a size."""
+        return scale_count(height, width, self.coarsest)
+
+    def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
+        """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
+        return self._partition(self._piece(0, (height, width), coverage), coverage)
+
+    def share(self, sizes: Mapping[int, Size], coverage: Sequence[Tensor] | None = None) -> Share:
+        """Share out the work on some scales of a view.
+
+        Args:
+            sizes: (height, width) of each scale.
+            coverage: from `position_weights`.
+        """
+        weights = {scale: coverage[scale] if coverage else None for scale in sizes}
+        pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
+        shares = divide(pieces, self.network.halo, self.speeds)
+        own = shares[self.collectives.rank]
+        return Share(
+            {scale: tuple(tuple(part for part in each if part.scale == scale) for each in shares) for scale in sizes},
+            {
+                scale: [tile for part in own if part.scale == scale for tile in self._partition(part, weights[scale])]
+                for scale in sizes
+            },
+        )
+
+    def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
+        """All of a scale that has to go through the network."""
+        if coverage is None or not self.leave_out:
+            return Piece(scale, size, Rectangle(0, 0, *size))
+        return Piece(scale, size, covered_region(coverage))
+
+    def kept(self, areas: Sequence[int]) -> list[bool]:
+        """Which of the tiles with so many pixels keep their activations, if they are in memory at the same time."""
+        if not self.keep_activations:
+            return [False] * len(areas)
+        return kept_tiles(areas, self.held, self.working)
+
+    @property
+    def held(self) -> float:
+        """Pixels whose activations the memory holds."""
+        return self.memory / self.network.held_bytes_per_pixel()
+
+    @property
+    def working(self) -> float:
+        """Memory that a tile needs in a pass beside its activations, as a share of them."""
+        return self.network.working_bytes_per_pixel() / self.network.held_bytes_per_pixel()
+
+    def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
+        """The partition tiles of a piece, as large as the memory allows."""
+        halo = self.network.halo
+        tile_size = self.tile_size
+        if tile_size is None:
+            tile_size = choose_tile_size(*piece.size, halo, held=self.held, working=self.working, region=piece.region)
+        tiles = partition(*piece.size, tile_size, halo, piece.region)
+        if coverage is None or not self.leave_out:
+            return tiles
+        return [tile for tile in tiles if coverage[tile.inner.slices].any()]
+
+    def style_targets(self, style: Tensor, view_size: Size) -> dict[int, dict[str, LayerTarget]]:
+        """Targets of every scale of views of view_size (height, width) from a style image [H, W, 3] in 0..1.
+
+        A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
+        """
+        image = resize_area(style, style_size((style.shape[0], style.shape[1]), view_size)).to(self.network.device)
+        scaled = {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
+        share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
+        targets: dict[int, dict[str, LayerTarget]] = {}
+        for scales in rounds(list(scaled), self.collectives.size):
+            passes = [_ScalePass(self, scaled[s], s, share.tiles[s], ViewTarget(), None) for s in scales]
+            for pass_, merged in zip(passes, self._first_passes(passes, keep=False)[0], strict=True):
+                parts = zip(self.style_layers, self._wait(merged)[0], strict=True)
+                targets[pass_.scale] = {layer: LayerTarget.of(part) for layer, part in parts if not part.empty}
+        return targets
+
+    def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
+        """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""
+        weights = None if coverage is None else self.position_weights(coverage)
+        share = self.share(self._sizes(_size(content)), weights)
+        target = ViewTarget(content_image=content, coverage=weights, share=share)
+        if self.content_weight and keep_content:
+            target.content = {
+                scale: self.content_features(content, scale, tiles) for scale, tiles in share.tiles.items()
+            }
+            target.content_image = None
+        return target
+
+    def _sizes(self, size: Size, scales: Sequence[int] | None = None) -> dict[int, Size]:
+        """(height, width) of scales of a view; None for all."""
+        scales = range(self.scale_count(*size)) if scales is None else scales
+        return {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
+
+    def position_weights(self, coverage: Tensor) -> list[Tensor]:
+        """Coverage [H, W] in 0..1 at every power of two that a layer of a scale needs."""
+        levels = self.scale_count(coverage.shape[0], coverage.shape[1]) + layer_stride("relu5_1").bit_length()
+        return coverage_pyramid(coverage.to(self.network.device, _gradient_dtype(self.network)), levels)
+
+    def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        """Features of the content layer on the cells that some tiles own, of a content image [H, W, 3] at a scale."""
+        image = downscale(content.to(self.network.device), scale)
+        result = {}
+        for tile in tiles:
+            own = tile.owned_cells(CONTENT_LAYER, _size(image))[1]
+            # A copy: a slice would keep the features of the halo in memory too.
+            result[tile] = self._forward(image, tile, keep=False).features[CONTENT_LAYER][own.slices].clone()
+        return result
+
+    def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
+        """What `content_features` of a scale takes on the rank that holds most, from every rank's pieces of it."""
+        value = torch.finfo(self.network.dtype).bits // 8 * self.network.channels(CONTENT_LAYER)
+        cells = [sum(part.cells(CONTENT_LAYER) for part in own) for own in pieces]
+        return max(cells) * value
+
+    def evaluate(
+        self,
+        image: Tensor,
+        style: Mapping[int, ScaleTarget],
+        view: ViewTarget,
+        scales: Sequence[int] | None = None,
+        *,
+        gradient: bool = True,
+    ) -> SosResult:
+        """Loss of an image [H, W, 3] (0..1, not clamped), and dE/dimage.
+
+        Args:
+            style: targets by scale, from `style_targets`.
+            view: from `view_target`.
+            scales: which scales; None for all (SOS). Phase 1 passes the coarsest alone.
+            gradient: False evaluates the loss only.
+        """
+        sizes = self._sizes(_size(image), scales)
+        share = self._share_of(view, sizes)
+        total = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=self.network.device)
+        terms: dict[int, LossTerms] = {}
+        for some in rounds(list(sizes), self.collectives.size):
+            scaled = {scale: downscale(image.to(self.network.device), scale) for scale in some}
+            for pass_, pixel_gradient in self._round(scaled, style, view, share, gradient):
+                terms[pass_.scale] = pass_.terms
+                if pixel_gradient is not None:
+                    add_upscaled_(total, pixel_gradient, pass_.scale, 1.0 / len(sizes))
+        return SosResult(terms, total if gradient else None)
+
+    def evaluate_scale(self, image: Tensor, style: ScaleTarget, view: ViewTarget, scale: int) -> SosResult:
+        """Loss of one scale from the image at that scale, [H >> scale, W >> scale, 3], and dE/dimage of that size."""
+        share = self._share_of(view, {scale: _size(image)})
+        scaled = {scale: image.to(self.network.device)}
+        ((pass_, pixel_gradient),) = self._round(scaled, {scale: style}, view, share, True)
+        return SosResult({scale: pass_.terms}, pixel_gradient)
+
+    def _share_of(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Share:
+        if view.share is not None and view.share.tiles.keys() == sizes.keys():
+            return view.share
+        return self.share(sizes, view.coverage)
+
+    def _round(
+        self,
+        scaled: Mapping[int, Tensor],
+        style: Mapping[int, ScaleTarget],
+        view: ViewTarget,
+        share: Share,
+        gradient: bool,
+    ) -> Iterator[tuple[_ScalePass, Tensor | None]]:
+        """Loss (in the pass) and pixel gradient [h, w, 3] of some scales, whose statistics travel together."""
+        passes = [
+            _ScalePass(self, image, scale, share.tiles[scale], view, self._content(view, scale, share.tiles[scale]))
+            for scale, image in scaled.items()
+        ]
+        merged, kept = self._first_passes(passes, keep=gradient)
+        for pass_, waiting in zip(passes, merged, strict=True):
+            statistics, content = self._wait(waiting)
+            with self.timer("statistics"):
+                self._compare(pass_, dict(zip(self.style_layers, statistics, strict=True)), content, style[pass_.scale])
+        yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
+
+    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], float]:
+        with self.timer("communication"):
+            return merged()
+
+    def _compare(
+        self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], content: float, style: ScaleTarget
+    ) -> None:
+        """Loss of one scale and its gradient maps, from the statistics of the whole scale."""
+        pass_.terms = LossTerms(content=content)
+        for layer, part in statistics.items():
+            if layer in style and not part.empty:
+                eps = torch.finfo(self.network.dtype).eps
+                layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=eps)
+                pass_.terms += layer_terms
+
+    def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:
+        """Pixel gradient [h, w, 3] of each scale: first of what was kept, which makes room for what was not."""
+        dtype = _gradient_dtype(self.network)
+        results = [torch.zeros(pass_.image.shape, dtype=dtype, device=pass_.image.device) for pass_ in passes]
+        again = [[tile for tile in pass_.tiles if tile not in own] for pass_, own in zip(passes, kept, strict=True)]
+        for pass_, result, own in zip(passes, results, kept, strict=True):
+            while own:
+                tile = next(iter(own))
+                self._backward_tile(pass_, tile, own.pop(tile), result)
+        for pass_, result, tiles in zip(passes, results, again, strict=True):
+            for tile in tiles:
+                self._backward_tile(pass_, tile, self._forward(pass_.image, tile), result)
+        return results
+
+    def _backward_tile(self, pass_: _ScalePass, tile: PartitionTile, activations: Activations, result: Tensor) -> None:
+        with self.timer("vgg_backward"):
+            result[tile.outer.slices] += self.network.backward(activations, pass_.feature_gradient(tile))
+
+    def _content(self, view: ViewTarget, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures | None:
+        if not self.content_weight:
+            return None
+        if scale in view.content:
+            return view.content[scale]
+        if view.content_image is None:
+            raise ValueError("the view was prepared without content, but content_weight is not 0")
+        return self.content_features(view.content_image, scale, tiles)
+
+    def _first_passes(
+        self, passes: Sequence[_ScalePass], *, keep: bool
+    ) -> tuple[list[Merged], list[dict[PartitionTile, Activations]]]:
+        """For each scale, the merge of its statistics and content loss under way, and the activations that fit."""
+        merged: list[Merged] = []
+        kept: list[dict[PartitionTile, Activations]] = []
+        fits = iter(self.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
+        for pass_ in passes:
+            statistics = [
+                LayerStatistics.zero(self.network.channels(layer), pass_.image.device) for layer in self.style_layers
+            ]
+            content = 0.0
+            kept.append({})
+            for tile in pass_.tiles:
+                keep_this = next(fits) and keep
+                activations = self._forward(pass_.image, tile, keep=keep_this)
+                with self.timer("statistics"):
+                    for place, layer in enumerate(self.style_layers):
+                        part = pass_.statistics(layer, tile, activations.features[layer])
+                        statistics[place] = merge(statistics[place], part)
+                    content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
+                if keep_this:
+                    kept[-1][tile] = activations
+            merged.append(self.collectives.merge_statistics(statistics, content))
+        return merged, kept
+
+    def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
+        with self.timer("vgg_forward"):
+            return self.network.forward(image[tile.outer.slices], keep=keep)
+
+
+class _ScalePass:
+    """What the tiles of one scale share: pixels, position weights, content; loss and gradient maps once known."""
+
+    def __init__(
+        self,
+        loss: SosLoss,
+        image: Tensor,
+        scale: int,
+        tiles: list[PartitionTile],
+        view: ViewTarget,
+        content: ContentFeatures | None,
+    ) -> None:
+        self.image = image
+        self.scale = scale
+        self.tiles = tiles
+        self.size = _size(image)
+        self.maps: dict[str, StyleGradient] = {}
+        self.terms = LossTerms()
+        self._coverage = view.coverage
+        self._content_weight = loss.content_weight
+        self._timer = loss.timer
+        self._content = content
+        self._content_count = 0.0
+        if content is not None:
+            stride = layer_stride(CONTENT_LAYER)
+            cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
+            weights = self.weights(CONTENT_LAYER, cells)
+            self._content_count = cells.pixels if weights is None else float(weights.sum(dtype=torch.float64))
+
+    def weights(self, layer: str, cells: Rectangle) -> Tensor | None:
+        """Weights [h, w] of some cells of a layer: the coverage, box-averaged to the cells; None for equal weights."""
+        if self._coverage is None:
+            return None
+        return self._coverage[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
+
+    def statistics(self, layer: str, tile: PartitionTile, features: Tensor) -> LayerStatistics:
+        """Of the cells that a tile owns; features are those of all its cells."""
+        view, own = tile.owned_cells(layer, self.size)
+        return layer_statistics(features[own.slices], self.weights(layer, view))
+
+    def content_loss(self, tile: PartitionTile, features: Tensor | None) -> tuple[float, Tensor | None]:
+        """The tile's share of the content loss and its gradient on owned cells; features are those of all its cells."""
+        if self._content is None or features is None or not self._content_count > 0:
+            return 0.0, None
+        view, own = tile.owned_cells(CONTENT_LAYER, self.size)
+        return content_loss(
+            features[own.slices],
+            self._content[tile],
+            self._content_count,
+            self._content_weight,
+            self.weights(CONTENT_LAYER, view),
+        )
+
+    def feature_gradient(self, tile: PartitionTile) -> FeatureGradient:
+        """Adds dE/dfeatures of one tile, which is zero on cells that it does not own."""
+
+        def add(layer: str, features: Tensor, gradient: Tensor) -> None:
+            view, own = tile.owned_cells(layer, self.size)
+            with self._timer("statistics"):
+                if layer in self.maps:
+                    self.maps[layer].add_to(gradient[own.slices], features[own.slices], self.weights(layer, view))
+                elif layer == CONTENT_LAYER and (owned := self.content_loss(tile, features)[1]) is not None:
+                    gradient[own.slices] += owned
+
+        return add
+
+
+def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Image [H, W, 3] brought down to size (height, width) with an antialiasing filter."""
+    if (image.shape[0], image.shape[1]) == size:
+        return image
+    planes = image.permute(2, 0, 1).unsqueeze(0)
+    resized = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True, align_corners=False)
+    return resized[0].permute(1, 2, 0).contiguous()
+
+
+def _size(image: Tensor) -> Size:
+    return image.shape[0], image.shape[1]
+
+
+def _gradient_dtype(network: FeatureNetwork) -> torch.dtype:
+    return torch.promote_types(network.dtype, torch.float32)

@@ -1,0 +1,95 @@
+"""The SOS loss as the paper writes it: float64, untiled, gradient by autograd. The twin of `sos.SosLoss`, for tests."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
+from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
+from sgsst_core.scene.pyramid import scale_count
+
+
+def features_reference(weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
+    """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
+    x = rgb.double() * weights.input_scale.double() + weights.input_shift.double()
+    x = x.permute(2, 0, 1).unsqueeze(0)
+    features: dict[str, Tensor] = {}
+    block = 1
+    for name, (weight, bias) in weights.convolutions.items():
+        if int(name[4]) > block:
+            block += 1
+            x = F.max_pool2d(x, 2)
+        x = F.conv2d(x, weight.double(), bias.double(), padding=1).relu()
+        features["relu" + name[4:]] = x[0].permute(1, 2, 0)
+        if name == "conv5_1":
+            break
+    return features
+
+
+def box_average_reference(image: Tensor, side: int) -> Tensor:
+    """Box average of [H, W, c] over side x side blocks."""
+    return F.avg_pool2d(image.permute(2, 0, 1).unsqueeze(0), side)[0].permute(1, 2, 0)
+
+
+def _moments(features: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    flat = features.reshape(-1, features.shape[-1])
+    a = torch.ones(flat.shape[0], dtype=torch.float64) if weights is None else weights.reshape(-1).double()
+    mean = (a[:, None] * flat).sum(0) / a.sum()
+    gram = (a[:, None] * flat).T @ flat / a.sum()
+    variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
+    # The root of an exact zero (a dead channel) has no derivative; it takes no part, as in the closed form.
+    std = torch.where(variance > 0, variance, 1.0).sqrt() * (variance > 0)
+    return gram, mean, std
+
+
+def sos_reference(
+    weights: BackboneWeights,
+    image: Tensor,
+    style: Tensor,
+    content: Tensor | None = None,
+    *,
+    content_weight: float = 1.0,
+    coverage: Tensor | None = None,
+    coarsest: int = COARSEST_SHORTER_SIDE,
+) -> tuple[float, Tensor]:
+    """E and dE/dimage [H, W, 3] in float64.
+
+    Args:
+        image, content: [H, W, 3] in 0..1.
+        style: [H', W', 3], already at the size at which it is used (`pyramid.style_size`).
+        coverage: [H, W] position weights; None for equal weights.
+        coarsest: pixels of the coarsest scale's shorter side at most.
+    """
+    x = image.double().clone().requires_grad_()
+    loss = torch.zeros((), dtype=torch.float64)
+    scales = scale_count(image.shape[0], image.shape[1], coarsest)
+    for scale in range(scales):
+        side = 1 << scale
+        features = features_reference(weights, box_average_reference(x, side))
+        wanted = features_reference(weights, box_average_reference(style.double(), side))
+        for layer in STYLE_LAYERS:
+            position = _cells(coverage, side * layer_stride(layer))
+            gram, mean, std = _moments(features[layer], position)
+            gram_v, mean_v, std_v = _moments(wanted[layer], None)
+            loss = loss + GRAM_WEIGHT / mean.shape[0] ** 2 * (gram - gram_v).square().mean()
+            loss = loss + MEAN_WEIGHT * (mean - mean_v).square().mean() + STD_WEIGHT * (std - std_v).square().mean()
+        if content is not None and content_weight:
+            difference = features[CONTENT_LAYER] - _content_reference(weights, content, side)
+            position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
+            a = torch.ones(difference.shape[:2], dtype=torch.float64) if position is None else position
+            loss = loss + content_weight * (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
+    loss = loss / scales
+    (gradient,) = torch.autograd.grad(loss, x)
+    return loss.item(), gradient
+
+
+def _content_reference(weights: BackboneWeights, content: Tensor, side: int) -> Tensor:
+    return features_reference(weights, box_average_reference(content.double(), side))[CONTENT_LAYER].detach()
+
+
+def _cells(coverage: Tensor | None, side: int) -> Tensor | None:
+    return None if coverage is None else box_average_reference(coverage.double()[:, :, None], side)[:, :, 0]

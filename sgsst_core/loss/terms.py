@@ -1,0 +1,146 @@
+"""The transfer loss of one scale and its gradient with respect to the features, in closed form.
+
+E_style = sum over layers of w_G mean((G - G_v)^2) + w_m mean((mu - mu_v)^2) + w_s mean((sigma - sigma_v)^2)
+E_content = lambda_c mean((F_42 - F_42^content)^2)
+
+with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025); means over the entries of each matrix or vector.
+With position weights a_p, n becomes their sum and the content mean is weighted in the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sgsst_core.features.statistics import CHUNK_VALUES, LayerStatistics
+
+#: w_G = GRAM_WEIGHT / c^2: the numerator.
+GRAM_WEIGHT = 1e3
+#: w_m.
+MEAN_WEIGHT = 1e4
+#: w_s.
+STD_WEIGHT = 1e4
+
+
+@dataclass(frozen=True)
+class LayerTarget:
+    """What a layer is drawn to, float64: the style's Gram matrix [c, c], mean [c], standard deviation [c]."""
+
+    gram: Tensor
+    mean: Tensor
+    std: Tensor
+
+    @staticmethod
+    def of(statistics: LayerStatistics) -> LayerTarget:
+        """The target that the statistics of a style image make."""
+        return LayerTarget(statistics.gram(), statistics.mean, statistics.std())
+
+
+@dataclass(frozen=True)
+class LossTerms:
+    """One scale's loss, split; `total` is what is minimised."""
+
+    gram: float = 0.0
+    mean: float = 0.0
+    std: float = 0.0
+    content: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """E_style + E_content."""
+        return self.gram + self.mean + self.std + self.content
+
+    def divided(self, count: int) -> LossTerms:
+        """Each part divided by a count: the mean of a sum."""
+        return LossTerms(self.gram / count, self.mean / count, self.std / count, self.content / count)
+
+    def __add__(self, other: LossTerms) -> LossTerms:
+        return LossTerms(
+            self.gram + other.gram, self.mean + other.mean, self.std + other.std, self.content + other.content
+        )
+
+
+@dataclass(frozen=True)
+class StyleGradient:
+    """dE/dF of one layer as an affine map of centred features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
+
+    The map acts on centred features because at mean-to-sigma ratios of 1e4 the product matrix F and a separate
+    offset would cancel each other down to their last digits in float32.
+    """
+
+    matrix: Tensor  # [c, c] float64
+    mean: Tensor  # [c] float64
+    offset: Tensor  # [c] float64
+
+    def apply(self, features: Tensor, weights: Tensor | None = None) -> Tensor:
+        """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
+        result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
+        self.add_to(result, features, weights)
+        return result
+
+    def add_to(self, gradient: Tensor, features: Tensor, weights: Tensor | None = None) -> None:
+        """Add `apply` to a gradient [h, w, c] in place, chunk by chunk: nothing as large as the features is made."""
+        precision = torch.promote_types(features.dtype, torch.float32)
+        matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
+        height, width, channels = features.shape
+        rows = max(1, CHUNK_VALUES // max(width * channels, 1))
+        for top in range(0, height, rows):
+            centred = features[top : top + rows].to(precision) - mean
+            part = torch.addmm(offset, centred.reshape(-1, channels), matrix).view(centred.shape)
+            if weights is not None:
+                part = part.mul_(weights[top : top + rows, :, None].to(precision))
+            gradient[top : top + rows] += part
+
+
+def style_loss(
+    statistics: LayerStatistics, target: LayerTarget, *, feature_eps: float = 2.0**-23
+) -> tuple[LossTerms, StyleGradient]:
+    """One layer's style loss and its gradient with respect to the features.
+
+    Args:
+        statistics: of the view's features, not empty.
+        target: of the style.
+        feature_eps: relative rounding of the features (2^-23 for float32, 2^-52 for float64).
+
+    Where sigma is zero, or no more than the rounding of the mean, a channel is constant: its factor (F - mu)/sigma
+    is taken as 0. The loss keeps the term, the gradient stays finite.
+    """
+    channels = statistics.mean.shape[0]
+    gram_error = statistics.gram() - target.gram
+    mean_error = statistics.mean - target.mean
+    std = statistics.std()
+    std_error = std - target.std
+    gram_weight = GRAM_WEIGHT / channels**2
+    terms = LossTerms(
+        gram=gram_weight * float(gram_error.square().mean()),
+        mean=MEAN_WEIGHT * float(mean_error.square().mean()),
+        std=STD_WEIGHT * float(std_error.square().mean()),
+    )
+    matrix = (4 * gram_weight / channels**2) * gram_error
+    offset = matrix @ statistics.mean + (2 * MEAN_WEIGHT / channels) * mean_error
+    alive = std > feature_eps * statistics.mean.abs()
+    slope = torch.where(alive, std_error / torch.where(alive, std, 1.0), 0.0)
+    matrix = matrix + torch.diag((2 * STD_WEIGHT / channels) * slope)
+    return terms, StyleGradient(matrix / statistics.count, statistics.mean, offset / statistics.count)
+
+
+def content_loss(
+    features: Tensor, content: Tensor, count: float, weight: float, position_weights: Tensor | None = None
+) -> tuple[float, Tensor]:
+    """Content loss of some positions and its gradient [h, w, c].
+
+    Args:
+        features, content: [h, w, c] at the same positions.
+        count: positions (or sum of position weights) of the whole view: the loss is a mean over the view.
+        weight: lambda_c.
+        position_weights: [h, w].
+    """
+    precision = torch.promote_types(features.dtype, torch.float32)
+    difference = features.to(precision) - content.to(precision)
+    weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
+    factor = weight / (count * features.shape[-1])
+    # A dot product in float32 over a whole view would lose digits: rows first, then float64.
+    loss = factor * float((weighted * difference).sum(dim=(1, 2)).sum(dtype=torch.float64))
+    return loss, weighted * (2 * factor)

@@ -1,0 +1,1 @@
+"""What ranks tell each other, and who of them does what."""

@@ -1,0 +1,122 @@
+"""What the ranks of a job tell each other, as one small interface; `ALONE` is a job of one rank, with nobody to tell.
+
+Every rank calls the same methods in the same order; that is what makes them meet. Results that are "the same on every
+rank" are the same bits, so that whatever follows from them is decided alike everywhere without another message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
+
+from torch import Tensor
+
+from sgsst_core.features.statistics import LayerStatistics
+from sgsst_core.rasterizer.arguments import Rows
+
+T = TypeVar("T")
+
+#: Waits for statistics under way: those of all ranks together, and the sum of the numbers that went with them.
+Merged = Callable[[], tuple[list[LayerStatistics], float]]
+
+
+class Collectives(Protocol):
+    """One rank's end of the exchanges of a group of ranks.
+
+    Attributes:
+        rank: this one's number in the group.
+        size: how many there are.
+        local_size: how many of them share this machine's memory, this one included.
+    """
+
+    rank: int
+    size: int
+    local_size: int
+
+    def gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+        """The image [H, ...] of every rank's band of rows [h, ...]; `bands` says which rows each has, in order."""
+        ...
+
+    def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+        """This rank's band [h, ...] of the sum over all ranks' images [H, ...]: the adjoint of `gather_rows`."""
+        ...
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        """The sum over all ranks, the same on every rank. The argument may be overwritten."""
+        ...
+
+    def merge_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+        """Start merging the statistics of disjoint positions, layer by layer, and adding up a number.
+
+        Returns at once; what it returns waits for the result, the same on every rank. No other exchange may be started
+        before all results have been waited for, but for further ones of this kind.
+        """
+        ...
+
+    def gather(self, value: T) -> list[T]:
+        """Every rank's value, by rank: the same on every rank. Values must be picklable and small."""
+        ...
+
+    def from_first(self, make: Callable[[], T]) -> T:
+        """What `make` returns on rank 0, the only one that calls it; an `SgsstError` of it is raised on every rank."""
+        ...
+
+    def expect(self, seconds: float) -> None:
+        """From now on ranks meet about so often: one that keeps the others waiting for much longer is given up.
+
+        Until this is called, they wait for as long as it may take to prepare a job.
+        """
+        ...
+
+    def first(self, count: int) -> Collectives | None:
+        """The group of the first `count` ranks; None on the others."""
+        ...
+
+    def split(self, groups: int) -> Collectives:
+        """The group of this rank when neighbouring ranks form so many groups of equal size."""
+        ...
+
+
+class RankLeftOut(Exception):  # noqa: N818 (not an error: the job goes on without this rank)
+    """Raised on ranks that the plan leaves out, because they would only add communication."""
+
+
+class _Alone:
+    """The collectives of one rank."""
+
+    rank, size, local_size = 0, 1, 1
+
+    def gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+        return band
+
+    def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+        return image
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        return tensor
+
+    def merge_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+        return lambda: (list(parts), number)
+
+    def gather(self, value: T) -> list[T]:
+        return [value]
+
+    def from_first(self, make: Callable[[], T]) -> T:
+        return make()
+
+    def expect(self, seconds: float) -> None:
+        return None
+
+    def first(self, count: int) -> Collectives | None:
+        return self
+
+    def split(self, groups: int) -> Collectives:
+        return self
+
+
+ALONE: Collectives = _Alone()
+
+
+def same_on_all(collectives: Collectives, value: Any) -> bool:
+    """Whether every rank has an equal value; the same answer on every rank."""
+    return all(other == value for other in collectives.gather(value))

@@ -1,0 +1,82 @@
+"""A look at every view before the work: what each Gaussian contributes, and what of each view is covered.
+
+One forward and one backward pass of the rasterizer a view, with all colours 1; no feature network. Of several ranks,
+each looks at some of the views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import CameraError
+from sgsst_core.features.partition import Rectangle, covered_region
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+
+#: Below this coverage nothing can be seen of a pixel's colour in 8 bits.
+SEEN_COVERAGE = 1 / 255
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the views show.
+
+    Attributes:
+        total_weights: [N] float64, sum of each Gaussian's blend weights over all pixels of all views.
+        covered: indices of the views that see anything.
+        regions: for each view, the rectangle that holds every covered pixel.
+        uncovered_share: share of uncovered pixels in the views that see anything.
+    """
+
+    total_weights: Tensor
+    covered: list[int]
+    regions: list[Rectangle]
+    uncovered_share: float
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What one view shows."""
+
+    region: Rectangle
+    uncovered: float  # pixels
+    pixels: int
+    covered: bool
+
+
+def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, collectives: Collectives = ALONE) -> Survey:
+    """Look at every view once; every rank gets the same survey.
+
+    Raises:
+        CameraError: no camera sees a Gaussian.
+    """
+    weights = torch.zeros(len(scene), dtype=torch.float64)
+    own: dict[int, _Look] = {}
+    for index in range(collectives.rank, len(cameras), collectives.size):
+        camera = cameras[index]
+        coverage = rasterizer.coverage(camera)
+        seen = float(coverage.amax()) > SEEN_COVERAGE
+        uncovered = float((1 - coverage).sum(dtype=torch.float64))
+        own[index] = _Look(covered_region(coverage), uncovered, coverage.numel(), seen)
+        if seen:
+            ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
+            weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
+    looks: dict[int, _Look] = {}
+    for part in collectives.gather(own):
+        looks |= part
+    covered = [index for index in range(len(cameras)) if looks[index].covered]
+    if not covered:
+        raise CameraError(
+            f"None of the {len(cameras)} cameras sees a Gaussian. Check that cameras and scene belong "
+            "together (same training run, same world), or let --orbit make cameras."
+        )
+    weights = collectives.sum(weights.to(rasterizer.device)).cpu()
+    uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
+    regions = [looks[index].region for index in range(len(cameras))]
+    return Survey(weights, covered, regions, uncovered_share)

@@ -1,0 +1,139 @@
+"""The exact twin of a job: the same loss without its approximations, to measure them against.
+
+Features in float32, every Gaussian that a view shows, blend weights computed anew. (float32 itself is within 1e-6 of
+the float64 reference: tests/sgsst_core/test_sos.py.)
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.terms import LayerTarget
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, evaluate
+from sgsst_core.stylizing.views import Views
+
+
+def approximations(stylizer: Stylizer) -> list[str]:
+    """What makes a job's gradient differ from the exact one by more than rounding; empty where nothing does."""
+    found = []
+    if stylizer.network.dtype != torch.float32:
+        found.append("bfloat16 features")
+    if bool((stylizer.plan.survey.total_weights[~stylizer.plan.seen] > 0).any()):
+        found.append("pruned Gaussians")
+    if stylizer.plan.kept_weights == "half" and stylizer.views.rasterizer.name == "cached":
+        found.append("half-precision blend weights")
+    return found
+
+
+@dataclass(frozen=True)
+class GradientError:
+    """A colour gradient against the exact one.
+
+    Attributes:
+        step: after which it was measured.
+        view: name of the camera.
+        relative_error: |g - exact| / |exact|, Euclidean, over the optimised Gaussians.
+        cosine: of the angle between the two.
+        seconds: of the gradient as the job computes it.
+        seconds_exact: of the exact one.
+    """
+
+    step: int
+    view: str
+    relative_error: float
+    cosine: float
+    seconds: float
+    seconds_exact: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+class ExactTwin:
+    """Evaluates loss and gradient of a job's colours exactly.
+
+    Args:
+        stylizer: the job; it is not changed.
+        memory: bytes that view targets may take.
+    """
+
+    def __init__(self, stylizer: Stylizer, memory: int = 1 << 30) -> None:
+        self._stylizer = stylizer
+        settings = stylizer.settings
+        network = FeatureNetwork(stylizer.weights, stylizer.network.layers, torch.float32, stylizer.network.device)
+        self.loss = SosLoss(
+            network,
+            content_weight=settings.content_weight,
+            memory=stylizer.loss.memory,
+            coarsest=settings.coarsest_side,
+        )
+        self.shown = stylizer.plan.survey.total_weights > 0
+        scene = stylizer.scene.subset(self.shown).without_zero_bands()
+        name = "cuda" if stylizer.views.rasterizer.name == "cuda" else "cpu"
+        self.views = Views(
+            scene,
+            stylizer.views.cameras,
+            make_rasterizer(name, scene, background=settings.background, near=settings.near),
+            self.loss,
+            covered=stylizer.plan.survey.covered,
+            weighted=stylizer.plan.weighted,
+            photos=stylizer.photos,
+            memory=memory,
+            revive=settings.revive,
+        )
+        self._style_targets: dict[tuple[int, int], dict[int, dict[str, LayerTarget]]] = {}
+
+    def style_targets(self, camera: Camera) -> dict[int, dict[str, LayerTarget]]:
+        """The style's statistics for views of the camera's size."""
+        size = (camera.height, camera.width)
+        if size not in self._style_targets:
+            style = self._stylizer.style.to(self.loss.network.device)
+            self._style_targets[size] = self.loss.style_targets(style, size)
+        return self._style_targets[size]
+
+    def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
+        """Mean SOS loss over views of colours [N, 3] of the whole scene, split by scale."""
+        return evaluate(self.views, self.style_targets, indices, sh_dc[self.shown].to(self.views.rasterizer.device))
+
+    def gradient(self, index: int, sh_dc: Tensor, scales: list[int]) -> tuple[Tensor, float]:
+        """dE/dsh_dc [N, 3] of colours [N, 3] of the whole scene, and the seconds it took with its targets at hand."""
+        target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
+        gradient = torch.zeros_like(sh_dc)
+        values = sh_dc[self.shown].to(self.views.rasterizer.device)
+        started = time.perf_counter()
+        colours = self.views.colours(index, values)
+        image = self.views.render(index, colours)
+        pixels = self.loss.evaluate(image, style, target, scales).image_gradient
+        assert pixels is not None
+        gradient[self.shown] = self.views.gradient(index, pixels.to(image.device), colours).cpu()
+        return gradient, time.perf_counter() - started
+
+    def gradient_error(self) -> GradientError:
+        """Compare the job's gradient of its latest view with the exact one, at the job's present colours."""
+        stylizer = self._stylizer
+        index = stylizer.history[-1].view if stylizer.history else stylizer.views.covered[0]
+        scales = stylizer.phase.scales(stylizer.scale_count(index))
+        approximate, seconds = stylizer.gradient(index, scales)
+        exact, seconds_exact = self.gradient(index, stylizer.stylized(), scales)
+        seen = stylizer.plan.seen
+        error, wanted = (approximate - exact[seen]).double().norm(), exact[seen].double().norm()
+        product = float((approximate.double() * exact[seen].double()).sum())
+        lengths = float(approximate.double().norm() * wanted)
+        return GradientError(
+            stylizer.step,
+            stylizer.views.cameras[index].name,
+            float(error / wanted) if wanted > 0 else float(error > 0),
+            product / lengths if lengths > 0 else float(not error > 0),
+            seconds,
+            seconds_exact,
+        )

@@ -1,0 +1,363 @@
+"""What is extreme in a scene, its views and its style, before a long job: counts, the worst one, and what is done.
+
+Nothing here is an error. What cannot be used at all is refused where it is read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
+from sgsst_core.errors import TooManyIntersectionsError
+from sgsst_core.features.vgg import ALIGNMENT
+from sgsst_core.files.ply import SceneFile
+from sgsst_core.planning.survey import SEEN_COVERAGE
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import style_size
+
+#: Trained quaternions are of any length around 1; far beyond, training or export went wrong.
+QUATERNION_LENGTHS = (1e-3, 1e3)
+#: Relative to the scene's extent: larger than all of it, and too small for any view to resolve.
+LARGE_SCALE, SMALL_SCALE = 1.0, 1e-7
+#: Longest to middle axis. Flat discs are usual, needles are not.
+NEEDLE = 1e3
+#: exp(177)^4 overflows float64, and with it the determinant of the projected covariance.
+OVERFLOW_SCALE = 177.0
+#: Coefficients of trained scenes stay within a few units; 20 is a colour of 6.
+LARGE_COEFFICIENT = 20.0
+#: Scene extents from the world's origin at which float32 positions step by a thousandth of the extent.
+FAR_WORLD = 1e4
+#: Total blend weight below which a Gaussian changes no view by a grey level.
+HARDLY_SEEN = 1.0 / 255.0
+#: Degrees; beyond, the perspective bends so much within one Gaussian that its linearisation is coarse.
+WIDE, NARROW = 140.0, 1.0
+#: Share of a view without Gaussians that is worth telling.
+UNCOVERED = 0.01
+#: A style image longer than this many times its width.
+LONG_STYLE = 4.0
+#: Standard deviation of a style image's values below which it has no texture: one grey level.
+FLAT_STYLE = 1.0 / 255.0
+#: Points that the extent of the scene is taken from.
+_SAMPLE = 50_000
+
+Subject = Literal["scene", "views", "style"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is extreme.
+
+    Attributes:
+        subject: of what.
+        what: is extreme about it.
+        count, total: how many, of how many.
+        worst: which one most, and its value; empty where there is nothing to name.
+        done: what becomes of it.
+    """
+
+    subject: Subject
+    what: str
+    count: int
+    total: int
+    worst: str
+    done: str
+
+
+def check_scene(file: SceneFile) -> list[Finding]:
+    """What is extreme in a scene that was read with `drop_invalid`; indices are rows of the file."""
+    checked = _Scene(file)
+    return [
+        *checked.invalid(),
+        *checked.rotations(),
+        *checked.sizes(),
+        *checked.opacities(),
+        *checked.harmonics(),
+        *checked.place(),
+    ]
+
+
+class _Scene:
+    """A scene's columns with what several checks need: the extent, and the file's row of each Gaussian."""
+
+    def __init__(self, file: SceneFile) -> None:
+        self.file, self.scene = file, file.scene
+        self.centre, self.extent = scene_extent(file.scene)
+        self.rows = np.arange(len(file.scene)) if file.kept is None else np.flatnonzero(file.kept)
+
+    def finding(
+        self,
+        what: str,
+        extreme: Tensor,
+        value: Tensor,
+        done: str,
+        *,
+        largest: bool = True,
+        subject: Subject = "scene",
+    ) -> list[Finding]:
+        """A finding for the Gaussians that are `extreme` [N] bool; the worst has the largest (smallest) `value` [N]."""
+        count = int(extreme.sum())
+        if not count:
+            return []
+        order = value.double() if largest else -value.double()
+        index = int(torch.where(extreme, order, -math.inf).argmax())
+        worst = f"Gaussian {self.rows[index]}: {float(value[index]):.3g}"
+        return [Finding(subject, what, count, len(self.scene), worst, done)]
+
+    def invalid(self) -> list[Finding]:
+        kept = self.file.kept
+        if kept is None:
+            return []
+        first = int(np.flatnonzero(~kept)[0])
+        done = "stylize refuses the scene; with --drop-invalid they are left out, of the stylized scene too"
+        return [
+            Finding("scene", "NaN or infinite values", self.file.dropped, len(kept), f"first: Gaussian {first}", done)
+        ]
+
+    def rotations(self) -> list[Finding]:
+        length = self.scene.quats.double().norm(dim=1)
+        low, high = QUATERNION_LENGTHS
+        normalised = "normalised in float64, as all are"
+        return [
+            *self.finding("quaternion of length 0", length == 0, length, "never drawn: it is no rotation"),
+            *self.finding(
+                f"quaternion shorter than {low:g}", (length > 0) & (length < low), length, normalised, largest=False
+            ),
+            *self.finding(f"quaternion longer than {high:g}", length > high, length, normalised),
+        ]
+
+    def sizes(self) -> list[Finding]:
+        logarithms = self.scene.scales.double().sort(dim=1).values
+        longest, middle = logarithms[:, 2], logarithms[:, 1]
+        beyond = longest > OVERFLOW_SCALE
+        relative = (longest - math.log(self.extent)).clamp(-700, 700).exp()
+        slender = (longest - middle).clamp_max(700).exp()
+        return [
+            *self.finding("size that overflows", beyond, longest, "never drawn (value: the logarithm)"),
+            *self.finding(
+                "longer than the scene's extent (value: how many times)",
+                (relative > LARGE_SCALE) & ~beyond,
+                relative,
+                "drawn; each touches every raster tile of every view, which costs time and memory",
+            ),
+            *self.finding(
+                f"smaller than {SMALL_SCALE:g} of the scene's extent (value: share)",
+                relative < SMALL_SCALE,
+                relative,
+                "drawn as a point of one pixel's blur",
+                largest=False,
+            ),
+            *self.finding(
+                f"needles more than {NEEDLE:g} times longer than thick (value: ratio)",
+                (slender > NEEDLE) & ~beyond,
+                slender,
+                "drawn exactly: the determinant is a sum of positive terms and cannot cancel",
+            ),
+        ]
+
+    def opacities(self) -> list[Finding]:
+        opacity = self.scene.opacities.double().sigmoid()
+        return [
+            *self.finding(
+                "opacity below 1/255", opacity < ALPHA_MIN, opacity, "never drawn, not optimised", largest=False
+            ),
+            *self.finding(
+                f"opacity above {ALPHA_MAX:g}",
+                opacity > ALPHA_MAX,
+                opacity,
+                f"drawn with {ALPHA_MAX:g}, as in training",
+            ),
+        ]
+
+    def harmonics(self) -> list[Finding]:
+        found = []
+        for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
+            if values.numel():
+                size = values.abs().flatten(1).amax(1)
+                found += self.finding(
+                    f"{name} SH coefficients above {LARGE_COEFFICIENT:g}",
+                    size > LARGE_COEFFICIENT,
+                    size,
+                    "kept; gradients grow with their third power, and a job whose gradient exceeds 1e19 stops",
+                )
+        return found
+
+    def place(self) -> list[Finding]:
+        far = float(self.centre.norm()) / self.extent
+        if far < FAR_WORLD:
+            return []
+        step = float(np.spacing(np.float32(self.centre.abs().max())))
+        done = (
+            "differences are taken in float64 on the CPU, but what lies between the file's float32 positions is lost: "
+            "move the scene to the origin before training. gsplat on a GPU loses more"
+        )
+        worst = f"centre {far:.3g} extents away; positions step by {step:.3g}, {step / self.extent:.1e} of the extent"
+        return [Finding("scene", "world far from its origin", len(self.scene), len(self.scene), worst, done)]
+
+
+def scene_extent(scene: Scene) -> tuple[Tensor, float]:
+    """Median position [3] float64, and the 98 % quantile of the distances to it (1 for a scene of one point)."""
+    points = scene.means[:: max(1, len(scene) // _SAMPLE)].double()
+    centre = points.median(dim=0).values
+    extent = float(torch.quantile((points - centre).norm(dim=1), 0.98))
+    return centre, extent or 1.0
+
+
+def check_views(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float) -> list[Finding]:
+    """What is extreme in the views, and which Gaussians they do not show; each is rendered once, forwards and back."""
+    return [*_lenses(cameras), *_near(file.scene, cameras, near), *_shown(file, cameras, rasterizer)]
+
+
+def _of_views(
+    what: str, values: list[float], extreme: list[bool], cameras: Sequence[Camera], done: str
+) -> list[Finding]:
+    """A finding for the views that are extreme; the worst has the largest value."""
+    if not any(extreme):
+        return []
+    index = max((i for i, is_extreme in enumerate(extreme) if is_extreme), key=lambda i: values[i])
+    worst = f"{cameras[index].name!r}: {values[index]:.4g}"
+    return [Finding("views", what, sum(extreme), len(cameras), worst, done)]
+
+
+def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
+    angles = [
+        max(math.degrees(2 * math.atan(side / 2 / focal)) for side, focal in ((c.width, c.fx), (c.height, c.fy)))
+        for c in cameras
+    ]
+    off = [max(abs(c.cx / c.width - 0.5), abs(c.cy / c.height - 0.5)) for c in cameras]
+    small = [float(min(c.width, c.height)) for c in cameras]
+    return [
+        *_of_views(
+            f"field of view above {WIDE:g} degrees",
+            angles,
+            [angle > WIDE for angle in angles],
+            cameras,
+            "drawn; a Gaussian's perspective is linearised at its centre, but no farther outside the view than "
+            f"{FRUSTUM_MARGIN:.0%} of half its width",
+        ),
+        *_of_views(
+            f"field of view below {NARROW:g} degree",
+            angles,
+            [angle < NARROW for angle in angles],
+            cameras,
+            "drawn as any other",
+        ),
+        *_of_views(
+            "principal point outside the picture (value: widths from its middle)",
+            off,
+            [value > 0.5 for value in off],
+            cameras,
+            "drawn as any other; check that it is meant",
+        ),
+        *_of_views(
+            f"fewer than {ALIGNMENT} pixels to a side",
+            small,
+            [value < ALIGNMENT for value in small],
+            cameras,
+            "feature layers without a cell are left out of their loss",
+        ),
+    ]
+
+
+def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]:
+    """Cameras with Gaussians closer than the near plane."""
+    means = scene.means.double()
+    close = [float(((means - camera.centre).norm(dim=1) < near).sum()) for camera in cameras]
+    return _of_views(
+        f"camera inside the scene: Gaussians within {near:g} of it (value: how many)",
+        close,
+        [count > 0 for count in close],
+        cameras,
+        "nearer than the near plane they are not drawn; --near moves it",
+    )
+
+
+def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -> list[Finding]:
+    """Total blend weights, and each view's uncovered share."""
+    weights = torch.zeros(len(file.scene), dtype=torch.float64)
+    uncovered: list[float] = []
+    refused: list[str] = []
+    for camera in cameras:
+        try:
+            coverage = rasterizer.coverage(camera)
+        except TooManyIntersectionsError as error:
+            refused.append(str(error))
+            uncovered.append(0.0)
+            continue
+        seen = bool((coverage > SEEN_COVERAGE).any())
+        uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
+        ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
+        weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
+    found = (
+        [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops a job")]
+        if refused
+        else []
+    )
+    found += _of_views(
+        "see no Gaussian",
+        uncovered,
+        [share == 1 for share in uncovered],
+        cameras,
+        "left out; a job needs one that does",
+    )
+    found += _of_views(
+        f"more than {UNCOVERED:.0%} uncovered (value: share)",
+        uncovered,
+        [UNCOVERED < share < 1 for share in uncovered],
+        cameras,
+        "statistics are weighted by coverage where the views' mean is above 1 % (--position-weights auto)",
+    )
+    return found if refused else [*found, *_weights(file, weights)]
+
+
+def _weights(file: SceneFile, weights: Tensor) -> list[Finding]:
+    checked = _Scene(file)
+    hardly = (weights > 0) & (weights < HARDLY_SEEN)
+    return [
+        *checked.finding(
+            "in no view",
+            weights == 0,
+            weights,
+            "neither drawn nor optimised; at the end they take their neighbours' colour change (`paper`: none)",
+            subject="views",
+        ),
+        *checked.finding(
+            "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)",
+            hardly,
+            weights,
+            "optimised as all others, and as fast: from other viewpoints their colours may be extreme",
+            largest=False,
+            subject="views",
+        ),
+    ]
+
+
+def check_style(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
+    """What is extreme in a style image [H, W, 3]."""
+    height, width = int(style.shape[0]), int(style.shape[1])
+    found = []
+    spread = float(style.double().std(dim=(0, 1), correction=0).max())
+    if spread < FLAT_STYLE:
+        done = "its features hardly vary: the scene is drawn to one flat colour"
+        found.append(Finding("style", "one colour throughout", 1, 1, f"standard deviation {spread:.2g}", done))
+    aspect = max(height, width) / min(height, width)
+    if aspect > LONG_STYLE:
+        done = "used whole; its shorter side decides to what size it is brought down"
+        found.append(Finding("style", "extreme aspect", 1, 1, f"{width} x {height}", done))
+    used = [style_size((height, width), (camera.height, camera.width)) for camera in cameras]
+    tiny = [size for size in used if min(size) < ALIGNMENT]
+    if tiny:
+        done = f"feature layers without a cell in it are left out of the loss; give one of at least {ALIGNMENT} pixels"
+        smallest = min(tiny, key=min)
+        found.append(
+            Finding("style", "too small for the deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
+        )
+    return found

@@ -1,0 +1,314 @@
+"""Quality on views that were never trained on, measured at moments of a run.
+
+No camera is taken away from the training: held-out views lie halfway between neighbouring cameras. What is measured is
+how far their style is from the style image's (the Gram terms of the SOS loss) and how well they agree with each other
+(multi-view consistency). Geometry is frozen, so that coverage and warps are the same at every moment and are kept.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgsst_core.budget import Shelf
+from sgsst_core.loss.sos import ScaleTarget, SosLoss
+from sgsst_core.planning.survey import SEEN_COVERAGE
+from sgsst_core.quality.consistency import (
+    LONG_RANGE,
+    SHORT_RANGE,
+    Consistency,
+    Warp,
+    compare,
+    expected_depth,
+    find_warp,
+    shown,
+    view_pairs,
+)
+from sgsst_core.quality.lpips import Lpips
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scene.camera import Camera, between, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+
+#: Views whose Gram distance is measured, and pairs of each range that are compared, at most.
+MOST_VIEWS = 4
+#: Two cameras farther apart than so many median steps are no neighbours: the capture was broken off between them.
+JUMP = 4.0
+#: Nor are two that are turned against each other by more than this, about the field of view of a photo: halfway between
+#: them, nothing need be in view that either sees.
+LARGEST_TURN = math.radians(60)
+#: Median depth and coverage of a held-out view are at least the smaller of its neighbours' divided by this, and at most
+#: the larger times this. Inside an object or behind a wall they are not; on the chord of an arc of 60 degrees they
+#: change by no more than a third.
+LIKENESS = 2.0
+#: Longer side in pixels at which that is looked at.
+_OUTLOOK_SIDE = 160
+#: cos(60 degrees) of a camera file has been rounded.
+_COSINE_ROUNDING = 1e-6
+
+
+def moments(total_steps: int) -> list[int]:
+    """Steps after which a run of `total_steps` is measured: none, 1/32, 1/16, 1/8, 1/4, half of it, and all."""
+    return sorted({0, *(total_steps >> halvings for halvings in range(6))})
+
+
+def held_out_cameras(cameras: Sequence[Camera], covered: Sequence[int]) -> list[Camera]:
+    """One camera between each two neighbours among the cameras of some indices; neighbours in space follow each other.
+
+    The list's order counts. Where the next camera is mostly no neighbour (see `JUMP` and `LARGEST_TURN`) the list is
+    not in the order of a capture, and a walk from each camera to the nearest one takes its place. Fewer than two
+    cameras have nothing between them, and neither have two of one pose.
+    """
+    return [between(*pair) for pair in _neighbours([cameras[index] for index in covered])]
+
+
+def _neighbours(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
+    """The pairs that held-out cameras lie between."""
+    if len(cameras) < 2:
+        return []
+    centres = torch.stack([camera.centre for camera in cameras])
+    rotations = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
+    walk = _walk(centres, rotations)
+    steps = (centres[walk[1:]] - centres[walk[:-1]]).norm(dim=1)
+    reach = JUMP * float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
+
+    def pairs(order: Sequence[int]) -> list[tuple[Camera, Camera]]:
+        return [
+            (cameras[i], cameras[j])
+            for i, j in itertools.pairwise(order)
+            if float((centres[i] - centres[j]).norm()) <= reach
+            and bool(_similarly_turned(rotations[i], rotations[j]))
+            and not torch.allclose(cameras[i].world_to_camera, cameras[j].world_to_camera)
+        ]
+
+    in_order = pairs(range(len(cameras)))
+    return in_order if 2 * len(in_order) >= len(cameras) - 1 else max(in_order, pairs(walk), key=len)
+
+
+def _walk(centres: Tensor, rotations: Tensor) -> list[int]:
+    """An order of cameras [n, 3], [n, 3, 3] that goes to the nearest one left, similarly turned ones first."""
+    left = torch.ones(len(centres), dtype=torch.bool)
+    left[0] = False
+    order = [0]
+    while bool(left.any()):
+        here = order[-1]
+        similar = left & _similarly_turned(rotations, rotations[here])
+        candidates = (similar if bool(similar.any()) else left).nonzero()[:, 0]
+        order.append(int(candidates[(centres[candidates] - centres[here]).norm(dim=1).argmin()]))
+        left[order[-1]] = False
+    return order
+
+
+def _similarly_turned(rotations: Tensor, rotation: Tensor) -> Tensor:
+    """Whether rotations [..., 3, 3] differ from one by no more than `LARGEST_TURN`, [...] bool."""
+    cosine = ((rotations * rotation).sum(dim=(-2, -1)) - 1) / 2  # trace(A B^T) = 1 + 2 cos(angle)
+    return cosine >= math.cos(LARGEST_TURN) - _COSINE_ROUNDING
+
+
+@dataclass(frozen=True)
+class HeldOutMoment:
+    """What one measurement gives.
+
+    Attributes:
+        gram: scale to Gram distance, the mean over views of sum over layers of w_G mean((G - G_v)^2) (see `loss`).
+        gram_relative: mean of `gram` over the scales, relative to the run's first measurement; None without views.
+        short, long: consistency of views 1 and 7 apart; None where there is no such pair.
+    """
+
+    gram: dict[int, float]
+    gram_relative: float | None
+    short: Consistency | None
+    long: Consistency | None
+
+    def as_dict(self, step: int, seconds: float) -> dict[str, Any]:
+        """The measurement after `step` iterations and `seconds` of optimisation, as values that JSON can hold."""
+        return {
+            "step": step,
+            "seconds": seconds,
+            "gram": {str(scale): value for scale, value in self.gram.items()},
+            "gram_relative": self.gram_relative,
+            "consistency": {"short": _consistency_json(self.short), "long": _consistency_json(self.long)},
+        }
+
+
+class HeldOut:
+    """Measures the held-out views of one job.
+
+    Args:
+        cameras: of the job.
+        covered: indices of those that see anything.
+        scene: what is stylized. Gaussians that it lacks are missing in the held-out views too.
+        rasterizer: of the scene. Best one of its own: a `cached` one that the job uses as well would keep the weights
+            of held-out views in the place of views that come again in every round.
+        loss: gives network, memory and partition; it is not used itself, so that its timer does not run.
+        style_targets: the style's statistics for views of a camera's size, in the loss's units.
+        weighted: weigh statistics by rendered coverage, as the job does.
+        lpips: None leaves LPIPS out.
+        first: `HeldOutMoment.gram` of the run's first measurement, where a session before this one has made it.
+        memory: bytes that coverage, colours, warps and pictures may take; what does not fit is computed again.
+
+    Attributes:
+        cameras: all held-out views.
+        views: indices of those whose Gram distance is measured, at most 4; without any there is nothing to measure.
+        pairs: gap to the pairs of views that are compared, at most 4 each.
+        first: see above; set by the first measurement.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        covered: Sequence[int],
+        scene: Scene,
+        rasterizer: Rasterizer,
+        loss: SosLoss,
+        style_targets: Callable[[Camera], Mapping[int, ScaleTarget]],
+        *,
+        weighted: bool,
+        lpips: Lpips | None = None,
+        first: dict[int, float] | None = None,
+        memory: int = 1 << 29,
+    ) -> None:
+        self.scene = scene
+        self.rasterizer = rasterizer
+        self.lpips = lpips
+        self.weighted = weighted
+        self.first = first
+        self._style_targets = style_targets
+        self._loss = SosLoss(
+            loss.network,
+            content_weight=0.0,
+            memory=loss.memory,
+            tile_size=loss.tile_size,
+            coarsest=loss.coarsest,
+            leave_out=loss.leave_out,
+        )
+        self._sh_rest = scene.sh_rest.to(rasterizer.device)
+        self._means = scene.means.to(rasterizer.device)
+        self._rest: Shelf[int, Tensor] = Shelf(memory // 8, _tensor_bytes)
+        self._coverage: Shelf[int, Tensor] = Shelf(memory // 8, _tensor_bytes)
+        self._warps: Shelf[tuple[int, int], Warp] = Shelf(memory // 2, lambda warp: warp.nbytes)
+        self._picture_memory = memory // 4
+        parents = _neighbours([cameras[index] for index in covered])
+        self.cameras = [between(*pair) for pair in parents]
+        self.views, self.pairs = self._choose(parents)
+
+    def _choose(self, parents: list[tuple[Camera, Camera]]) -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
+        """Views and pairs to measure, evenly spread over the held-out views; those inside of something are dropped."""
+        count = len(self.cameras)
+        pairs = {gap: view_pairs(count, gap, MOST_VIEWS) for gap in (SHORT_RANGE, LONG_RANGE)}
+        # the first views of the short pairs: they have to be rendered anyway, and are as even
+        views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(count))
+        used = {*views, *(index for chosen in pairs.values() for pair in chosen for index in pair)}
+        clear = {index for index in used if self._is_clear(self.cameras[index], parents[index])}
+        return [index for index in views if index in clear], {
+            gap: [pair for pair in chosen if clear.issuperset(pair)] for gap, chosen in pairs.items()
+        }
+
+    def _is_clear(self, camera: Camera, parents: tuple[Camera, Camera]) -> bool:
+        """Whether a held-out camera sees much the same as its neighbours do, rather than the inside of something."""
+        (covered, depth), *others = (self._outlook(view) for view in (camera, *parents))
+        return (
+            covered > 0
+            and _alike(covered, [other[0] for other in others])
+            and (depth is None or _alike(depth, [other[1] for other in others if other[1] is not None]))
+        )
+
+    def _outlook(self, camera: Camera) -> tuple[float, float | None]:
+        """Mean coverage of a view, 0 if nothing can be seen, and median depth where it is known."""
+        small = resized(camera, min(_OUTLOOK_SIDE, max(camera.width, camera.height)))
+        coverage = self.rasterizer.coverage(small)
+        seen = float(coverage.amax()) > SEEN_COVERAGE
+        depth = expected_depth(self.scene, small, self.rasterizer)
+        known = depth.depth[depth.known]
+        return float(coverage.mean()) if seen else 0.0, float(known.median()) if len(known) else None
+
+    @torch.no_grad()
+    def measure(self, sh_dc: Tensor) -> HeldOutMoment:
+        """Measure the scene with colours sh_dc [N, 3].
+
+        Raises:
+            ValueError: a picture holds NaN or infinity.
+        """
+        pictures: Shelf[int, Tensor] = Shelf(self._picture_memory, _tensor_bytes)
+        sh_dc = sh_dc.detach().to(self.rasterizer.device)
+
+        def picture(index: int) -> Tensor:
+            return pictures.get(index, lambda: self._picture(index, sh_dc))
+
+        gram = self._gram(picture)
+        self.first = self.first or gram
+        start = _mean(self.first)
+        return HeldOutMoment(
+            gram,
+            _mean(gram) / start if start else None,
+            self._consistency(SHORT_RANGE, picture),
+            self._consistency(LONG_RANGE, picture),
+        )
+
+    def _picture(self, index: int, sh_dc: Tensor) -> Tensor:
+        """Picture [H, W, 3] of a held-out view, as a screen shows it."""
+        camera = self.cameras[index]
+        if self.scene.sh_degree == 0:
+            rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
+        else:
+            rest = self._rest.get(index, lambda: rest_colours(self._sh_rest, self._means, camera))
+        return shown(self.rasterizer.render(view_colours(sh_dc, rest), camera), camera, self.rasterizer.device)
+
+    def _gram(self, picture: Callable[[int], Tensor]) -> dict[int, float]:
+        """Scale to Gram distance, the mean over the views that have the scale."""
+        values: dict[int, list[float]] = {}
+        for index in self.views:
+            image, coverage = picture(index), None
+            if self.weighted:
+                coverage = self._coverage.get(index, partial(self.rasterizer.coverage, self.cameras[index]))
+            target = self._loss.view_target(image, coverage)
+            style = self._style_targets(self.cameras[index])
+            for scale, terms in self._loss.evaluate(image, style, target, gradient=False).terms.items():
+                values.setdefault(scale, []).append(terms.gram)
+        return {scale: sum(found) / len(found) for scale, found in sorted(values.items())}
+
+    def _consistency(self, gap: int, picture: Callable[[int], Tensor]) -> Consistency | None:
+        if not self.pairs[gap]:
+            return None
+        results = []
+        for i, j in self.pairs[gap]:
+            warped, valid = self._warps.get((i, j), partial(self._warp, i, j)).apply(picture(j))
+            results.append(compare(i, j, picture(i), warped, valid, self.lpips))
+        return Consistency(gap, results)
+
+    def _warp(self, i: int, j: int) -> Warp:
+        """How view j's picture is brought into view i."""
+        depth, other = (expected_depth(self.scene, self.cameras[k], self.rasterizer) for k in (i, j))
+        return find_warp(other, self.cameras[j], depth, self.cameras[i])
+
+
+def _alike(value: float, others: list[float]) -> bool:
+    """Whether a value is not far outside the others' range; true where there are none."""
+    return not others or min(others) / LIKENESS <= value <= LIKENESS * max(others)
+
+
+def _mean(gram: dict[int, float]) -> float:
+    return sum(gram.values()) / max(len(gram), 1)
+
+
+def _consistency_json(consistency: Consistency | None) -> dict[str, Any] | None:
+    if consistency is None:
+        return None
+    return {
+        "gap": consistency.gap,
+        "pairs": len(consistency.pairs),
+        "compared": consistency.compared,
+        "rmse": consistency.rmse,
+        "lpips": consistency.lpips,
+    }
+
+
+def _tensor_bytes(tensor: Tensor) -> int:
+    return tensor.numel() * tensor.element_size()

@@ -1,0 +1,155 @@
+"""LPIPS, the learned perceptual distance of two images, as a number and as a map.
+
+Zhang, Isola, Efros, Shechtman, Wang, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR
+2018, equation 1: features of five layers are scaled to unit length at every position, and
+
+    d(x, y) = sum over layers l of the mean over positions of sum over channels c of w_lc (x_lc - y_lc)^2
+
+with learned weights w >= 0 (version 0.1 of the published heads, the one that papers report).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import list_weights, load_perceptual, load_weights
+from sgsst_core.features.vgg import FeatureNetwork, layer_stride
+
+LpipsNetwork = Literal["alex", "vgg16"]
+
+#: The last ReLU of each block, which LPIPS looks at.
+_VGG16_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
+#: (stride, padding) of AlexNet's convolutions (Krizhevsky 2014, the one-tower form that torchvision has).
+_ALEX_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
+#: Convolutions of AlexNet in front of which a 3x3 max pool of stride 2 stands, counted from 1.
+_ALEX_POOLED = (2, 3)
+#: Shorter side in pixels below which the deepest layer has no cell at all.
+_MINIMUM_SIDE = {"alex": 31, "vgg16": layer_stride("relu5_3")}
+#: Added to a feature vector's length, as published: a dead position stays zero instead of becoming 0/0.
+_LENGTH_EPS = 1e-10
+
+
+@dataclass(frozen=True)
+class PerceptualDistance:
+    """LPIPS of two images.
+
+    Attributes:
+        mean: the published number, 0 for equal images.
+        map: [H, W], each layer's distances upsampled bilinearly to the pixels, summed over the layers (published as
+            `spatial`); its mean over pixels is `mean` but for the upsampling at the border.
+    """
+
+    mean: float
+    map: Tensor
+
+
+class Lpips:
+    """Evaluates LPIPS.
+
+    Args:
+        network: "alex", which the authors recommend as a metric, or "vgg16".
+        dtype: torch.float32, or torch.float64 (reference).
+        device: where features are computed.
+        folder: of the weights; None is the cache folder.
+
+    Raises:
+        SettingsError: no such network.
+        WeightsError: the weights are missing or corrupt.
+    """
+
+    def __init__(
+        self,
+        network: LpipsNetwork = "alex",
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        folder: Path | None = None,
+    ) -> None:
+        if network not in _MINIMUM_SIDE:
+            raise SettingsError(f"LPIPS has no network called {network!r}: use alex or vgg16.")
+        self.network = network
+        self.dtype = dtype
+        self.device = torch.device(device)
+        #: Images whose shorter side has fewer pixels have no distance.
+        self.minimum_side = _MINIMUM_SIDE[network]
+        tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(network, folder).items()}
+        self._heads = [tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
+        self._features: Callable[[Tensor], list[Tensor]] = (
+            _alexnet(tensors) if network == "alex" else _vgg16(folder, dtype, self.device)
+        )
+
+    @torch.no_grad()
+    def distance(self, first: Tensor, second: Tensor) -> PerceptualDistance:
+        """Distance of two images [H, W, 3] of one size, values 0..1, any floating dtype.
+
+        Raises:
+            ValueError: shapes differ or are no images, or a side is shorter than `minimum_side`.
+        """
+        if first.shape != second.shape or first.ndim != 3 or first.shape[2] != 3:
+            raise ValueError(f"LPIPS of shapes {tuple(first.shape)} and {tuple(second.shape)}: two images [H, W, 3]")
+        size = (int(first.shape[0]), int(first.shape[1]))
+        if min(size) < self.minimum_side:
+            raise ValueError(
+                f"LPIPS ({self.network}) of {size[1]} x {size[0]} pixels: {self.minimum_side} are the least"
+            )
+        mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
+        layers = zip(self._features(self._input(first)), self._features(self._input(second)), self._heads, strict=True)
+        for x, y, head in layers:
+            distances = ((_unit(x) - _unit(y)).square_() @ head)[None, None]
+            mean += float(distances.mean(dtype=torch.float64))
+            spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
+        return PerceptualDistance(mean, spatial)
+
+    def _input(self, image: Tensor) -> Tensor:
+        return image.to(self.device, self.dtype)
+
+
+def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Lpips | None:
+    """LPIPS with AlexNet in float32, or None where its weights (which come with VGG16's) are not installed.
+
+    Raises:
+        WeightsError: the weights are installed, but corrupt.
+    """
+    installed = any(entry.name == "lpips_alex" and entry.path for entry in list_weights(folder))
+    return Lpips(device=device, folder=folder) if installed else None
+
+
+def _unit(features: Tensor) -> Tensor:
+    """Features [h, w, c] scaled to unit length at every position."""
+    return features / (torch.linalg.vector_norm(features, dim=2, keepdim=True) + _LENGTH_EPS)
+
+
+def _alexnet(tensors: dict[str, Tensor]) -> Callable[[Tensor], list[Tensor]]:
+    """AlexNet's five ReLU outputs [h, w, c] as a function of pixels [H, W, 3]."""
+
+    def features(rgb: Tensor) -> list[Tensor]:
+        x = (rgb * tensors["input_scale"] + tensors["input_shift"]).permute(2, 0, 1).unsqueeze(0)
+        outputs = []
+        for layer, (stride, padding) in enumerate(_ALEX_CONVOLUTIONS, start=1):
+            if layer in _ALEX_POOLED:
+                x = F.max_pool2d(x, 3, 2)
+            weight, bias = tensors[f"conv{layer}.weight"], tensors[f"conv{layer}.bias"]
+            x = F.conv2d(x, weight, bias, stride, padding).relu_()
+            outputs.append(x[0].permute(1, 2, 0))
+        return outputs
+
+    return features
+
+
+def _vgg16(folder: Path | None, dtype: torch.dtype, device: torch.device) -> Callable[[Tensor], list[Tensor]]:
+    """VGG16's last ReLU of each block [h, w, c] as a function of pixels [H, W, 3]."""
+    network = FeatureNetwork(load_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
+
+    def features(rgb: Tensor) -> list[Tensor]:
+        found = network.forward(rgb, keep=False).features
+        return [found[layer] for layer in _VGG16_LAYERS]
+
+    return features

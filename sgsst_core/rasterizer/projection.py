@@ -1,0 +1,201 @@
+"""EWA projection of a scene onto one camera's image plane, in float64.
+
+Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 2002: a Gaussian with covariance V becomes a 2D Gaussian
+with covariance J V J^T, J the derivative of the perspective at its centre. What is done about the numbers:
+
+* The 2x3 factor M = J R_camera R_quaternion diag(scales) is formed, never the 3x3 covariance. With the blur e,
+  det(M M^T + e I) = (sum of the squared 2x2 minors of M) + e trace(M M^T) + e^2 (Cauchy-Binet): a sum of positive
+  terms, which cannot cancel. p r - q^2 has no correct digit left for a needle a million times longer than wide.
+* With the covariance [[p, q], [q, r]] the exponent is a sum of two squares, which cannot become negative either:
+  w = dy / sqrt(r), u = (dx - (q / r) dy) sqrt(r / det), power = (u^2 + w^2) / 2.
+* A Gaussian's support is exactly where its alpha is at least ALPHA_MIN: half extents t sqrt(p) and t sqrt(r) with
+  t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cut, so a renderer without any support agrees.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.compiled import compiled, kernel_threads
+from sgsst_core.constants import ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+
+_LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+#: exp(-power) = 2^-(u'^2 + w'^2) when u and w are scaled by this: the kernels evaluate powers of two.
+_TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
+
+
+class Column(IntEnum):
+    """Columns of `Projection.values`; dx, dy are a pixel centre's offsets from (X, Y) in pixels.
+
+    alpha = 2^(LOG2_OPACITY - u^2 - w^2) with w = dy * W_SCALE, u = (dx - SKEW * dy) * U_SCALE.
+    """
+
+    X = 0
+    Y = 1
+    SKEW = 2
+    U_SCALE = 3
+    W_SCALE = 4
+    LOG2_OPACITY = 5
+    EXTENT_X = 6
+    EXTENT_Y = 7
+
+
+class Outcome(IntEnum):
+    """What became of a Gaussian in a view."""
+
+    VISIBLE = 0
+    #: Depth below the near plane; a Gaussian exactly on it is kept.
+    NEAR = 1
+    #: Zero quaternion, or a value that overflows float64.
+    INVALID = 2
+    #: Opacity below ALPHA_MIN: contributes to no pixel.
+    FAINT = 3
+    #: No pixel centre of the image inside its extents.
+    OUTSIDE = 4
+
+
+_VISIBLE, _NEAR, _INVALID, _FAINT, _OUTSIDE = (int(outcome) for outcome in Outcome)
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The Gaussians of a scene that a view can show, front to back.
+
+    Attributes:
+        gaussians: [V] int32 indices into the scene, by depth along the viewing axis; equal depths by index.
+        values: [V, 8] float64, see `Column`.
+        outcomes: how many Gaussians of the scene ended in which `Outcome`.
+    """
+
+    gaussians: NDArray[np.int32]
+    values: NDArray[np.float64]
+    outcomes: dict[Outcome, int]
+
+
+def project(scene: Scene, camera: Camera, *, near: float = NEAR) -> Projection:
+    """Project a scene (any N, also 0) onto a camera.
+
+    Raises:
+        ValueError: `near` is not positive (depths of 0 and less have no projection).
+    """
+    if not near > 0:
+        raise ValueError(f"near plane {near}: must be positive")
+    count = len(scene)
+    values = np.empty((count, len(Column)))
+    depths = np.empty(count)
+    outcomes = np.empty(count, dtype=np.uint8)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float64)
+    with kernel_threads():
+        _project_all(
+            *(np.ascontiguousarray(t.numpy()) for t in (scene.means, scene.quats, scene.scales, scene.opacities)),
+            np.ascontiguousarray(camera.world_to_camera.double().numpy()),
+            intrinsics,
+            near,
+            values,
+            depths,
+            outcomes,
+        )
+    visible = np.flatnonzero(outcomes == Outcome.VISIBLE)
+    order = visible[np.argsort(depths[visible], kind="stable")]
+    tally = np.bincount(outcomes, minlength=len(Outcome))
+    return Projection(
+        gaussians=order.astype(np.int32),
+        values=values[order],
+        outcomes={outcome: int(tally[outcome]) for outcome in Outcome},
+    )
+
+
+@compiled()
+def _rotation(quat):
+    """Rows of the rotation matrix of a quaternion wxyz of any length but zero."""
+    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@compiled()
+def _factor_row(focal, slope, axis, forward, rotation, scale):
+    """One row of M: focal / z times (camera axis - slope * viewing axis), turned into the Gaussian's own axes."""
+    a = focal * (axis[0] - slope * forward[0])
+    b = focal * (axis[1] - slope * forward[1])
+    c = focal * (axis[2] - slope * forward[2])
+    return (
+        (a * rotation[0][0] + b * rotation[1][0] + c * rotation[2][0]) * math.exp(np.float64(scale[0])),
+        (a * rotation[0][1] + b * rotation[1][1] + c * rotation[2][1]) * math.exp(np.float64(scale[1])),
+        (a * rotation[0][2] + b * rotation[1][2] + c * rotation[2][2]) * math.exp(np.float64(scale[2])),
+    )
+
+
+@compiled()
+def _covariance(m0, m1):
+    """p, q, r and the determinant of M M^T + EPS2D I, without cancellation (see the module's text)."""
+    p = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
+    q = m0[0] * m1[0] + m0[1] * m1[1] + m0[2] * m1[2]
+    r = m1[0] * m1[0] + m1[1] * m1[1] + m1[2] * m1[2]
+    minor0 = m0[1] * m1[2] - m0[2] * m1[1]
+    minor1 = m0[2] * m1[0] - m0[0] * m1[2]
+    minor2 = m0[0] * m1[1] - m0[1] * m1[0]
+    minors = minor0 * minor0 + minor1 * minor1 + minor2 * minor2
+    return p + EPS2D, q, r + EPS2D, minors + EPS2D * (p + r) + EPS2D * EPS2D
+
+
+@compiled()
+def _project_one(mean, quat, scale, logit, pose, intrinsics, near, value):
+    """Fill one row of `Projection.values`; returns the outcome and the depth."""
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    width, height = intrinsics[4], intrinsics[5]
+    x = pose[0, 0] * mean[0] + pose[0, 1] * mean[1] + pose[0, 2] * mean[2] + pose[0, 3]
+    y = pose[1, 0] * mean[0] + pose[1, 1] * mean[1] + pose[1, 2] * mean[2] + pose[1, 3]
+    z = pose[2, 0] * mean[0] + pose[2, 1] * mean[1] + pose[2, 2] * mean[2] + pose[2, 3]
+    if z < near:
+        return _NEAR, z
+    opacity = -math.log1p(math.exp(-np.float64(logit))) / math.log(
+        2.0
+    )  # log2 of the sigmoid, -inf for logits under -709
+    support = opacity - _LOG2_ALPHA_MIN
+    if support < 0:
+        return _FAINT, z
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+    slope_x = min((width - cx) / fx + margin_x, max(-cx / fx - margin_x, x / z))
+    slope_y = min((height - cy) / fy + margin_y, max(-cy / fy - margin_y, y / z))
+    rotation = _rotation(quat)
+    m0 = _factor_row(fx / z, slope_x, pose[0], pose[2], rotation, scale)
+    m1 = _factor_row(fy / z, slope_y, pose[1], pose[2], rotation, scale)
+    p, q, r, det = _covariance(m0, m1)
+    u_scale = _TO_POWER_OF_TWO * math.sqrt(r / det)
+    reach = math.sqrt(support) / _TO_POWER_OF_TWO
+    extent_x, extent_y = reach * math.sqrt(p), reach * math.sqrt(r)
+    u, v = fx * (x / z) + cx, fy * (y / z) + cy
+    if not math.isfinite(u + v + q / r + u_scale + extent_x + extent_y + det):
+        return _INVALID, z
+    if np.ceil(u - extent_x - 0.5) > min(np.floor(u + extent_x - 0.5), width - 1) or u + extent_x < 0.5:
+        return _OUTSIDE, z
+    if np.ceil(v - extent_y - 0.5) > min(np.floor(v + extent_y - 0.5), height - 1) or v + extent_y < 0.5:
+        return _OUTSIDE, z
+    value[0], value[1], value[2], value[3] = u, v, q / r, u_scale
+    value[4], value[5], value[6], value[7] = _TO_POWER_OF_TWO / math.sqrt(r), opacity, extent_x, extent_y
+    return _VISIBLE, z
+
+
+@compiled(parallel=True)
+def _project_all(means, quats, scales, logits, pose, intrinsics, near, values, depths, outcomes):
+    for i in numba.prange(means.shape[0]):
+        outcomes[i], depths[i] = _project_one(
+            means[i], quats[i], scales[i], logits[i], pose, intrinsics, near, values[i]
+        )

@@ -1,0 +1,122 @@
+"""Colours of one view from spherical harmonics, and their gradient.
+
+    c_j = max(0, 0.5 + SH_C0 * sh_dc_j + sum over l >= 1 of sh_rest_j * Y_l(direction_j))
+
+Only `sh_dc` is ever optimised, so the sum over l >= 1 is frozen: it is computed once per view (`rest_colours`), after
+which a view's colours cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import COLOUR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
+from sgsst_core.scene.camera import Camera
+
+#: Gaussians evaluated at a time: bounds the basis [chunk, 15] and the float64 copies to some tens of megabytes.
+_CHUNK = 1 << 17
+
+
+def view_directions(
+    means: Tensor,  # [N, 3]
+    centre: Tensor,  # [3] float64
+) -> Tensor:
+    """Unit vectors [N, 3] float64 from the camera's centre to the Gaussians.
+
+    The difference is taken in float64: with the world moved far from its origin, both points are large and nearly
+    equal. A Gaussian exactly at the centre has no direction; it gets the zero vector, so that its colour stays finite.
+    (It lies in front of the near plane and is never drawn.)
+    """
+    offsets = means.double() - centre.to(device=means.device, dtype=torch.float64)
+    # hypot-like: scaled by the largest component first, so that no square overflows or vanishes.
+    largest = offsets.abs().amax(dim=-1, keepdim=True)
+    scaled = offsets / torch.where(largest > 0, largest, torch.ones_like(largest))
+    length = scaled.norm(dim=-1, keepdim=True)
+    return scaled / torch.where(length > 0, length, torch.ones_like(length))
+
+
+def basis(
+    directions: Tensor,  # [..., 3] unit vectors
+    degree: int,
+) -> Tensor:
+    """Real spherical harmonics of degrees 1 to `degree` (at most 3): [..., (degree + 1)^2 - 1]."""
+    if not 0 <= degree <= 3:
+        raise ValueError(f"spherical harmonics of degree {degree}: 3DGS scenes have 0 to 3")
+    x, y, z = directions.unbind(-1)
+    terms: list[Tensor] = []
+    if degree >= 1:
+        terms += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        polynomials = (x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy)
+        terms += [c * p for c, p in zip(SH_C2, polynomials, strict=True)]
+    if degree >= 3:
+        polynomials3 = (
+            y * (3 * xx - yy),
+            x * y * z,
+            y * (4 * zz - xx - yy),
+            z * (2 * zz - 3 * xx - 3 * yy),
+            x * (4 * zz - xx - yy),
+            z * (xx - yy),
+            x * (xx - 3 * yy),
+        )
+        terms += [c * p for c, p in zip(SH_C3, polynomials3, strict=True)]
+    if not terms:
+        return directions.new_zeros((*directions.shape[:-1], 0))
+    return torch.stack(terms, dim=-1)
+
+
+def rest_colours(
+    sh_rest: Tensor,  # [N, K, 3], K = 0, 3, 8 or 15
+    means: Tensor,  # [N, 3]
+    camera: Camera,
+    *,
+    degree: int | None = None,
+) -> Tensor:
+    """The frozen part of a view's colours: the sum over l >= 1, [N, 3] in the dtype and on the device of `sh_rest`.
+
+    `degree` leaves out higher bands (that a plan found to be zero, say). Summed in float64 and rounded once. Degree 0
+    is zeros, without any work.
+
+    Raises:
+        ValueError: K is no number of coefficients of degree 0 to 3, or `degree` is higher than the file's.
+    """
+    stored = {0: 0, 3: 1, 8: 2, 15: 3}.get(int(sh_rest.shape[1]))
+    if stored is None:
+        raise ValueError(f"sh_rest has {sh_rest.shape[1]} coefficients a Gaussian; 0, 3, 8 or 15 are possible")
+    degree = stored if degree is None else degree
+    if not 0 <= degree <= stored:
+        raise ValueError(f"degree {degree} asked of spherical harmonics of degree {stored}")
+    colours = torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
+    if degree == 0:
+        return colours
+    count = (degree + 1) ** 2 - 1
+    for start in range(0, sh_rest.shape[0], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        values = basis(view_directions(means[part], camera.centre), degree)
+        colours[part] = torch.einsum("nk,nkc->nc", values, sh_rest[part, :count].double()).to(sh_rest.dtype)
+    return colours
+
+
+def view_colours(
+    sh_dc: Tensor,  # [N, 3]
+    rest: Tensor,  # [N, 3]
+) -> Tensor:
+    """Colours [N, 3] of one view, clamped at zero: `max(0, 0.5 + SH_C0 * sh_dc + rest)`."""
+    return torch.add(rest + COLOUR_OFFSET, sh_dc, alpha=SH_C0).clamp_min(0)
+
+
+def view_colours_gradient(
+    colour_gradient: Tensor,  # [N, 3]
+    colours: Tensor,  # [N, 3], of `view_colours`
+    *,
+    revive: bool = False,
+) -> Tensor:
+    """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolours` where the clamp let the colour through, 0 where it did not.
+
+    With `revive`, colours that the clamp holds at 0 also take a gradient that would raise them. It is not the
+    derivative: it lets colours that a large step has thrown below 0 come back, which otherwise never move again.
+    """
+    passes = (colours > 0) | (colour_gradient < 0) if revive else colours > 0
+    return torch.where(passes, SH_C0 * colour_gradient, torch.zeros_like(colour_gradient))

@@ -1,0 +1,1 @@
+"""The optimiser: views, steps, phases, checkpoints."""

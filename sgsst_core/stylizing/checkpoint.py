@@ -1,0 +1,293 @@
+"""Checkpoints: one safetensors file with everything that a resumed run needs, tied to its job by a fingerprint.
+
+The last two are kept. Each holds a digest of its own content, so that one that was damaged is noticed, and the one
+before takes its place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from sgsst_core.errors import CheckpointError
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.loss.terms import LossTerms
+from sgsst_core.planning.planner import Decision, Plan, Prediction
+from sgsst_core.planning.survey import Survey
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, StylizerState
+
+#: Raised whenever the meaning of a stored value changes.
+FORMAT_VERSION = "3"
+#: Settings that may differ between a checkpoint and the run that goes on from it: they only end it, or (the memory
+#: limit, which decides the partition) change no more than its rounding.
+_FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit"}
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What an unfinished job goes on from.
+
+    Attributes:
+        state: of the stylizer.
+        plan: that the job follows; with it a resumed run need not look at every view again.
+        ranks: that there were when the plan was made.
+        before: loss of the unstylized scene.
+        run: identifies the run of the program that wrote it.
+        written_by: versions of the program and of PyTorch.
+    """
+
+    state: StylizerState
+    plan: Plan
+    ranks: int
+    before: Evaluation
+    run: str
+    written_by: dict[str, str]
+
+
+class Checkpoints:
+    """The last two checkpoints of a job.
+
+    Args:
+        latest: file of the newer one; the older one lies beside it.
+    """
+
+    def __init__(self, latest: Path) -> None:
+        self.latest = latest
+        self.previous = latest.with_name(f"{latest.stem}.previous{latest.suffix}")
+
+    @property
+    def exist(self) -> bool:
+        """Whether there is one, of whatever job."""
+        return self.latest.exists() or self.previous.exists()
+
+    def save(self, checkpoint: Checkpoint, job: str) -> None:
+        """Write the newest one, and keep the one before; at any moment there is a whole one.
+
+        Raises:
+            OutputError: the file cannot be written; the newest of those that are there stays.
+        """
+        with atomic_path(self.latest) as temporary:
+            _write(temporary, checkpoint, job)
+            if self.latest.exists():
+                os.replace(self.latest, self.previous)
+
+    def load(self, job: str, warn: Callable[[str], None], run: str | None = None) -> Checkpoint:
+        """The newest one that can be used by the job with that fingerprint.
+
+        Args:
+            warn: told why one was passed over.
+            run: take only what this run of the program has written.
+
+        Raises:
+            CheckpointError: there is none, or none that can be used.
+        """
+        try:
+            return load_checkpoint(self.latest, job, run)
+        except CheckpointError as error:
+            if not self.previous.exists():
+                raise
+            try:
+                found = load_checkpoint(self.previous, job, run)
+            except CheckpointError:
+                raise error from None
+            warn(f"The checkpoint before the last one is used, of step {found.state.step}, because of this: {error}")
+            return found
+
+    def remove(self) -> None:
+        """Delete both."""
+        self.latest.unlink(missing_ok=True)
+        self.previous.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str]:
+    """Of this program ("unknown" where it is not installed) and of PyTorch."""
+    try:
+        program = version("sgsst-service")
+    except PackageNotFoundError:
+        program = "unknown"
+    return {"program": program, "torch": torch.__version__}
+
+
+def fingerprint(
+    scene: Scene, cameras: Sequence[Camera], style: Tensor, settings: Settings, weights: str, photos: str = ""
+) -> str:
+    """SHA-256 over all that decides the course of a job.
+
+    Args:
+        weights: digest of the feature network's.
+        photos: whatever identifies the content images; empty for unstylized renders.
+    """
+    digest = hashlib.sha256(repr((weights, photos)).encode())
+    for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
+        digest.update(repr(tuple(tensor.shape)).encode())
+        digest.update(tensor.contiguous().numpy().data)
+    for camera in cameras:
+        pose = camera.world_to_camera.numpy().tobytes()
+        digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
+    digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
+    return digest.hexdigest()
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint, job: str) -> None:
+    """Write a checkpoint of the job with that fingerprint; it appears whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        _write(temporary, checkpoint, job)
+
+
+def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
+    state = checkpoint.state
+    plan_tensors, plan_values = _plan_parts(checkpoint.plan)
+    tensors = {
+        "sh_dc": state.sh_dc,
+        "first_moment": state.first_moment,
+        "second_moment": state.second_moment,
+        "generator": state.generator,
+        **plan_tensors,
+    }
+    metadata = {
+        "version": FORMAT_VERSION,
+        "job": job,
+        "run": checkpoint.run,
+        "written_by": json.dumps(checkpoint.written_by),
+        "step": str(state.step),
+        "seconds": repr(state.seconds),
+        "queue": json.dumps(state.queue),
+        "history": json.dumps([asdict(record) for record in state.history]),
+        "seconds_by_part": json.dumps(state.seconds_by_part),
+        "memory": json.dumps(state.memory),
+        "measured": json.dumps(state.measured),
+        "plan": json.dumps(plan_values),
+        "ranks": str(checkpoint.ranks),
+        "before": json.dumps({scale: asdict(terms) for scale, terms in checkpoint.before.items()}),
+    }
+    try:
+        save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
+    except SafetensorError as error:  # what the system said is in the text alone
+        if "os error" not in str(error).lower():
+            raise
+        raise OSError(_error_number(str(error)), str(error)) from error
+
+
+def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
+    """Read a checkpoint of the job with that fingerprint; with `run`, only one that this run of the program wrote.
+
+    Raises:
+        CheckpointError: missing or corrupt file, or another job's.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: there is no checkpoint to resume from. Start again without --resume.")
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        if metadata["version"] != FORMAT_VERSION:
+            raise CheckpointError(f"{path}: is of another version of this program. Start again without --resume.")
+        if metadata.pop("digest") != _digest(tensors, metadata):
+            raise ValueError("its content is not what was written")
+        if metadata["job"] != job:
+            raise CheckpointError(
+                f"{path}: belongs to another job (scene, cameras, style, weights or settings differ). "
+                "Give the same ones as before, or start again without --resume."
+            )
+        if run is not None and metadata["run"] != run:
+            raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
+        return Checkpoint(
+            state=_state(tensors, metadata),
+            plan=_plan(tensors, json.loads(metadata["plan"])),
+            ranks=int(metadata["ranks"]),
+            before=_evaluation(json.loads(metadata["before"])),
+            run=metadata["run"],
+            written_by=json.loads(metadata["written_by"]),
+        )
+    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        raise CheckpointError(
+            f"{path}: is not a readable checkpoint ({error}). Start again without --resume."
+        ) from error
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """SHA-256 of everything that a checkpoint holds."""
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous()
+        digest.update(repr((name, str(tensor.dtype), tuple(tensor.shape))).encode())
+        digest.update(tensor.numpy().data)
+    return digest.hexdigest()
+
+
+def _error_number(text: str) -> int:
+    """The number in "No space left on device (os error 28)"; 0 where there is none."""
+    digits = text.lower().rpartition("os error")[2].strip(" )")
+    return int(digits) if digits.isdigit() else 0
+
+
+def _state(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> StylizerState:
+    return StylizerState(
+        sh_dc=tensors["sh_dc"],
+        first_moment=tensors["first_moment"],
+        second_moment=tensors["second_moment"],
+        step=int(metadata["step"]),
+        seconds=float(metadata["seconds"]),
+        generator=tensors["generator"].to(torch.uint8),
+        queue=json.loads(metadata["queue"]),
+        history=[_record(entry) for entry in json.loads(metadata["history"])],
+        seconds_by_part=json.loads(metadata["seconds_by_part"]),
+        memory=json.loads(metadata["memory"]),
+        measured=json.loads(metadata["measured"]),
+    )
+
+
+def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """A plan's tensors, and the rest for JSON."""
+    tensors = {
+        "plan.total_weights": plan.survey.total_weights,
+        "plan.optimised": plan.optimised,
+        "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not take twice
+    }
+    nothing = torch.empty(0)  # `asdict` would copy them
+    survey = replace(plan.survey, total_weights=nothing)
+    values = asdict(replace(plan, survey=survey, optimised=nothing, seen=nothing))
+    del values["optimised"], values["seen"], values["survey"]["total_weights"]
+    return tensors, values
+
+
+def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
+    looked = values.pop("survey")
+    regions = [Rectangle(**region) for region in looked.pop("regions")]
+    decisions = [Decision(**decision) for decision in values.pop("decisions")]
+    expected = values.pop("prediction")
+    return Plan(
+        survey=Survey(total_weights=tensors["plan.total_weights"], regions=regions, **looked),
+        optimised=tensors["plan.optimised"],
+        seen=tensors["plan.seen"],
+        decisions=decisions,
+        prediction=Prediction(**expected) if expected else None,
+        **values,
+    )
+
+
+def _evaluation(values: dict[str, dict[str, float]]) -> Evaluation:
+    return {int(scale): LossTerms(**parts) for scale, parts in values.items()}
+
+
+def _record(entry: dict[str, Any]) -> StepRecord:
+    return StepRecord(**{**entry, "terms": _evaluation(entry["terms"])})

@@ -1,0 +1,154 @@
+"""The optimiser loop: all steps of a job, and when it ends before them.
+
+The loop prints nothing and writes nothing; what is to be shown or saved goes through `Callbacks`. Of several ranks,
+each runs it; the first one decides when it ends.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from torch import Tensor
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.convergence import has_converged, has_reached
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
+from sgsst_core.stylizing.views import PhotoLoader
+
+Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interrupted"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress bar shows."""
+
+    stage: str
+    step: int
+    total: int
+    loss: float
+    seconds: float
+    seconds_left: float
+
+
+@dataclass
+class Callbacks:
+    """What the loop calls between iterations; each is optional.
+
+    `measure` and `moments` are the same on every rank; the others are the first rank's alone.
+
+    Attributes:
+        progress: after every iteration.
+        stop: asked before every iteration; True ends the loop as "interrupted".
+        checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
+        preview: called with the stylizer about every `preview_seconds`.
+        measure: called with the stylizer after each of the `moments`, and before the first step for 0; its time does
+            not count as the job's.
+    """
+
+    progress: Callable[[Progress], None] | None = None
+    stop: Callable[[], bool] | None = None
+    checkpoint: Callable[[Stylizer], None] | None = None
+    checkpoint_seconds: float = 300.0
+    preview: Callable[[Stylizer], None] | None = None
+    preview_seconds: float = 60.0
+    measure: Callable[[Stylizer], None] | None = None
+    moments: Container[int] = ()
+
+
+def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
+    """Iterate to the end of the schedule, or until one of the settings' limits or `callbacks.stop` ends it before."""
+    callbacks = callbacks or Callbacks()
+    started, before = time.perf_counter(), stylizer.step
+    last_checkpoint = last_preview = started
+    _measure(stylizer, callbacks)
+    while stylizer.step < stylizer.total:
+        reason = stylizer.collectives.from_first(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
+        if reason:
+            return _end_early(stylizer, callbacks, reason)
+        stylizer.run_step()
+        now = time.perf_counter()
+        if callbacks.progress:
+            callbacks.progress(_progress(stylizer, (now - started) / (stylizer.step - before)))
+        if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
+            _checkpoint(stylizer, callbacks.checkpoint)
+            last_checkpoint = time.perf_counter()
+        if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
+            callbacks.preview(stylizer)
+            last_preview = time.perf_counter()
+        _measure(stylizer, callbacks)
+    return "finished"
+
+
+def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
+    """Whether the user or the clock ends the run before the next step; ranks may see these differently."""
+    if callbacks.stop and callbacks.stop():
+        return "interrupted"
+    seconds = stylizer.settings.max_seconds
+    return "max-seconds" if seconds and stylizer.seconds >= seconds else None
+
+
+def _enough(stylizer: Stylizer) -> Stopped | None:
+    """Whether the losses end the run before the next step; they are the same on every rank."""
+    settings = stylizer.settings
+    if not (settings.target_loss or settings.early_stop):
+        return None
+    losses = [record.loss for record in stylizer.history if record.stage == "sos"]
+    if settings.target_loss:
+        target = settings.target_loss * mean_loss(stylizer.start())
+        if has_reached(losses, target, stylizer.round_length):
+            return "target-loss"
+    return "converged" if settings.early_stop and has_converged(losses, stylizer.round_length) else None
+
+
+def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
+    measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # before a resume
+    if callbacks.measure and stylizer.step in callbacks.moments and not measured:
+        callbacks.measure(stylizer)
+
+
+def _progress(stylizer: Stylizer, seconds_per_step: float) -> Progress:
+    record = stylizer.history[-1]
+    left = seconds_per_step * (stylizer.total - stylizer.step)
+    if stylizer.settings.max_seconds:
+        left = min(left, max(stylizer.settings.max_seconds - stylizer.seconds, 0.0))
+    return Progress(record.stage, record.step, stylizer.total, record.loss, stylizer.seconds, left)
+
+
+def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:
+    if callbacks.checkpoint:
+        _checkpoint(stylizer, callbacks.checkpoint)
+    return reason
+
+
+def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
+    """Save, and count the seconds beside those of the steps."""
+    started = time.perf_counter()
+    save(stylizer)
+    parts = stylizer.seconds_by_part
+    parts["checkpoint"] = parts.get("checkpoint", 0.0) + time.perf_counter() - started
+
+
+def stylize(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor,
+    settings: Settings,
+    *,
+    weights: BackboneWeights | None = None,
+    photos: PhotoLoader | None = None,
+    callbacks: Callbacks | None = None,
+) -> Tensor:
+    """Stylize a scene from beginning to end; the arguments are those of `Stylizer`.
+
+    Returns:
+        The new sh_dc [N, 3], float32 on the CPU. Everything else of the scene stays as it is.
+    """
+    stylizer = Stylizer(scene, cameras, style, settings, weights=weights, photos=photos)
+    run(stylizer, callbacks)
+    return stylizer.stylized()

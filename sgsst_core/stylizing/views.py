@@ -1,0 +1,172 @@
+"""The views of a job: what each is compared with, and what of it is kept in memory."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from sgsst_core.budget import Shelf
+from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.loss.sos import ContentFeatures, SosLoss, ViewTarget
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel.division import Piece, divide_rows
+from sgsst_core.rasterizer import Rasterizer, Rows
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
+
+PhotoLoader = Callable[[int], Tensor]
+
+
+class Views:
+    """Renders views, and prepares their targets at first use.
+
+    Of several ranks, each renders a band of rows. What is kept is decided by sizes that are the same on every rank, so
+    that all of them find a view's targets, or none: preparing them takes all ranks.
+
+    Args:
+        scene: supplies the colours' frozen part and the content (the unstylized render).
+        cameras: one for each view.
+        rasterizer: renders them.
+        loss: prepares the targets.
+        photos: content image [H, W, 3] of a view by its index; None for the unstylized render.
+        covered: indices of the views that see anything.
+        weighted: weigh statistics by rendered coverage.
+        memory: bytes that content features, coverage and colours of views may take.
+        revive: let colours that the clamp holds at 0 come back (`view_colours_gradient`).
+        keep_content: keep content features that fit; False computes them at each visit, for comparison.
+        regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
+        collectives: of the ranks that render each view together; `loss` has the same.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        rasterizer: Rasterizer,
+        loss: SosLoss,
+        *,
+        covered: list[int],
+        weighted: bool,
+        photos: PhotoLoader | None = None,
+        memory: int = 1 << 30,
+        keep_content: bool = True,
+        revive: bool = False,
+        regions: Sequence[Rectangle] | None = None,
+        collectives: Collectives = ALONE,
+    ) -> None:
+        self.scene = scene
+        self.cameras = list(cameras)
+        self.rasterizer = rasterizer
+        self.loss = loss
+        self.collectives = collectives
+        self._photos = photos
+        self._bands = [
+            divide_rows(
+                camera.height, collectives.size, (regions[index].top, regions[index].bottom) if regions else None
+            )
+            for index, camera in enumerate(cameras)
+        ]
+        self._sh_rest = scene.sh_rest.to(rasterizer.device)
+        self._means = scene.means.to(rasterizer.device)
+        self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
+        self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
+        kept = memory // 2 if keep_content else 0
+        self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept)
+        self.covered = covered
+        self.weighted = weighted
+        self.revive = revive
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def colours(self, index: int, sh_dc: Tensor) -> Tensor:
+        """Colours [N, 3] of a view."""
+        if self.scene.sh_degree == 0:
+            return view_colours(sh_dc, torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device))
+        rest = self._rest.get(index, lambda: rest_colours(self._sh_rest, self._means, self.cameras[index]))
+        return view_colours(sh_dc, rest)
+
+    def render(self, index: int, colours: Tensor) -> Tensor:
+        """Image [H, W, 3] of a view with its colours [N, 3]."""
+        band, camera = self._own_band(index), self.cameras[index]
+        some = band[0] < band[1]
+        rows = self.rasterizer.render(colours, camera, band) if some else self._nothing(0, camera.width, 3)
+        with self.loss.timer("communication"):
+            return self.collectives.gather_rows(rows, self._bands[index])
+
+    def gradient(self, index: int, image_gradient: Tensor, colours: Tensor) -> Tensor:
+        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [H, W, 3] and the colours that were rendered."""
+        with self.loss.timer("communication"):
+            rows = self.collectives.scatter_rows(image_gradient, self._bands[index])
+        if len(rows):
+            gradient = self.rasterizer.colour_gradient(rows, self.cameras[index], self._own_band(index))
+        else:
+            gradient = self._nothing(len(colours), 3)
+        return self.add_up(gradient, colours)
+
+    def add_up(self, gradient: Tensor, colours: Tensor) -> Tensor:
+        """dL/dsh_dc [N, 3] from this rank's part of dL/dcolours [N, 3] and the colours that were rendered."""
+        with self.loss.timer("communication"):
+            gradient = self.collectives.sum(gradient)
+        # After the sum: which colours are let through depends on the sign of their whole gradient.
+        return view_colours_gradient(gradient, colours, revive=self.revive)
+
+    def _nothing(self, *shape: int) -> Tensor:
+        """What a rank without rows has to add."""
+        return torch.zeros(shape, dtype=self.rasterizer.dtype, device=self.rasterizer.device)
+
+    def _own_band(self, index: int) -> Rows:
+        return self._bands[index][self.collectives.rank]
+
+    def content(self, index: int) -> Tensor:
+        """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
+        if self._photos is not None:
+            return self._photos(index)
+        return self.render(index, self.colours(index, self.scene.sh_dc.to(self.rasterizer.device)))
+
+    def target(self, index: int, scales: Sequence[int]) -> ViewTarget:
+        """What the view is compared with at some scales; kept where memory allows.
+
+        Features are computed only of scales that are asked for: phase 1 needs those of one.
+        """
+        coverage = self._coverage.get(index, lambda: self._position_weights(index)) if self.weighted else None
+        camera = self.cameras[index]
+        share = self.loss.share({s: (camera.height >> s, camera.width >> s) for s in scales}, coverage)
+        target = ViewTarget(coverage=coverage, share=share)
+        if self.loss.content_weight:
+            image = functools.cache(lambda: self.content(index))
+            for scale in scales:
+                pieces = share.pieces[scale]
+                make = functools.partial(self._features, image, scale, share.tiles[scale])
+                size = self.loss.content_bytes(pieces)
+                target.content[scale] = self._content.get((index, scale, pieces), make, size)
+        return target
+
+    def share_anew(self) -> None:
+        """Forget what belongs to the present division of the work, because another follows."""
+        self._content.clear()
+
+    def _position_weights(self, index: int) -> list[Tensor]:
+        band, camera = self._own_band(index), self.cameras[index]
+        some = band[0] < band[1]
+        rows = self.rasterizer.coverage(camera, band) if some else self._nothing(0, camera.width)
+        return self.loss.position_weights(self.collectives.gather_rows(rows, self._bands[index]))
+
+    def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        return self.loss.content_features(image(), scale, tiles)
+
+
+#: View, scale, and every rank's pieces of it.
+_ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
+
+
+def _tensor_bytes(tensor: Tensor) -> int:
+    return tensor.numel() * tensor.element_size()
+
+
+def _pyramid_bytes(pyramid: list[Tensor]) -> int:
+    return sum(_tensor_bytes(level) for level in pyramid)

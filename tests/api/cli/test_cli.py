@@ -1,0 +1,707 @@
+"""The `sgsst` command from end to end, on files so small that a job takes seconds."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData
+
+from api.cli.jobs import view_file_names
+from api.cli.main import main
+from sgsst_core.features.network_weights import BackboneWeights, cache_folder
+from sgsst_core.files.ply import read_scene, write_scene
+from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@dataclass
+class Files:
+    """A job's inputs, and the folder that its output goes into."""
+
+    ply: Path
+    cameras: Path
+    style: Path
+    out: Path
+
+    def stylize(self, *options: str) -> list[str]:
+        base = ["stylize", str(self.ply), "--style", str(self.style), "--out", str(self.out), "--backbone", "vgg16"]
+        return [*base, "--cameras", str(self.cameras), *options]
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Files:
+    inputs = tmp_path / "inputs with a space"
+    inputs.mkdir()
+    return Files(*write_files(inputs, wall(sh_degree=1)), out=tmp_path / "new" / "stylized.ply")
+
+
+def second_reader(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a binary little-endian PLY of floats, without plyfile."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    names = [line.split()[2].decode() for line in head.splitlines() if line.startswith(b"property")]
+    count = next(int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element"))
+    values = np.array(struct.unpack(f"<{count * len(names)}f", body), dtype=np.float32).reshape(count, len(names))
+    return {name: values[:, i] for i, name in enumerate(names)}
+
+
+def test_stylize_writes_a_scene_that_differs_in_f_dc_only(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(files.stylize("--steps-sos", "3")) == 0
+    shown = capsys.readouterr().out
+    for expected in ("616 Gaussians, SH degree 1", "3 of 64x48, 1 scale", "VGG16", "3 steps", "before", str(files.out)):
+        assert expected in shown
+    assert sorted(path.name for path in files.out.parent.iterdir()) == [
+        "stylized.before_after.jpg",
+        "stylized.loss.png",
+        "stylized.plan.json",
+        "stylized.ply",
+        "stylized.report.html",
+        "stylized.report.json",
+    ]
+    colours = {"f_dc_0", "f_dc_1", "f_dc_2"}
+    with_plyfile = [PlyData.read(path)["vertex"].data for path in (files.ply, files.out)]
+    by_hand = [second_reader(path) for path in (files.ply, files.out)]
+    for before, after in (with_plyfile, by_hand):
+        names = before.dtype.names if isinstance(before, np.ndarray) else before.keys()
+        assert {name for name in names if not np.array_equal(before[name], after[name])} == colours
+    heads = [path.read_bytes().partition(b"end_header\n")[0] for path in (files.ply, files.out)]
+    assert heads[0] == heads[1]
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["stopped"] == "finished"
+    assert report["loss"]["relative"] < 1
+    assert len(report["history"]) == 3
+
+
+def test_same_command_gives_the_same_file(files: Files) -> None:
+    main(files.stylize("--steps-sos", "3", "--seed", "5"))
+    first = files.out.read_bytes()
+    main(files.stylize("--steps-sos", "3", "--seed", "5"))
+    assert files.out.read_bytes() == first
+
+
+def test_resolution_and_views_are_what_was_asked_for(files: Files) -> None:
+    main(files.stylize("--steps-sos", "1", "--resolution", "80", "--views", "2", "--preset", "preview"))
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["cameras"]["sizes"] == [[80, 60]]
+    assert report["cameras"]["names"] == ["view_0", "view_2"]
+
+
+def test_plan_tells_what_would_be_left_out(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scene(files.ply, ball())
+    out = files.out.with_name("plan.json")
+    command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", "--out", str(out)]
+    assert main([*command, "--style", str(files.ply)]) == 2
+    assert not out.parent.exists()
+    assert main([*command, "--style", str(files.style)]) == 0
+    plan = json.loads(out.read_text())
+    items = {decision["item"] for decision in plan["decisions"]}
+    assert {"position weights", "phase 1", "second forward"} <= items
+    assert plan["prediction"]["seconds"] > 0
+    assert "position weights" in capsys.readouterr().out
+
+
+def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    for out in (files.ply, files.cameras, files.ply.parent):
+        before = files.ply.read_bytes(), files.cameras.read_bytes()
+        assert main([*command, "--out", str(out)]) == 2
+        assert (files.ply.read_bytes(), files.cameras.read_bytes()) == before
+        assert str(out) in capsys.readouterr().err
+
+
+def test_keep_everything_gives_the_same_scene(files: Files) -> None:
+    results = []
+    for options in ([], ["--keep-everything"]):
+        assert main(files.stylize("--steps-sos", "2", *options)) == 0
+        report = json.loads(files.out.with_name("stylized.report.json").read_text())
+        assert report["plan"]["measured"]["seconds"] > 0
+        results.append(read_scene(files.out).scene.sh_dc)
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-3)
+
+
+def test_photos_are_used_as_content(files: Files, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i in range(3):
+        Image.new("RGB", (128, 96), (40 * i, 80, 120)).save(photos / f"view_{i}.png")
+    assert main(files.stylize("--steps-sos", "1", "--images", str(photos))) == 0
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["cameras"]["content"] == str(photos)
+    assert report["loss"]["before"]["scales"]["0"]["content"] > 0
+
+
+def test_orbit_needs_no_camera_file(files: Files) -> None:
+    write_scene(files.ply, ball())
+    command = files.stylize("--steps-sos", "1", "--orbit", "3", "--resolution", "64")
+    at = command.index("--cameras")
+    assert main(command[:at] + command[at + 2 :]) == 0
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["cameras"]["form"] == "orbit"
+    assert report["position_weights"]["used"] is True
+
+
+def test_invalid_gaussians_are_dropped_on_demand(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = wall()
+    scene.opacities[7] = float("nan")
+    write_scene(files.ply, scene)
+    assert main(files.stylize("--steps-sos", "1")) == 2
+    assert "--drop-invalid" in capsys.readouterr().err
+    assert main(files.stylize("--steps-sos", "1", "--drop-invalid")) == 0
+    assert len(read_scene(files.out).scene) == len(scene) - 1
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["scene"]["dropped"] == 1
+
+
+def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
+    shown = capsys.readouterr().out
+    assert "come down to --target-loss" in shown
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert report["stopped"] == "target-loss"
+    assert 3 <= len(report["history"]) < 60
+    assert report["bought"]["relative"] <= 0.8
+    assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
+
+
+def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    """With next to no learning rate nothing falls: two windows of 24 steps, and the run ends."""
+    options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9"]
+    assert main(files.stylize(*options)) == 0
+    assert "has stopped falling" in capsys.readouterr().out
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert (report["stopped"], len(report["history"])) == ("converged", 48)
+
+
+def test_held_out_views_approximations_and_findings_are_reported(files: Files) -> None:
+    assert main(files.stylize("--steps-sos", "16", "--kept-weights", "half")) == 0
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    moments = report["held_out"]["moments"]
+    assert [moment["step"] for moment in moments] == [0, 1, 2, 4, 8, 16]
+    assert moments[0]["gram_relative"] == 1
+    assert moments[-1]["gram_relative"] < 1
+    assert moments[0]["consistency"]["short"]["rmse"] >= 0
+    assert report["approximations"]["what"] == ["half-precision blend weights"]
+    assert all(0 < moment["relative_error"] < 0.1 for moment in report["approximations"]["moments"])
+    assert isinstance(report["findings"], list)
+    page = files.out.with_name("stylized.report.html").read_text()
+    assert "half-precision blend weights" in page
+    plan = json.loads(files.out.with_name("stylized.plan.json").read_text())
+    assert plan["decisions"] == report["plan"]["decisions"]
+
+
+def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = files.out.with_name("bench")
+    command = ["bench", "error-time", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24"]
+    assert main([*command, "--variants", "standard,faster"]) == 2
+    assert "no variant faster" in capsys.readouterr().err
+    assert not folder.exists()
+    assert main([*command, "--seconds", "2", "--variants", "standard, coarse-only"]) == 0
+    assert "coarse-only" in capsys.readouterr().out
+    assert {path.name for path in folder.iterdir()} == {
+        "error_time.json",
+        "error_time.png",
+        "standard.ply",
+        "coarse-only.ply",
+    }
+    values = json.loads((folder / "error_time.json").read_text())
+    assert len(values["variants"]["standard"]["points"]) == 6
+    assert len(read_scene(folder / "standard.ply").scene) == len(wall())
+
+
+def test_bench_stability_measures_the_cases_asked_for(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "found.json"
+    assert main(["bench", "stability", "--quick", "--only", "nan in", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    cases = json.loads(out.read_text())["cases"]
+    assert cases
+    assert all("nan in" in case["case"] and case["passed"] for case in cases)
+    assert "Numerical stability" in shown
+    assert main(["bench", "stability", "--only", "no such case"]) == 2
+    assert "no such case" in capsys.readouterr().err
+
+
+def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    files.out.with_name("stylized.report.json").mkdir(parents=True)
+    assert main(files.stylize("--steps-sos", "1")) == 1
+    error = capsys.readouterr().err
+    assert "report could not be written" in error
+    assert "stylized.report.json" in error
+    assert len(read_scene(files.out).scene) == len(wall())
+
+
+# --- stopping and going on -----------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
+    options = files.stylize("--steps-sos", "25", "--learning-rate", "0.1")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "api.cli", *options]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=files.ply.parent
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("schedule"):  # from here on Ctrl-C lets the step in hand finish
+                break
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=600)  # compiling the kernels included
+    assert process.returncode == 130, error
+    assert "Traceback" not in error
+    checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
+    plan = files.out.with_name("stylized.plan.json")
+    assert sorted(path.name for path in files.out.parent.iterdir()) == [checkpoint.name, plan.name]
+    assert f"saved in {checkpoint}" in error
+    go_on = shlex.split(error.strip().splitlines()[-1])
+    assert go_on == ["sgsst", *options, "--resume"]
+
+    assert main([*options, "--seed", "1", "--resume"]) == 2
+    assert "belongs to another job" in capfd.readouterr().err
+    assert main(go_on[1:]) == 0
+    assert "resuming" in capfd.readouterr().out
+    assert not checkpoint.exists()
+    resumed = files.out.read_bytes()
+    assert main(options) == 0
+    assert files.out.read_bytes() == resumed
+
+
+def test_time_budget_writes_the_result_and_keeps_the_checkpoint(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = files.stylize("--steps-sos", "5")
+    assert main([*options, "--max-seconds", "0.000001"]) == 0
+    shown = capsys.readouterr().out
+    assert "The time was up at step 1 of 5" in shown
+    assert "--resume" in shown
+    checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
+    assert checkpoint.exists()
+    partial = files.out.read_bytes()
+    assert json.loads(files.out.with_name("stylized.report.json").read_text())["stopped"] == "max-seconds"
+
+    assert main([*options, "--max-seconds", "0.000001", "--resume"]) == 2
+    assert "--max-seconds counts these too" in capsys.readouterr().err
+    assert main([*options, "--resume"]) == 0
+    assert not checkpoint.exists()
+    assert files.out.read_bytes() != partial
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert [entry["step"] for entry in report["history"]] == [1, 2, 3, 4, 5]
+
+    assert main([*options, "--resume"]) == 2
+    assert "this job is finished" in capsys.readouterr().err
+
+
+def test_an_old_checkpoint_is_mentioned_when_a_job_starts_anew(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(files.stylize("--steps-sos", "3", "--max-seconds", "0.000001"))
+    capsys.readouterr()
+    assert main(files.stylize("--steps-sos", "2")) == 0
+    assert "of an earlier run is there" in capsys.readouterr().out
+    assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+def _missing_scene(files: Files) -> list[str]:
+    files.ply.unlink()
+    return []
+
+
+def _truncated_scene(files: Files) -> list[str]:
+    files.ply.write_bytes(files.ply.read_bytes()[:-1000])
+    return []
+
+
+def _lying_header(files: Files) -> list[str]:
+    data = files.ply.read_bytes()
+    files.ply.write_bytes(data.replace(b"element vertex 616", b"element vertex 999999999999"))
+    return []
+
+
+def _mesh(files: Files) -> list[str]:
+    files.ply.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 0\n"
+    )
+    return []
+
+
+def _point_cloud(files: Files) -> list[str]:
+    files.ply.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "end_header\n0 0 0\n"
+    )
+    return []
+
+
+def _infinite_values(files: Files) -> list[str]:
+    scene = wall()
+    scene.scales[3, 1] = float("inf")
+    scene.scales[4, 1] = float("nan")
+    write_scene(files.ply, scene)
+    return []
+
+
+def _no_gaussians(files: Files) -> list[str]:
+    head, end, _ = files.ply.read_bytes().partition(b"end_header\n")
+    files.ply.write_bytes(head.replace(b"element vertex 616", b"element vertex 0") + end)
+    return []
+
+
+def _blind_cameras(files: Files) -> list[str]:
+    write_files(files.ply.parent, wall(), [blind_camera(), replace(blind_camera(), name="blind_2")])
+    return []
+
+
+def _unknown_cameras(files: Files) -> list[str]:
+    files.cameras.write_text('{"poses": []}')
+    return []
+
+
+def _no_cameras(files: Files) -> list[str]:
+    files.cameras.unlink()
+    return []
+
+
+def _missing_photos(files: Files) -> list[str]:
+    photos = files.ply.parent / "photos"
+    photos.mkdir()
+    Image.new("RGB", (64, 48)).save(photos / "view_1.png")
+    return ["--images", str(photos)]
+
+
+def _style_is_no_image(files: Files) -> list[str]:
+    files.style.write_text("not an image")
+    return []
+
+
+def _style_is_missing(files: Files) -> list[str]:
+    files.style.unlink()
+    return []
+
+
+def _style_is_a_bomb(files: Files) -> list[str]:
+    """A PNG of a few hundred bytes whose header declares 90000 x 90000 pixels."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", 90000, 90000, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+    files.style.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    return []
+
+
+def _out_is_a_folder(files: Files) -> list[str]:
+    files.out = files.ply.parent
+    return []
+
+
+def _out_lies_in_a_file(files: Files) -> list[str]:
+    files.out = files.cameras / "stylized.ply"
+    return []
+
+
+def _out_is_the_scene(files: Files) -> list[str]:
+    files.out = files.ply.parent / ".." / files.ply.parent.name / files.ply.name
+    return []
+
+
+def _out_is_no_ply(files: Files) -> list[str]:
+    files.out = files.style
+    return []
+
+
+def _no_steps(files: Files) -> list[str]:
+    return ["--steps-sos", "0", "--steps-coarse", "0"]
+
+
+def _both_cameras_and_orbit(files: Files) -> list[str]:
+    return ["--orbit", "3"]
+
+
+def _nothing_to_resume(files: Files) -> list[str]:
+    return ["--resume"]
+
+
+def _damaged_checkpoint(files: Files) -> list[str]:
+    files.out = files.ply.parent / "stylized.ply"
+    files.out.with_name("stylized.checkpoint.safetensors").write_bytes(b"damaged")
+    return ["--resume"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (_missing_scene, ["scene.ply", "No such file"]),
+        (_truncated_scene, ["scene.ply", "truncated"]),
+        (_lying_header, ["scene.ply", "999999999999"]),
+        (_mesh, ["scene.ply", "mesh", "rot_0", "opacity"]),
+        (_point_cloud, ["scene.ply", "point cloud", "f_dc_0"]),
+        (_infinite_values, ["scene.ply", "2 of 616", "scale_1 (1 NaN, 1 infinite)", "--drop-invalid"]),
+        (_no_gaussians, ["scene.ply", "no Gaussians"]),
+        (_blind_cameras, ["None of the 2 cameras sees a Gaussian"]),
+        (_unknown_cameras, ["cameras.json", "transforms.json"]),
+        (_no_cameras, ["cameras.json", "cannot be read"]),
+        (_missing_photos, ["no photo for 2 of 3 views: view_0, view_2"]),
+        (_style_is_no_image, ["style.png", "not an image"]),
+        (_style_is_missing, ["style.png", "No such file"]),
+        (_style_is_a_bomb, ["style.png", "megapixels"]),
+        (_out_is_a_folder, ["is a folder"]),
+        (_out_lies_in_a_file, ["cameras.json"]),
+        (_out_is_the_scene, ["is the scene itself"]),
+        (_out_is_no_ply, ["does not end in .ply"]),
+        (_no_steps, ["steps are 0"]),
+        (_both_cameras_and_orbit, ["--cameras", "--orbit"]),
+        (_nothing_to_resume, ["no checkpoint to resume from"]),
+        (_damaged_checkpoint, ["not a readable checkpoint"]),
+    ],
+)
+def test_bad_input_gives_one_message_and_leaves_nothing(
+    files: Files,
+    tmp_path: Path,
+    spoil: Callable[[Files], list[str]],
+    expected: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    options = spoil(files)
+    before = _everything(tmp_path)
+    assert main(files.stylize(*options)) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.count("error: ") == 1
+    assert len(shown.err.strip().splitlines()) == 1
+    for words in expected:
+        assert words in shown.err
+    assert _everything(tmp_path) == before
+
+
+def _everything(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+
+
+def test_neither_cameras_nor_orbit_is_an_error_that_names_both(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = files.stylize()
+    at = command.index("--cameras")
+    assert main(command[:at] + command[at + 2 :]) == 2
+    error = capsys.readouterr().err
+    assert "--cameras" in error
+    assert "--orbit" in error
+
+
+def test_photos_of_an_orbit_are_an_error(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    command = files.stylize("--orbit", "3", "--images", str(files.ply.parent))
+    at = command.index("--cameras")
+    assert main(command[:at] + command[at + 2 :]) == 2
+    assert "--images" in capsys.readouterr().err
+
+
+def test_a_folder_without_write_permission_is_refused_before_any_work(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if os.geteuid() == 0:  # root may write anywhere but where the kernel itself refuses
+        folder = Path("/proc")
+        if not folder.is_dir():
+            pytest.skip("root can write everywhere on this system")
+    else:
+        folder = tmp_path / "locked"
+        folder.mkdir(mode=0o500)
+    files.out = folder / "stylized.ply"
+    assert main(files.stylize("--steps-sos", "1")) == 2
+    assert "not writable" in capsys.readouterr().err
+
+
+def test_without_weights_the_message_says_how_to_get_them(
+    files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "empty"))
+    for backbone in ("auto", "vgg16", "vgg19"):
+        assert main(files.stylize("--backbone", backbone)) == 2
+        assert "sgsst weights fetch vgg1" in capsys.readouterr().err
+    assert not files.out.parent.exists()
+
+
+def test_damaged_weights_are_refused(
+    files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray((cache_folder() / "vgg16.safetensors").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "vgg16.safetensors").write_bytes(data)
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
+    assert main(files.stylize()) == 2
+    assert "corrupt" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--preset", "fast"],
+        ["--precision", "float16"],
+        ["--background", "0,0,256"],
+        ["--background", "blue"],
+        ["--memory-limit", "lots"],
+        ["--memory-limit", "0GB"],
+        ["--resolution", "0"],
+        ["--views", "0"],
+        ["--learning-rate", "-1"],
+        ["--max-seconds", "0"],
+        ["--unheard-of"],
+    ],
+)
+def test_wrong_options_end_with_code_2(files: Files, options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(files.stylize(*options)) == 2
+    error = capsys.readouterr().err
+    assert options[0].strip("-").replace("-", "_") in error.replace("-", "_")
+    assert not files.out.parent.exists()
+
+
+def test_a_backbone_chosen_by_default_is_named_with_its_reason(
+    files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
+    assert main(files.stylize("--steps-sos", "1", "--backbone", "auto")) == 0
+    assert "VGG16, because VGG19 (the paper's) is not installed" in capsys.readouterr().out
+
+
+# --- render, weights, program --------------------------------------------------------------------------------------
+
+
+def test_render_writes_one_picture_a_view_in_the_cameras_order(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ["b/left.png", "a/left.png", "a/left.png"]
+    views = [replace(camera, name=name) for camera, name in zip(cameras(3), names, strict=True)]
+    write_files(files.ply.parent, ball(), views)
+    out = tmp_path / "renders"
+    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--out", str(out)]
+    assert main(command) == 0
+    assert "3 views" in capsys.readouterr().out
+    pictures = sorted(out.iterdir())
+    assert [picture.name for picture in pictures] == ["0000_b_left.png", "0001_a_left.png", "0002_a_left.png"]
+    arrays = [np.asarray(Image.open(picture)) for picture in pictures]
+    assert arrays[0].shape == (48, 64, 3)
+    assert (arrays[0][0, 0] == 0).all()
+    means = [np.nonzero(array.any(axis=(0, 2)))[0].mean() for array in arrays]
+    assert means == sorted(means, reverse=True) or means == sorted(means)
+
+    assert main([*command, "--background", "10,20,30", "--resolution", "100", "--views", "1"]) == 0
+    picture = np.asarray(Image.open(out / "0000_a_left.png"))
+    assert picture.shape == (75, 100, 3)
+    assert picture[0, 0].tolist() == [10, 20, 30]
+
+
+def test_render_refuses_what_stylize_refuses(files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _blind_cameras(files)
+    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--out", str(tmp_path / "renders")]
+    assert main(command) == 2
+    assert "sees a Gaussian" in capsys.readouterr().err
+    assert main(command[:2] + command[4:]) == 2
+    assert "--orbit" in capsys.readouterr().err
+    files.ply.unlink()
+    assert main(command) == 2
+    assert "scene.ply" in capsys.readouterr().err
+    assert not (tmp_path / "renders").exists()
+    assert main([*command[:-1], str(files.style)]) == 2
+    assert "style.png" in capsys.readouterr().err
+
+
+def test_file_names_of_views_are_plain_and_sort_in_order() -> None:
+    names = ["../up.JPG", "a:b*?.png", "", "x" * 300, "frame.0001", "Ünï.png", "."]
+    views = [replace(camera, name=name) for camera, name in zip(cameras(7), names, strict=True)]
+    files = view_file_names(views)
+    assert files == sorted(files)
+    assert files[:3] == ["0000_up.png", "0001_a_b.png", "0002.png"]
+    assert files[4] == "0004_frame.0001.png"
+    assert max(map(len, files)) < 100
+    many = view_file_names([views[0]] * 10_001)
+    assert many == sorted(many)
+
+
+def test_weights_are_listed_and_fetched(
+    vgg16_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = {
+        f"features.{index}.{kind}": tensor
+        for index, pair in zip(
+            (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), vgg16_weights.convolutions.values(), strict=True
+        )
+        for kind, tensor in zip(("weight", "bias"), pair, strict=True)
+    }
+    torch.save(state, tmp_path / "vgg16.pth")
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "cache"))
+    assert main(["weights", "path"]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "cache")
+    assert main(["weights", "fetch", "vgg16", "--from", str(tmp_path / "vgg16.pth")]) == 0
+    assert str(tmp_path / "cache" / "vgg16.safetensors") in capsys.readouterr().out
+    assert main(["weights", "list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert next(line for line in lines if line.startswith("vgg16")).split()[3] == "installed"
+    assert "to download from" in next(line for line in lines if line.startswith("vgg19"))
+    assert main(["weights", "fetch", "vgg16", "--from", str(tmp_path / "missing.pth")]) == 2
+    assert "missing.pth" in capsys.readouterr().err
+
+
+def test_help_and_version_need_no_heavy_import() -> None:
+    check = "import sys, api.cli.main; sys.exit(any(name in sys.modules for name in ('torch', 'numba', 'matplotlib')))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    assert subprocess.run([sys.executable, "-c", check], env=environment).returncode == 0
+
+
+def test_an_error_in_a_process_of_its_own_is_one_line_on_stderr(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "api.cli", "render", "missing.ply", "--orbit", "2", "--out", "renders"]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.splitlines() == [f"error: {done.stderr.removeprefix('error: ').strip()}"]
+    assert "missing.ply" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- check ---------------------------------------------------------------------------------------------------------
+
+
+def test_check_tells_what_is_extreme_and_what_is_done_about_it(
+    files: Files, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = wall()
+    scene.means[3, 0] = float("nan")
+    scene.quats[5] = 0
+    write_scene(files.ply, scene)
+    Image.new("RGB", (40, 40), (90, 90, 90)).save(files.style)
+    options = ["--cameras", str(files.cameras), "--style", str(files.style)]
+    before = sorted(files.ply.parent.iterdir())
+    assert main(["check", str(files.ply), *options]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for expected in ("infinite values", "1 of 616", "Gaussian 5: 0", "never drawn", "one colour"):
+        assert expected in shown, shown
+    assert sorted(files.ply.parent.iterdir()) == before
+
+    files.ply.write_bytes(b"not a scene")
+    assert main(["check", str(files.ply), *options]) == 2
+    assert str(files.ply) in capsys.readouterr().err

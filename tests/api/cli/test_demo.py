@@ -1,0 +1,54 @@
+"""`sgsst demo`, cut down to one step on small views: the same files and the same path through the program."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+
+from api.cli import main as cli
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.ply import read_scene
+
+
+def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
+    vgg16_weights: BackboneWeights,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(cli, "DEMO_STEPS", 1)
+    monkeypatch.setattr(cli, "DEMO_RESOLUTION", 180)
+    out = tmp_path / "demo"
+    assert cli.main(["demo", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    names = {"stylized.ply", "stylized.report.json", "stylized.before_after.jpg", "stylized.loss.png"}
+    names |= {"stylized.report.html"}
+    inputs = {"motorcycle.ply", "cameras.json", "style.png"}
+    assert {path.name for path in out.iterdir()} == names | inputs | {"stylized.plan.json"}
+    for name in names:
+        assert str(out / name) in shown
+    before, after = read_scene(out / "motorcycle.ply").scene, read_scene(out / "stylized.ply").scene
+    assert torch.equal(before.means, after.means)
+    assert float((before.sh_dc != after.sh_dc).float().mean()) > 0.5
+    report = json.loads((out / "stylized.report.json").read_text())
+    assert report["loss"]["relative"] < 0.9
+    assert report["cameras"]["count"] == 10
+
+    # what it prints is the command that it ran
+    command = next(line for line in shown.splitlines() if line.startswith("command:")).removeprefix("command:")
+    arguments = shlex.split(command)
+    assert arguments[:3] == ["sgsst", "stylize", str(out / "motorcycle.ply")]
+    assert cli.main([*arguments[1:], "--resume"]) == 2
+    assert "this job is finished" in capsys.readouterr().err
+
+
+def test_demo_into_a_folder_that_cannot_be_written_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert cli.main(["demo", "--out", str(tmp_path / "file")]) == 2
+    assert "file" in capsys.readouterr().err

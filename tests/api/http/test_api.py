@@ -1,0 +1,567 @@
+"""The API by itself, in its real process: what it refuses and how, uploads, keys, memory."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import socket
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+
+from api.cli.serve import ServeError, serve
+from service.files.blobs import BlobFolder
+from service.settings import ServiceSettings
+from service.store import open_store
+from tests.api.service import Service, check_documented, wait_for
+from tests.small_scenes import wall, write_files
+
+MB = 1_000_000
+TUS = {"Tus-Resumable": "1.0.0"}
+OFFSET_STREAM = "application/offset+octet-stream"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    limits = {
+        "SGSST_MAX_REQUEST_BYTES": str(500 * MB),
+        "SGSST_MAX_UPLOAD_BYTES": str(400 * MB),
+        "SGSST_MAX_GAUSSIANS": "5000",
+        "SGSST_MAX_IMAGE_PIXELS": str(20 * MB),
+        "SGSST_RECEIVE_SECONDS": "2",
+        "SGSST_INSPECTION_SECONDS": "20",
+        "SGSST_MAX_JOBS_PER_KEY": "1000",
+    }
+    data = tmp_path_factory.mktemp("api") / "data"
+    with Service(data, alone=True, **limits) as running:
+        yield running
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[httpx.Client]:
+    with service.client() as made:
+        yield made
+
+
+def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
+    """Multipart fields; a changed one may bring its own file name, None leaves it out."""
+    names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
+    parts: list[tuple[str, Any]] = []
+    for role in {**files, **changed}:
+        content = changed.get(role, files.get(role))
+        if content is not None:
+            parts.append((role, content if isinstance(content, tuple) else (names.get(role, role), content)))
+    return parts
+
+
+def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
+    """The problem document, after a look at its form."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    check_documented(answer)
+    problem: dict[str, Any] = answer.json()
+    assert (problem["status"], problem["code"]) == (status, code), problem
+    assert problem["title"]
+    assert problem["detail"]
+    assert "/tmp" not in problem["detail"], "a path of the service"
+    return problem
+
+
+def jobs_of(client: httpx.Client) -> list[str]:
+    return [entry["id"] for entry in client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]]
+
+
+# --- inputs that cannot be used ------------------------------------------------------------------------------------
+
+
+def png(width: int, height: int, rows: bytes) -> bytes:
+    """A PNG that says it has so many pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def lying(scene: bytes, count: int) -> bytes:
+    return scene.replace(b"element vertex 616", f"element vertex {count}".encode())
+
+
+def bomb() -> bytes:
+    """75 MB of black in 73 kB."""
+    return png(5000, 5000, zlib.compress(bytes(15_001 * 5000), 9))
+
+
+def moved(cameras: bytes) -> bytes:
+    """The cameras a million units away."""
+    return cameras.replace(b'"position": [', b'"position": [1e6, 1e6, 1e6], "before": [')
+
+
+OTHER_PLY = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n"
+
+HOSTILE = [
+    ("no PLY", "scene", lambda f: b"GIF89a" + f["scene"], "invalid-scene"),
+    ("empty scene", "scene", lambda f: b"", "invalid-scene"),
+    ("truncated scene", "scene", lambda f: f["scene"][:-5], "invalid-scene"),
+    ("more Gaussians than bytes", "scene", lambda f: lying(f["scene"], 4999), "invalid-scene"),
+    ("too many Gaussians", "scene", lambda f: lying(f["scene"], 5001) + bytes(400_000), "too-many-gaussians"),
+    ("2^63 Gaussians", "scene", lambda f: lying(f["scene"], 2**63), "invalid-scene"),
+    ("header without end", "scene", lambda f: b"ply\n" + b"comment x\n" * 200_000, "invalid-scene"),
+    ("another PLY", "scene", lambda f: OTHER_PLY, "invalid-scene"),
+    ("NaN", "scene", lambda f: f["scene"][:-4] + struct.pack("<f", float("nan")), "invalid-scene"),
+    ("no image", "style", lambda f: b"<svg/>", "invalid-image"),
+    ("truncated image", "style", lambda f: f["style"][: len(f["style"]) // 2], "invalid-image"),
+    ("decompression bomb", "style", lambda f: bomb(), "image-too-large"),
+    ("a lying image", "style", lambda f: png(2**31 - 1, 2**31 - 1, b""), "invalid-image"),
+    ("no JSON", "cameras", lambda f: b"{", "invalid-cameras"),
+    ("deep JSON", "cameras", lambda f: b"[" * 200_000, "invalid-cameras"),
+    ("no cameras in it", "cameras", lambda f: b"[]", "invalid-cameras"),
+    ("NaN camera", "cameras", lambda f: f["cameras"].replace(b'"fx": 64', b'"fx": NaN'), "invalid-cameras"),
+    ("cameras that see nothing", "cameras", lambda f: moved(f["cameras"]), "invalid-cameras"),
+    ("photos of nothing", "photos", lambda f: b"no photo", "invalid-image"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("role", "make", "code"), [case[1:] for case in HOSTILE], ids=[case[0] for case in HOSTILE])
+def test_what_cannot_be_used_is_never_accepted(
+    client: httpx.Client, files: dict[str, bytes], role: str, make: Any, code: str
+) -> None:
+    before = jobs_of(client)
+    name = {"photos": "view_0.png", "cameras": "cameras.json"}.get(role, role)
+    problem = refused(client.post("/v1/jobs", files=form(files, **{role: (name, make(files))})), 422, code)
+    assert problem["input"] == role
+    assert jobs_of(client) == before
+
+
+PARAMETERS = [
+    ('{"steps_sos": -1}', "invalid-request"),
+    ('{"steps_sos": 1e99}', "invalid-request"),
+    ('{"steps_sos": 0, "steps_coarse": 0}', "invalid-settings"),
+    ('{"preset": "best"}', "invalid-request"),
+    ('{"unknown": 1}', "invalid-request"),
+    ('{"near": NaN}', "invalid-request"),
+    ('{"background": [0, 0]}', "invalid-request"),
+    ('{"orbit": 3}', "invalid-cameras"),
+    ("[]", "invalid-request"),
+    ("{", "invalid-request"),
+    ("[" * 60_000, "invalid-request"),
+    ('{"name": "' + "x" * 70_000 + '"}', "invalid-request"),
+]
+
+
+@pytest.mark.parametrize(("text", "code"), PARAMETERS, ids=[text[:30] for text, _ in PARAMETERS])
+def test_parameters_that_make_no_sense(client: httpx.Client, files: dict[str, bytes], text: str, code: str) -> None:
+    refused(client.post("/v1/jobs", files=form(files), data={"parameters": text}), 422, code)
+
+
+def test_missing_and_surplus_files(client: httpx.Client, files: dict[str, bytes]) -> None:
+    assert refused(client.post("/v1/jobs", files=form(files, style=None)), 422, "invalid-request")["input"] == "style"
+    refused(client.post("/v1/jobs", files=form(files, cameras=None)), 422, "invalid-cameras")
+    refused(client.post("/v1/jobs", files=[*form(files), ("scene", ("b.ply", files["scene"]))]), 422, "invalid-request")
+    refused(client.post("/v1/jobs", files=form(files, weights=b"x")), 422, "invalid-request")
+    refused(client.post("/v1/jobs", files=form(files, cameras=("a.exe", b"x"))), 422, "invalid-cameras")
+
+
+def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> None:
+    for name in (
+        "../../../../etc/passwd",
+        "/etc/passwd",
+        "..\\..\\x.ply",
+        "a\x00b.ply",
+        "." * 300,
+        "~root",
+        "CON",
+        "\u202egnp",
+    ):
+        answer = client.post(
+            "/v1/jobs", files=form(files, scene=(name, files["scene"])), data={"parameters": '{"steps_sos": 1}'}
+        )
+        assert answer.status_code == 202, answer.text
+        (shown,) = [entry["name"] for entry in answer.json()["inputs"] if entry["role"] == "scene"]
+        assert "/" not in shown
+        assert not shown.startswith(".")
+
+
+# --- bodies --------------------------------------------------------------------------------------------------------
+
+
+def raw(service: Service, head: str, body: bytes, *, close: bool = True) -> bytes:
+    """What the service answers to exactly these bytes."""
+    host, port = service.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(head.replace("\n", "\r\n").encode() + b"\r\n\r\n" + body)
+        if close:
+            connection.shutdown(socket.SHUT_WR)
+        answer = b""
+        while part := connection.recv(65536):
+            answer += part
+            if b"\r\n\r\n" in answer and not close:
+                break
+        return answer
+
+
+def test_a_body_that_is_cut_off(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+    request = client.build_request("POST", "/v1/jobs", files=form(files))
+    body = request.read()
+    before = jobs_of(client)
+    headers = {"content-type": request.headers["content-type"]}
+    for end in (0, 10, 200, len(body) // 2, len(body) - 3):
+        refused(client.post("/v1/jobs", content=body[:end], headers=headers), 400, "malformed-body")
+    head = (
+        f"POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: {len(body)}\nContent-Type: {headers['content-type']}"
+    )
+    raw(service, head, body[: len(body) // 2])  # the connection breaks
+    assert jobs_of(client) == before
+    wait_for(lambda: not list((service.data / "incoming").iterdir()), "half files to be removed")
+
+
+def test_a_connection_may_rest_between_requests(service: Service) -> None:
+    host, port = service.url.removeprefix("http://").split(":")
+    post = "POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(post.encode())
+        assert b" 422 " in connection.recv(65536).splitlines()[0]
+        time.sleep(2.5)  # longer than a request may stand still
+        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+        assert b"HTTP/1.1 200 OK" in answer
+
+
+def test_a_body_that_comes_too_slowly(service: Service) -> None:
+    head = (
+        "POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: 1000\nContent-Type: multipart/form-data; boundary=x"
+    )
+    assert b" 408 " in raw(service, head, b"--x\r\n", close=False).splitlines()[0]
+
+
+@pytest.mark.parametrize("kind", ["text/plain", ""])
+def test_other_media_types(client: httpx.Client, kind: str) -> None:
+    refused(client.post("/v1/jobs", content=b"x", headers={"content-type": kind}), 415, "unsupported-media-type")
+
+
+def test_a_request_that_is_too_long(service: Service, client: httpx.Client) -> None:
+    head = "POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: 600000000\n"
+    head += "Content-Type: multipart/form-data; boundary=x"
+    assert b" 413 " in raw(service, head, b"--x\r\n", close=False).splitlines()[0]
+    refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(401 * MB)}), 413, "too-large")
+
+
+def test_memory_stays_flat_while_files_come_in(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+    client.get("/readyz")
+    api = service.process("api.http.server")
+    assert api is not None
+    before = api.memory_info().rss
+    boundary = "b0undary"
+    size = 300 * MB
+    block = bytes(MB)
+    largest = before
+
+    def body() -> Iterator[bytes]:
+        nonlocal largest
+        yield f'--{boundary}\r\nContent-Disposition: form-data; name="style"; filename="x.png"\r\n\r\n'.encode()
+        for _ in range(size // MB):
+            yield block
+            largest = max(largest, psutil.Process(api.pid).memory_info().rss)
+        yield f"\r\n--{boundary}--\r\n".encode()
+
+    headers = {"content-type": f"multipart/form-data; boundary={boundary}"}
+    answer = client.post("/v1/jobs", content=body(), headers=headers)
+    refused(answer, 422, "invalid-request")  # the scene is missing
+    assert largest - before < 64 * MB
+
+
+# --- uploads -------------------------------------------------------------------------------------------------------
+
+
+def begin(client: httpx.Client, size: int, name: str = "scene.ply") -> str:
+    metadata = f"filename {base64.b64encode(name.encode()).decode()}"
+    answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(size), "Upload-Metadata": metadata})
+    assert answer.status_code == 201, answer.text
+    assert answer.headers["upload-expires"].endswith("GMT")
+    return str(answer.headers["location"])
+
+
+def send(client: httpx.Client, where: str, offset: int, data: bytes, **headers: str) -> httpx.Response:
+    fixed = {**TUS, "Upload-Offset": str(offset), "Content-Type": OFFSET_STREAM}
+    return client.patch(where, content=data, headers={**fixed, **headers})
+
+
+def upload(client: httpx.Client, data: bytes, name: str) -> str:
+    where = begin(client, len(data), name)
+    assert send(client, where, 0, data).status_code == 204
+    return where.rsplit("/", 1)[1]
+
+
+def test_an_upload_in_parts_becomes_a_job(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+    scene = files["scene"]
+    where = begin(client, len(scene))
+    assert client.head(where).headers["upload-offset"] == "0"
+    assert send(client, where, 0, scene[:1000]).headers["upload-offset"] == "1000"
+    assert refused(send(client, where, 0, scene), 409, "conflict")["offset"] == 1000
+    assert client.head(where).headers["upload-offset"] == "1000"
+    wrong = "sha256 " + base64.b64encode(bytes(32)).decode()
+    refused(send(client, where, 1000, scene[1000:2000], **{"Upload-Checksum": wrong}), 460, "checksum-mismatch")
+    right = "sha1 " + base64.b64encode(hashlib.sha1(scene[1000:2000]).digest()).decode()
+    assert send(client, where, 1000, scene[1000:2000], **{"Upload-Checksum": right}).status_code == 204
+    unfinished = {
+        "scene": where.rsplit("/", 1)[1],
+        "style": upload(client, files["style"], "style.png"),
+        "parameters": {"orbit": 2},
+    }
+    refused(client.post("/v1/jobs", json=unfinished), 422, "unfinished-upload")
+    refused(send(client, where, 2000, scene), 413, "too-large")
+    assert send(client, where, 2000, scene[2000:]).status_code == 204
+    shown = client.get(where).json()
+    assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(scene).hexdigest())
+    assert client.head(where).headers["upload-offset"] == str(len(scene))
+    answer = client.post("/v1/jobs", json=unfinished)
+    assert answer.status_code == 202, answer.text
+    mixed = client.post("/v1/jobs", files=form(files, scene=None), data={"scene": unfinished["scene"]})
+    assert mixed.status_code == 202, mixed.text
+
+
+def test_a_broken_connection_keeps_what_has_come(service: Service, client: httpx.Client) -> None:
+    where = begin(client, 5 * MB)
+    head = f"PATCH {where} HTTP/1.1\nHost: 127.0.0.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\n"
+    head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: {5 * MB}"
+    raw(service, head, bytes(2 * MB))
+    offset = int(wait_for(lambda: int(client.head(where).headers["upload-offset"]), "the part to be saved"))
+    assert 0 < offset <= 2 * MB
+    assert send(client, where, offset, bytes(5 * MB - offset)).status_code == 204
+    assert client.get(where).json()["sha256"] == hashlib.sha256(bytes(5 * MB)).hexdigest()
+
+
+def test_one_scene_of_many_jobs_is_stored_once(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+    for _ in range(3):
+        upload(client, files["scene"], "again.ply")
+        assert client.post("/v1/jobs", files=form(files)).status_code == 202
+    digest = hashlib.sha256(files["scene"]).hexdigest()
+    assert len(list((service.data / "blobs").glob(f"*/{digest}*"))) == 1
+
+
+def test_the_protocol_of_uploads(client: httpx.Client) -> None:
+    options = client.options("/v1/uploads")
+    assert options.status_code == 204
+    assert set(options.headers["tus-extension"].split(",")) == {"creation", "expiration", "checksum", "termination"}
+    where = begin(client, 10)
+    refused(client.patch(where, content=b"x", headers={**TUS, "Upload-Offset": "0"}), 415, "unsupported-media-type")
+    refused(send(client, where, 0, b"x", **{"Tus-Resumable": "0.2"}), 412, "unsupported-tus-version")
+    refused(send(client, where, 0, b"x", **{"Upload-Checksum": "crc32 AAAA"}), 400, "malformed-body")
+    refused(client.post("/v1/uploads", headers=TUS), 422, "invalid-request")
+    refused(client.get("/v1/uploads/upl_00000000000"), 404, "not-found")
+    assert client.delete(where).status_code == 204
+    refused(client.get(where), 404, "not-found")
+
+
+def test_idempotency_keys(client: httpx.Client, files: dict[str, bytes]) -> None:
+    headers = {"Idempotency-Key": "the-same"}
+    first = client.post("/v1/jobs", files=form(files), headers=headers)
+    again = client.post("/v1/jobs", files=form(files), headers=headers)
+    assert first.json()["id"] == again.json()["id"]
+    assert again.headers["idempotency-replayed"] == "true"
+    other = client.post("/v1/jobs", files=form(files), data={"parameters": '{"seed": 1}'}, headers=headers)
+    refused(other, 422, "idempotency-key-reused")
+    made = [client.post("/v1/uploads", headers={**TUS, **headers, "Upload-Length": "5"}).json()["id"] for _ in range(2)]
+    assert made[0] == made[1]
+
+
+# --- who is asking -------------------------------------------------------------------------------------------------
+
+
+def test_keys_separate_their_holders(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+    store = open_store(ServiceSettings(data=service.data))
+    (mine, text), (_, other) = store.keys.create("mine"), store.keys.create("other")
+    with service.client(text) as me, service.client(other) as you:
+        job_id = me.post("/v1/jobs", files=form(files)).json()["id"]
+        where = begin(me, 5)
+        assert jobs_of(me) == [job_id]
+        assert jobs_of(you) == []
+        for caller in (you, client):
+            for method, path in (
+                ("GET", ""),
+                ("POST", "/cancel"),
+                ("POST", "/retry"),
+                ("DELETE", ""),
+                ("GET", "/events"),
+                ("GET", "/artifacts"),
+                ("GET", "/artifacts/plan.json"),
+            ):
+                refused(caller.request(method, f"/v1/jobs/{job_id}{path}"), 404, "not-found")
+            refused(caller.get(where), 404, "not-found")
+            refused(send(caller, where, 0, b"12345"), 404, "not-found")
+            stolen = {"scene": where.rsplit("/", 1)[1], "style": where.rsplit("/", 1)[1], "parameters": {"orbit": 1}}
+            refused(caller.post("/v1/jobs", json=stolen), 422, "unknown-upload")
+        store.keys.revoke(mine.id)
+        assert refused(me.get("/v1/jobs"), 401, "unauthorized")
+    with service.client("sgsst_wrong") as nobody:
+        assert nobody.get("/v1/jobs").headers["www-authenticate"] == "Bearer"
+    store.close()
+
+
+def test_web_pages_cannot_use_a_service_without_keys(client: httpx.Client) -> None:
+    refused(client.get("/v1/jobs", headers={"Host": "evil.example"}), 403, "foreign-site")
+    refused(client.get("/v1/jobs", headers={"Origin": "https://evil.example"}), 403, "foreign-site")
+    refused(client.get("/v1/jobs", headers={"Origin": "null"}), 403, "foreign-site")
+    assert client.get("/v1/jobs", headers={"Origin": str(client.base_url).rstrip("/")}).status_code == 200
+
+
+def test_keys_are_needed_where_others_can_reach_the_service(tmp_path: Path) -> None:
+    with Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service, service.client() as client:
+        refused(client.get("/v1/jobs"), 401, "unauthorized")
+        assert client.get("/livez").status_code == 200
+
+
+def test_nobody_else_is_let_in_before_there_is_a_key(tmp_path: Path) -> None:
+    with pytest.raises(ServeError, match="there is no API key yet"):
+        serve(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
+
+
+def test_half_files_of_a_dead_process_are_collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(ServiceSettings(data=tmp_path))
+    blobs = BlobFolder(tmp_path, store.inputs, 0)
+    half = blobs.incoming / "half.part"
+    half.write_bytes(b"x")
+    blobs.collect()
+    assert half.exists(), "it may still be written to"
+    monkeypatch.setattr(
+        "service.files.blobs._ORPHAN_SECONDS", -1.0
+    )  # no file's age can be made up: it is that of its name
+    blobs.collect()
+    assert not half.exists()
+    store.close()
+
+
+def test_limits_of_a_key_and_of_the_disk(tmp_path: Path, files: dict[str, bytes]) -> None:
+    with Service(tmp_path / "data", alone=True, SGSST_MAX_JOBS_PER_KEY="1") as service, service.client() as client:
+        assert client.post("/v1/jobs", files=form(files)).status_code == 202
+        answer = client.post("/v1/jobs", files=form(files))
+        refused(answer, 429, "queue-full")
+        assert answer.headers["retry-after"]
+    with Service(tmp_path / "data", alone=True) as service, service.client() as client:
+        job_ids = jobs_of(client)
+        assert client.post(f"/v1/jobs/{job_ids[0]}/cancel").json()["status"] == "canceled"
+    full = ServiceSettings(data=tmp_path / "data", min_free_bytes=10**18)
+    with Service(tmp_path / "other", alone=True) as service:
+        service.stop()
+        service.environment["SGSST_MIN_FREE_BYTES"] = str(full.min_free_bytes)
+        service.ready = lambda: _answers(service.url)  # type: ignore[method-assign]
+        service.start()
+        with service.client() as client:
+            refused(client.post("/v1/jobs", files=form(files)), 507, "insufficient-storage")
+            refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5"}), 507, "insufficient-storage")
+            health = client.get("/readyz")
+            assert (health.status_code, health.json()["checks"]["disk"]) == (503, "NoSpaceError")
+
+
+def _answers(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/livez", timeout=5).status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def test_a_stream_with_nothing_left_to_tell(client: httpx.Client, files: dict[str, bytes]) -> None:
+    """Of a job that has ended, after its last event or one that never was: it would not end."""
+    job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
+    client.post(f"/v1/jobs/{job_id}/cancel")
+    told = client.get(f"/v1/jobs/{job_id}/events").text
+    last = max(int(line.removeprefix("id: ")) for line in told.splitlines() if line.startswith("id: "))
+    for number in (last, last + 1, 10**15):
+        answer = client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(number)})
+        assert answer.status_code == 204
+    assert client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(last - 1)}).status_code == 200
+
+
+def test_unknown_paths_and_methods(client: httpx.Client) -> None:
+    refused(client.get("/v1/nothing"), 404, "not-found")
+    answer = client.put("/v1/jobs")
+    refused(answer, 405, "method-not-allowed")
+    assert answer.headers["allow"] == "GET, POST"
+    for job_id in ("job_00000000000", "../x", "job_' OR 1=1", "a" * 5000):
+        assert client.get(f"/v1/jobs/{job_id}").status_code == 404
+    refused(client.get("/v1/jobs", params={"limit": 0}), 422, "invalid-request")
+    refused(client.get("/v1/jobs", params={"cursor": "x"}), 422, "invalid-request")
+    refused(client.get("/v1/jobs", params={"status": "x"}), 422, "invalid-request")
+
+
+def test_readiness_tells_whether_somebody_is_there_to_run_jobs(service: Service, client: httpx.Client) -> None:
+    answer = client.get("/readyz")
+    assert (answer.status_code, answer.json()["status"]) == (200, "waiting")
+    assert answer.json()["checks"] == {"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "none"}
+    store = open_store(ServiceSettings(data=service.data))
+    store.operations.beat("one", 8, 3)
+    answer = client.get("/readyz")
+    assert (answer.json()["status"], answer.json()["checks"]["dispatchers"]) == ("ok", "1")
+    metrics = client.get("/metrics").text.splitlines()
+    assert {"sgsst_dispatchers 1.0", "sgsst_places 8.0", "sgsst_places_free 3.0"} <= set(metrics)
+    store.operations.gone("one")
+    assert client.get("/readyz").json()["status"] == "waiting"
+    assert "sgsst_dispatchers 0.0" in client.get("/metrics").text
+    store.close()
+
+
+def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, bytes]) -> None:
+    with Service(tmp_path / "data", alone=True) as service, service.client() as client:
+        for _ in range(3):
+            client.post("/v1/jobs", files=form(files))
+        now = time.time()
+        store = open_store(ServiceSettings(data=service.data), lambda: now)
+        held = store.jobs.lease("lost")
+        assert held is not None
+        now += 1000
+        held = store.jobs.lease("one")
+        assert held is not None
+        store.jobs.fail(held, {"code": "x", "message": "x"}, permanent=True, retention=1000.0)
+        for step, seconds in ((30, 10.0), (8, 4.0)):
+            held = store.jobs.lease("one")
+            assert held is not None
+            store.jobs.running(held)
+            store.jobs.progress(held, {"step": step, "seconds": seconds, "total": 100})
+        text = client.get("/metrics").text
+        found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+        assert found["sgsst_lease_expirations_total"] == "1.0"
+        assert found["sgsst_attempts_total"] == "4.0"
+        assert found['sgsst_attempts_ended_total{outcome="lost"}'] == "1.0"
+        assert found['sgsst_attempts_ended_total{outcome="failed"}'] == "1.0"
+        assert found['sgsst_jobs_finished_total{status="failed"}'] == "1.0"
+        assert found['sgsst_jobs{status="running"}'] == "2.0"
+        assert found["sgsst_queue_wait_seconds_count_total"] == "4.0"
+        assert float(found["sgsst_queue_wait_seconds_sum_total"]) >= 2000
+        assert found["sgsst_iterations_per_second"] == "5.0"
+        assert "job_" not in text, "metrics name no job"
+        store.close()
+
+
+def test_metrics_and_documentation(client: httpx.Client) -> None:
+    client.get("/v1/jobs")
+    text = client.get("/metrics").text
+    assert 'sgsst_requests_total{method="GET",route="/v1/jobs",status="200"}' in text
+    assert "sgsst_jobs_submitted_total" in text
+    assert client.get("/docs").status_code == 200
+    document = client.get("/openapi.json").json()
+    assert "JobParameters" in document["components"]["schemas"]
+
+
+def test_a_flood_of_broken_requests_leaves_nothing(service: Service, client: httpx.Client) -> None:
+    rubbish = b"\x00\xff" * 1000
+    for boundary in ("x", "--", "a b"):
+        client.post(
+            "/v1/jobs", content=rubbish, headers={"content-type": f'multipart/form-data; boundary="{boundary}"'}
+        )
+    assert json.loads(client.get("/livez").text)["status"] == "ok"
+    assert "Traceback" not in service.said()

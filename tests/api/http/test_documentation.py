@@ -1,0 +1,95 @@
+"""The OpenAPI document: whole, with an example of everything, and every example as its schema says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from jsonschema import Draft202012Validator, FormatChecker
+from openapi_spec_validator import validate
+
+from api.http.app import create_app
+from api.http.problems import MEDIA_TYPE
+from service.settings import ServiceSettings
+
+DOCUMENT: dict[str, Any] = create_app(ServiceSettings()).openapi()
+SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
+OPERATIONS: list[tuple[str, dict[str, Any]]] = [
+    (f"{method.upper()} {path}", operation)
+    for path, methods in DOCUMENT["paths"].items()
+    for method, operation in methods.items()
+]
+
+
+def resolved(schema: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = SCHEMAS[schema["$ref"].rsplit("/", 1)[1]] if "$ref" in schema else schema
+    return found
+
+
+def examples_of(described: dict[str, Any]) -> list[object]:
+    """Of a media type, a parameter or a header: its own ones, or those of its schema."""
+    own = [entry["value"] for entry in described.get("examples", {}).values()]
+    if "example" in described:
+        own.append(described["example"])
+    return own or list(resolved(described["schema"]).get("examples", []))
+
+
+def check(where: str, described: dict[str, Any]) -> None:
+    """Fail without an example, or with one that is not as the schema says."""
+    found = examples_of(described)
+    assert found, f"{where}: no example"
+    schema = {**described["schema"], "components": DOCUMENT["components"]}
+    validator = Draft202012Validator(schema, format_checker=FormatChecker())
+    for example in found:
+        wrong = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(example)]
+        assert not wrong, f"{where}: its example is not as its schema says: {wrong}"
+
+
+def bodies(operation: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every media type of request and answers."""
+    for kind, body in operation.get("requestBody", {}).get("content", {}).items():
+        yield f"request {kind}", body
+    for status, answer in operation["responses"].items():
+        for kind, body in answer.get("content", {}).items():
+            yield f"{status} {kind}", body
+
+
+def test_the_document_is_openapi() -> None:
+    validate(DOCUMENT)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_every_schema_has_an_example(name: str) -> None:
+    check(name, {"schema": {"$ref": f"#/components/schemas/{name}"}})
+
+
+@pytest.mark.parametrize(("label", "operation"), OPERATIONS, ids=[label for label, _ in OPERATIONS])
+def test_every_operation_has_examples(label: str, operation: dict[str, Any]) -> None:
+    for where, body in bodies(operation):
+        check(f"{label}: {where}", body)
+    for parameter in operation.get("parameters", []):
+        assert parameter.get("description"), f"{label}: {parameter['name']}: no description"
+        check(f"{label}: parameter {parameter['name']}", parameter)
+    for status, answer in operation["responses"].items():
+        assert answer["description"], f"{label}: {status}: no description"
+        for name, header in answer.get("headers", {}).items():
+            check(f"{label}: {status}: header {name}", header)
+
+
+@pytest.mark.parametrize(("label", "operation"), OPERATIONS, ids=[label for label, _ in OPERATIONS])
+def test_every_refusal_has_its_codes(label: str, operation: dict[str, Any]) -> None:
+    """Each error status lists its codes, each code has an example, and it is one of that status."""
+    refusals = {int(status): answer for status, answer in operation["responses"].items() if int(status) >= 400}
+    assert {400, 431, 500} <= refusals.keys()
+    assert {401, 403} <= refusals.keys() or "security" not in operation
+    for status, answer in refusals.items():
+        if MEDIA_TYPE not in answer.get("content", {}):
+            assert label.startswith("HEAD") or (label, status) == ("GET /readyz", 503)
+            continue
+        body = answer["content"][MEDIA_TYPE]
+        codes = body["schema"]["allOf"][1]["properties"]["code"]["enum"]
+        shown = {code: example["value"] for code, example in body["examples"].items()}
+        assert codes
+        assert list(shown) == codes
+        assert all(value["code"] == code and value["status"] == status for code, value in shown.items())

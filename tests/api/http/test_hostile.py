@@ -1,0 +1,1161 @@
+"""Hostile requests against the real API: each is refused with a problem document, costs no memory, leaves nothing."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import json
+import re
+import socket
+import struct
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import psutil
+import pytest
+from PIL import Image, PngImagePlugin
+
+from api.http.connection import MAX_HEAD_BYTES
+from service.files.artifacts import Artifacts
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.tables import UploadRow
+from tests.api.service import Service, check_documented, wait_for
+from tests.small_scenes import wall, write_files
+
+MB = 1_000_000
+#: What the API may grow by during one test, at its peak.
+GROWTH = 48 * MB
+#: Seconds after which the service under test gives up a body, or a request's head, that stands still.
+STILL = 2.0
+TUS = {"Tus-Resumable": "1.0.0"}
+OFFSET_STREAM = "application/offset+octet-stream"
+
+Files = dict[str, bytes]
+Make = Callable[[Files], bytes]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, files: Files) -> Iterator[Service]:
+    limits = {
+        "SGSST_MAX_REQUEST_BYTES": str(100 * MB),
+        "SGSST_MAX_UPLOAD_BYTES": str(80 * MB),
+        "SGSST_MAX_GAUSSIANS": "5000",
+        "SGSST_MAX_IMAGE_PIXELS": str(20 * MB),
+        "SGSST_MAX_PIXELS": str(100 * MB),
+        "SGSST_MAX_VIEWS": "100",
+        "SGSST_MAX_PHOTOS": "50",
+        "SGSST_RECEIVE_SECONDS": str(STILL),
+        "SGSST_INSPECTION_SECONDS": "10",
+        "SGSST_INSPECTION_BYTES": str(2000 * MB),
+        "SGSST_MAX_JOBS_PER_KEY": "10000",
+    }
+    with Service(tmp_path_factory.mktemp("hostile") / "data", alone=True, **limits) as running:
+        with running.client() as client:  # what is loaded once is no growth
+            assert client.post("/v1/jobs", files=form(files)).status_code == 202
+            client.get("/openapi.json")
+        yield running
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[httpx.Client]:
+    with service.client() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[Store]:
+    opened = open_store(ServiceSettings(data=service.data))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(autouse=True)
+def unharmed(service: Service) -> Iterator[None]:
+    """Around each test: the API is the same process, has not grown, left no half file, and did not break."""
+    before = api_of(service)
+    logged = service.log.stat().st_size
+    Path(f"/proc/{before.pid}/clear_refs").write_text("5")  # the peak is counted from here
+    start = memory_of(before, "VmRSS")
+    yield
+    assert api_of(service).pid == before.pid
+    peak = memory_of(before, "VmHWM")
+    assert peak - start < GROWTH, f"grew by {(peak - start) / MB:.0f} MB"
+    wait_for(lambda: not list((service.data / "incoming").iterdir()), "half files to be removed")
+    assert not list((service.data / "inspections").iterdir())
+    with service.log.open(errors="replace") as log:
+        log.seek(logged)
+        said = log.read()
+    assert "Traceback" not in said, said[-3000:]
+
+
+def api_of(service: Service) -> psutil.Process:
+    process = service.process("api.http.server")
+    assert process is not None
+    return process
+
+
+def memory_of(process: psutil.Process, field: str) -> int:
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    found = re.search(rf"{field}:\s+(\d+) kB", status)
+    assert found
+    return 1024 * int(found[1])
+
+
+def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
+    """Multipart fields; a changed one may bring its own file name, None leaves it out."""
+    names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
+    parts: list[tuple[str, Any]] = []
+    for role in {**files, **changed}:
+        content = changed.get(role, files.get(role))
+        if content is not None:
+            parts.append((role, content if isinstance(content, tuple) else (names.get(role, role), content)))
+    return parts
+
+
+def refused(answer: httpx.Response, status: int, *codes: str) -> dict[str, Any]:
+    """The problem document, after a look at its form."""
+    assert answer.status_code == status, f"{answer.status_code} {answer.text[:500]}"
+    assert answer.headers["content-type"] == "application/problem+json"
+    check_documented(answer)
+    problem: dict[str, Any] = answer.json()
+    assert problem["status"] == status
+    assert problem["code"] in codes, problem
+    assert problem["title"]
+    assert problem["detail"]
+    assert len(answer.content) < 20_000, "it repeats what was sent"
+    assert not re.search(r"/tmp|/work|Errno|Traceback|\.part\b", problem["detail"]), problem["detail"]
+    return problem
+
+
+def count_jobs(store: Store) -> int:
+    return len(store.jobs.page(None, limit=100_000))
+
+
+# --- files that lie ------------------------------------------------------------------------------------------------
+
+
+def header(scene: bytes, old: str, new: str | bytes) -> bytes:
+    """The scene with one thing in its header changed."""
+    end = scene.index(b"end_header") + len(b"end_header")
+    assert old.encode() in scene[:end]
+    return scene[:end].replace(old.encode(), new.encode() if isinstance(new, str) else new, 1) + scene[end:]
+
+
+VERTEX = "element vertex 616"
+LIST = "element face 200\nproperty list uchar int vertex_indices\n"
+
+
+def with_faces(scene: bytes, declared: str, data: bytes) -> bytes:
+    return header(scene, "end_header", declared + "end_header") + data
+
+
+def before_vertices(scene: bytes, declared: str, data: bytes) -> bytes:
+    """Another element in front of the Gaussians."""
+    changed = header(scene, VERTEX, declared + VERTEX)
+    start = changed.index(b"end_header\n") + len(b"end_header\n")
+    return changed[:start] + data + changed[start:]
+
+
+SCENES: list[tuple[str, Make]] = [
+    ("negative count", lambda f: header(f["scene"], VERTEX, "element vertex -616")),
+    ("hexadecimal count", lambda f: header(f["scene"], VERTEX, "element vertex 0x268")),
+    ("count with underscores", lambda f: header(f["scene"], VERTEX, "element vertex 6_1_6")),
+    ("count in other digits", lambda f: header(f["scene"], VERTEX, "element vertex ٦١٦")),
+    ("count of 4,000 digits", lambda f: header(f["scene"], VERTEX, "element vertex " + "9" * 4000)),
+    ("count of a million digits", lambda f: header(f["scene"], VERTEX, "element vertex " + "9" * 1_000_000)),
+    ("count 2^64", lambda f: header(f["scene"], VERTEX, f"element vertex {2**64}")),
+    ("count 10^18 - 1", lambda f: header(f["scene"], VERTEX, "element vertex 999999999999999999")),
+    ("count missing", lambda f: header(f["scene"], VERTEX, "element vertex")),
+    ("no Gaussians", lambda f: header(f["scene"], VERTEX, "element vertex 0")),
+    ("vertex twice", lambda f: header(f["scene"], VERTEX, VERTEX + "\n" + VERTEX)),
+    ("no vertex", lambda f: header(f["scene"], VERTEX, "element points 616")),
+    ("rows of no bytes", lambda f: header(f["scene"], "end_header", "element nothing 999999999999\nend_header")),
+    ("a property twice", lambda f: header(f["scene"], "property float y", "property float x")),
+    ("an unknown type", lambda f: header(f["scene"], "property float y", "property float128 y")),
+    ("a longer type", lambda f: header(f["scene"], "property float y", "property double y")),
+    ("positions as lists", lambda f: header(f["scene"], "property float y", "property list uchar float y")),
+    ("list of float length", lambda f: header(f["scene"], "property float y", "property list float float y")),
+    ("no opacity", lambda f: header(f["scene"], "property float opacity", "property float opacitx")),
+    ("no rotation", lambda f: header(f["scene"], "property float rot_3", "property float rot_4")),
+    ("an unknown byte order", lambda f: header(f["scene"], "binary_little_endian", "binary_middle_endian")),
+    ("the other byte order", lambda f: header(f["scene"], "binary_little_endian", "binary_big_endian")),
+    ("binary data said to be text", lambda f: header(f["scene"], "binary_little_endian", "ascii")),
+    ("format 2.0", lambda f: header(f["scene"], "endian 1.0", "endian 2.0")),
+    ("no format", lambda f: header(f["scene"], "format", "comment format")),
+    ("zero bytes in the header", lambda f: header(f["scene"], VERTEX, b"element ver\x00tex 616")),
+    ("a line without end", lambda f: b"ply\n" + b"x" * 3 * MB),
+    (
+        "50,000 elements",
+        lambda f: (
+            b"ply\nformat ascii 1.0\n" + b"".join(b"element e%d 0\n" % i for i in range(50_000)) + b"end_header\n"
+        ),
+    ),
+    (
+        "40,000 properties",
+        lambda f: (
+            b"ply\nformat ascii 1.0\nelement vertex 1\n"
+            + b"".join(b"property char p%d\n" % i for i in range(40_000))
+            + b"end_header\n"
+            + b"1 " * 40_000
+        ),
+    ),
+    (
+        "list longer than the file",
+        lambda f: before_vertices(
+            f["scene"], "element face 1\nproperty list uint int v\n", struct.pack("<I", 2**32 - 1)
+        ),
+    ),
+    (
+        "list of negative length",
+        lambda f: before_vertices(f["scene"], "element face 1\nproperty list char int v\n", b"\xff"),
+    ),
+    ("lists that end early", lambda f: with_faces(f["scene"], LIST, b"\x01\0\0\0\0" * 150)),
+    ("infinite scale", lambda f: f["scene"][:-20] + struct.pack("<f", float("inf")) + f["scene"][-16:]),
+    ("header only", lambda f: f["scene"][: f["scene"].index(b"end_header\n") + 11]),
+    ("half a header", lambda f: f["scene"][:200]),
+    ("one byte short", lambda f: f["scene"][:-1]),
+    ("gzip", lambda f: gzip.compress(f["scene"])),
+    ("zip", lambda f: zipped("scene.ply", f["scene"])),
+    ("text with words for numbers", lambda f: text_scene(f["scene"], "lots")),
+    ("text with too few numbers", lambda f: text_scene(f["scene"], "")),
+    ("text with one endless number", lambda f: text_scene(f["scene"], "1" * MB)),
+]
+
+
+def zipped(name: str, data: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, data)
+    return file.getvalue()
+
+
+def text_scene(scene: bytes, first: str) -> bytes:
+    """The scene's header over text, whose first row begins with this word."""
+    head = header(scene, "binary_little_endian", "ascii")
+    head = head[: head.index(b"end_header\n") + 11]
+    values = head.count(b"property")
+    return head + f"{first} {'0 ' * (values - 1)}\n".encode() + f"{'0 ' * values}\n".encode() * 615
+
+
+@pytest.mark.parametrize("make", [case[1] for case in SCENES], ids=[case[0] for case in SCENES])
+def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, make: Make) -> None:
+    before = count_jobs(store)
+    answer = client.post("/v1/jobs", files=form(files, scene=make(files)))
+    problem = refused(answer, 422, "invalid-scene", "too-many-gaussians", "inspection-limit")
+    if problem["code"] != "inspection-limit":
+        assert problem["input"] == "scene"
+    assert count_jobs(store) == before
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width: int, height: int, *chunks: bytes) -> bytes:
+    """A PNG that says it has so many RGB pixels."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + b"".join(chunks) + chunk(b"IEND", b"")
+
+
+def zeros(size: int) -> bytes:
+    """So many zero bytes, deflated, without holding them."""
+    packer = zlib.compressobj(9)
+    parts = [packer.compress(bytes(MB)) for _ in range(size // MB)]
+    return b"".join(parts) + packer.compress(bytes(size % MB)) + packer.flush()
+
+
+def jpeg(width: int, height: int) -> bytes:
+    """A JPEG whose header says that it is larger than it is."""
+    file = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(file, "JPEG")
+    data = file.getvalue()
+    at = data.index(b"\xff\xc0") + 5
+    return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
+
+
+def picture(format_: str, width: int, height: int) -> bytes:
+    file = io.BytesIO()
+    Image.new("L", (width, height)).save(file, format_)
+    return file.getvalue()
+
+
+def text_bomb() -> bytes:
+    """A small PNG with a compressed comment that unpacks to 200 MB."""
+    return png(16, 16, chunk(b"zTXt", b"Comment\0\0" + zeros(200 * MB)), chunk(b"IDAT", zeros(49 * 16)))
+
+
+def tagged() -> bytes:
+    """EXIF that points behind its own end, in a picture that is whole otherwise."""
+    file = io.BytesIO()
+    info = PngImagePlugin.PngInfo()
+    info.add(b"eXIf", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01\x12\0\x03\xff\xff\xff\xff\xff\xff\xff\xf0" * 4)
+    Image.new("RGB", (64, 48)).save(file, "PNG", pnginfo=info)
+    return file.getvalue()[:-30]
+
+
+IMAGES: list[tuple[str, Make]] = [
+    ("PNG bomb", lambda f: png(6000, 6000, chunk(b"IDAT", zeros(18_001 * 6000)))),
+    ("PNG of more pixels than Pillow takes", lambda f: png(100_000, 100_000, chunk(b"IDAT", zeros(MB)))),
+    ("PNG with much text", lambda f: text_bomb()),
+    ("PNG of no width", lambda f: png(0, 100, chunk(b"IDAT", zeros(100)))),
+    ("PNG without pixels", lambda f: png(64, 48)),
+    ("PNG with a wrong check sum", lambda f: f["style"][:40] + b"\0\0\0\0" + f["style"][44:]),
+    ("PNG with broken EXIF", lambda f: tagged()),
+    ("JPEG bomb", lambda f: jpeg(65_500, 65_500)),
+    ("JPEG of no height", lambda f: jpeg(100, 0)),
+    ("JPEG truncated", lambda f: picture("JPEG", 500, 500)[:-900]),
+    ("GIF bomb", lambda f: picture("GIF", 8, 8)[:6] + struct.pack("<HH", 65_535, 65_535) + picture("GIF", 8, 8)[10:]),
+    (
+        "TIFF bomb",
+        lambda f: picture("TIFF", 8, 8).replace(
+            struct.pack("<HHII", 256, 4, 1, 8), struct.pack("<HHII", 256, 4, 1, 2**31)
+        )[:200],
+    ),
+    ("WebP cut off", lambda f: picture("WEBP", 64, 64)[:20]),
+    (
+        "PostScript",
+        lambda f: b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\n(/etc/passwd) run\nshowpage\n",
+    ),
+    ("PDF", lambda f: b"%PDF-1.4\n1 0 obj<</Type/Catalog>>endobj\ntrailer<</Root 1 0 R>>"),
+    ("gzip bomb", lambda f: gzip.compress(bytes(50 * MB))),
+    ("gzip", lambda f: gzip.compress(f["style"])),
+    ("HTML", lambda f: b"<!doctype html><script>alert(1)</script>"),
+]
+
+
+@pytest.mark.parametrize("make", [case[1] for case in IMAGES], ids=[case[0] for case in IMAGES])
+def test_images_that_lie(client: httpx.Client, store: Store, files: Files, make: Make) -> None:
+    before = count_jobs(store)
+    answer = client.post("/v1/jobs", files=form(files, style=make(files)))
+    problem = refused(answer, 422, "invalid-image", "image-too-large", "inspection-limit")
+    assert problem.get("input", "style") == "style"
+    assert count_jobs(store) == before
+
+
+def changed_cameras(files: Files, **values: Any) -> bytes:
+    entries = json.loads(files["cameras"])
+    entries[1] |= values
+    return json.dumps(entries).encode()
+
+
+def transforms(**values: Any) -> bytes:
+    frame = {"file_path": "a.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    return json.dumps({"fl_x": 64, "w": 64, "h": 48, "frames": [{**frame, **values}]}).encode()
+
+
+CAMERAS: list[tuple[str, str, Make]] = [
+    ("no width", "cameras.json", lambda f: changed_cameras(f, width=0)),
+    ("negative width", "cameras.json", lambda f: changed_cameras(f, width=-64)),
+    ("half a pixel", "cameras.json", lambda f: changed_cameras(f, width=64.5)),
+    ("a width of words", "cameras.json", lambda f: changed_cameras(f, width="wide")),
+    ("10^9 pixels wide", "cameras.json", lambda f: changed_cameras(f, width=10**9, height=10**9)),
+    ("10^400 pixels wide", "cameras.json", lambda f: changed_cameras(f, width=10**400)),
+    (
+        "a number of 10,000 digits",
+        "cameras.json",
+        lambda f: f["cameras"].replace(b'"width": 64', b'"width": ' + b"6" * 10_000),
+    ),
+    ("infinite focal length", "cameras.json", lambda f: changed_cameras(f, fx=float("inf"))),
+    ("no rotation", "cameras.json", lambda f: changed_cameras(f, rotation=[[0, 0, 0]] * 3)),
+    ("ragged rotation", "cameras.json", lambda f: changed_cameras(f, rotation=[[1, 0, 0], [0], []])),
+    ("rotation of objects", "cameras.json", lambda f: changed_cameras(f, rotation={"a": 1})),
+    ("infinite position", "cameras.json", lambda f: changed_cameras(f, position=[1e999, 0, 0])),
+    ("no name", "cameras.json", lambda f: changed_cameras(f, img_name="")),
+    ("more than a thousand", "cameras.json", lambda f: json.dumps(json.loads(f["cameras"]) * 400).encode()),
+    ("deep JSON", "cameras.json", lambda f: b'{"frames":' + b"[" * 500_000),
+    ("half a surrogate", "cameras.json", lambda f: b'[{"img_name": "\\ud800"}]'),
+    ("no UTF-8", "cameras.json", lambda f: b"\xff\xfe\xfd"),
+    ("gzip", "cameras.json", lambda f: gzip.compress(f["cameras"])),
+    ("fish eye", "transforms.json", lambda f: transforms(is_fisheye=True)),
+    (
+        "an angle of 7",
+        "transforms.json",
+        lambda f: json.dumps(
+            {"camera_angle_x": 7, "w": 9, "h": 9, "frames": [{"file_path": "a", "transform_matrix": []}]}
+        ).encode(),
+    ),
+    ("COLMAP of 2^60 cameras", "cameras.bin", lambda f: struct.pack("<Q", 2**60) + bytes(100)),
+    ("COLMAP cut off", "cameras.bin", lambda f: struct.pack("<QIiQQ", 1, 1, 1, 64, 48)),
+    ("COLMAP without images", "cameras.bin", lambda f: struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 64, 64, 32, 24)),
+    ("COLMAP of words", "cameras.txt", lambda f: b"1 PINHOLE wide high 1 1 1 1\n"),
+    ("a name of another kind", "cameras.json.exe", lambda f: f["cameras"]),
+]
+
+
+@pytest.mark.parametrize(("name", "make"), [case[1:] for case in CAMERAS], ids=[case[0] for case in CAMERAS])
+def test_cameras_that_lie(client: httpx.Client, store: Store, files: Files, name: str, make: Make) -> None:
+    before = count_jobs(store)
+    answer = client.post("/v1/jobs", files=form(files, cameras=(name, make(files))))
+    problem = refused(answer, 422, "invalid-cameras", "too-many-views", "too-many-pixels", "inspection-limit")
+    assert problem.get("input", "cameras") == "cameras"
+    assert count_jobs(store) == before
+
+
+def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, files: Files, tmp_path: Path) -> None:
+    """A transforms.json without sizes lets the reader look into the image that it names, wherever that is."""
+    there = tmp_path / "secret.png"
+    there.write_bytes(files["style"])
+    told = set()
+    for path in (there, tmp_path / "nothing.png", Path("/etc/passwd"), Path("../../../../../../etc/passwd")):
+        content = json.loads(transforms(file_path=str(path)))
+        del content["w"], content["h"]
+        body = form(files, cameras=("transforms.json", json.dumps(content).encode()))
+        problem = refused(client.post("/v1/jobs", files=body), 422, "invalid-cameras")
+        told.add(problem["detail"].replace(str(path), "PATH").replace(str(path).lstrip("/"), "PATH"))
+    assert len(told) == 1, f"answers tell what is on the machine: {told}"
+
+
+# --- names ---------------------------------------------------------------------------------------------------------
+
+NAMES = [
+    "../../../../etc/cron.d/x",
+    "/etc/passwd",
+    "..\\..\\..\\windows\\system32\\x",
+    "C:\\x.ply",
+    "\\\\server\\share\\x.ply",
+    "a\x00b.ply",
+    "a\nb\r\nX-Injected: 1.ply",
+    "....//....//x.ply",
+    "%2e%2e%2f%2e%2e%2fx.ply",
+    "..%c0%af..%c0%afx.ply",
+    ".",
+    "..",
+    "...",
+    "/",
+    "",
+    " ",
+    ".bashrc",
+    "-rf",
+    "~root/.ssh/id",
+    "$(id).ply",
+    "CON",
+    "aux.ply",
+    "x.ply:stream",
+    "a" * 5000 + ".ply",
+    "a/" * 3000 + "x.ply",
+    "界" * 200 + ".ply",
+    "é" * 255,
+    "\u202egpj.ply",
+    "\ufeffx.ply",
+    "👩‍👩‍👧‍👦" * 50,
+]
+
+
+@pytest.mark.parametrize("role", ["scene", "style", "photos"])
+def test_names_lead_nowhere(client: httpx.Client, service: Service, files: Files, role: str) -> None:
+    before = {path for path in service.data.parent.rglob("*") if "blobs" not in path.parts}
+    photos = [("photos", (f"view_{i}.png", picture("PNG", 64, 48))) for i in range(3)] if role == "photos" else []
+    for name in NAMES:
+        encoded = name.encode().replace(b'"', b"%22").replace(b"\r", b"%0D").replace(b"\n", b"%0A")
+        content = files.get(role, picture("PNG", 64, 48))
+        body = [*((r, c) for r, c in form(files) if r != role), *photos]
+        request = client.build_request("POST", "/v1/jobs", files=[*body, (role, ("NAME", content))])
+        data = request.read().replace(b'filename="NAME"', b'filename="' + encoded + b'"')
+        answer = client.post("/v1/jobs", content=data, headers={"content-type": request.headers["content-type"]})
+        if answer.status_code != 202:  # such as a name that no field can have: refused is as good
+            codes = ("malformed-body", "invalid-request", "unknown-upload", "invalid-image")
+            refused(answer, 400 if answer.status_code == 400 else 422, *codes)
+            continue
+        for entry in answer.json()["inputs"]:
+            shown = entry["name"]
+            assert shown
+            assert not shown.startswith(("/", "~", "."))
+            assert all(part not in ("", ".", "..") and not part.startswith(".") for part in shown.split("/"))
+            assert "/" not in shown or entry["role"] == "photos"
+            assert not re.search(r"[\x00-\x1f\x7f\\:$]", shown)
+            assert all(len(part.encode()) <= 255 for part in shown.split("/"))
+    after = {path for path in service.data.parent.rglob("*") if "blobs" not in path.parts}
+    assert {path.name for path in after - before} <= {"sgsst.db-wal", "sgsst.db-shm"}
+
+
+# --- multipart bodies ----------------------------------------------------------------------------------------------
+
+BOUNDARY = "b0undary"
+
+
+def post(client: httpx.Client, body: bytes | Iterator[bytes], kind: str = "", **headers: str) -> httpx.Response:
+    kind = kind or f"multipart/form-data; boundary={BOUNDARY}"
+    return client.post("/v1/jobs", content=body, headers={"content-type": kind, **headers})
+
+
+def part(head: str, body: bytes = b"x") -> bytes:
+    return f"--{BOUNDARY}\r\n{head}\r\n\r\n".encode("latin-1") + body + b"\r\n"
+
+
+END = f"--{BOUNDARY}--\r\n".encode()
+FILE = 'Content-Disposition: form-data; name="{}"; filename="x"'
+
+BODIES: list[tuple[str, bytes, int]] = [
+    ("nothing", b"", 400),
+    ("another boundary", b"--other\r\n\r\nx\r\n--other--\r\n", 400),
+    ("the end alone", END, 422),
+    ("no end", part(FILE.format("scene")), 400),
+    ("no head", f"--{BOUNDARY}\r\n\r\nx\r\n".encode() + END, 422),
+    ("no name", part('Content-Disposition: form-data; filename="x"') + END, 422),
+    ("no disposition", part("Content-Type: text/plain") + END, 422),
+    ("a head without colon", part("what is this") + END, 400),
+    ("zero bytes in the head", part('Content-Disposition: form-data; name="sc\0ene"') + END, 422),
+    ("another charset", part("Content-Disposition: form-data; name=\"scene\"; filename*=none''%ff%fe") + END, 422),
+    (
+        "endless continuations",
+        part('Content-Disposition: form-data; name="scene"; ' + "; ".join(f'filename*{i}="x"' for i in range(5000)))
+        + END,
+        400,
+    ),
+    ("a boundary within", part(FILE.format("scene"), part(FILE.format("style"))) + END, 422),
+    ("rubbish", bytes(range(256)) * 100, 400),
+    ("bare line ends", part(FILE.format("scene")).replace(b"\r\n", b"\n") + END, 400),
+    ("a head of a megabyte", part("Content-Disposition: form-data; name=" + "x" * MB) + END, 400),
+    ("a head of 2,000 lines", part("\r\n".join(f"X-{i}: y" for i in range(2000))) + END, 400),
+    ("an unknown field", part(FILE.format("scene/../../x")) + END, 422),
+    ("a field of a megabyte", part('Content-Disposition: form-data; name="parameters"', b" " * MB) + END, 422),
+    ("a field twice", 2 * part('Content-Disposition: form-data; name="parameters"', b"{}") + END, 422),
+    ("no text", part('Content-Disposition: form-data; name="parameters"', b"\xff\xfe") + END, 422),
+]
+
+
+@pytest.mark.parametrize(("body", "status"), [case[1:] for case in BODIES], ids=[case[0] for case in BODIES])
+def test_bodies_that_make_no_sense(client: httpx.Client, store: Store, body: bytes, status: int) -> None:
+    before = count_jobs(store)
+    codes = ("malformed-body",) if status == 400 else ("invalid-request", "unknown-upload", "invalid-scene")
+    refused(post(client, body), status, *codes)
+    assert count_jobs(store) == before
+
+
+@pytest.mark.parametrize(
+    ("kind", "status"),
+    [
+        ("application/x-www-form-urlencoded", 415),
+        ("application/octet-stream", 415),
+        ("multipart/mixed; boundary=x", 415),
+        ("application/json-patch+json", 415),
+        ("nonsense", 415),
+        ("multipart/form-data", 400),
+        ("multipart/form-data; boundary=", 400),
+        ("multipart/form-data; boundary=" + "x" * 3000, 400),
+        ("multipart/form-data; boundary=\xff\xfe", 400),
+        ("multipart/form-data; boundary*=none''%ff", 400),
+    ],
+)
+def test_content_types(client: httpx.Client, kind: str, status: int) -> None:
+    answer = client.post("/v1/jobs", content=b"x=y", headers=[(b"content-type", kind.encode("latin-1"))])
+    refused(answer, status, "unsupported-media-type" if status == 415 else "malformed-body")
+
+
+def test_a_body_that_is_compressed(client: httpx.Client, files: Files) -> None:
+    """Nothing unpacks bodies, so that no bomb can be one."""
+    request = client.build_request("POST", "/v1/jobs", files=form(files))
+    answer = post(
+        client, gzip.compress(request.read()), request.headers["content-type"], **{"content-encoding": "gzip"}
+    )
+    refused(answer, 415, "unsupported-media-type")
+    answer = post(client, gzip.compress(b"{}"), "application/json", **{"content-encoding": "gzip"})
+    refused(answer, 415, "unsupported-media-type")
+
+
+def test_more_parts_than_any_job_has(client: httpx.Client, files: Files) -> None:
+    small = part(FILE.format("photos"), b"x")
+    refused(post(client, small * 1000 + END), 422, "too-many-files")
+    named = part('Content-Disposition: form-data; name="photos"', b"upl_00000000000")
+    refused(post(client, named * 20_000 + END), 422, "too-many-files")
+    empty = part('Content-Disposition: form-data; name="photos"', b"")
+    refused(post(client, empty * 20_000 + END), 422, "too-many-files")
+
+
+def test_a_part_whose_head_never_ends(client: httpx.Client) -> None:
+    def body() -> Iterator[bytes]:
+        yield f"--{BOUNDARY}\r\nContent-Disposition: ".encode()
+        for _ in range(90):
+            yield b"x" * MB
+
+    refused(post(client, body()), 400, "malformed-body")
+
+
+def test_too_long(client: httpx.Client, files: Files) -> None:
+    def chunked(size: int) -> Iterator[bytes]:
+        yield part(FILE.format("style"))[:-3]
+        for _ in range(size):
+            yield bytes(MB)
+        yield b"\r\n" + END
+
+    refused(post(client, chunked(85)), 413, "too-large")  # a file
+    refused(post(client, chunked(120)), 413, "too-large")  # and a request, of which no length was told
+    refused(post(client, b'{"scene": "' + b"x" * 2 * MB + b'"}', "application/json"), 413, "too-large")
+
+
+# --- JSON ----------------------------------------------------------------------------------------------------------
+
+NUMBERS = ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "1" + "0" * 400, "-1", "1.5e-400", "9" * 5000]
+MAY_BE_0 = ("content_weight", "prune_weight", "similar_views", "steps_coarse", "steps_sos", "seed")
+FIELDS = [
+    "orbit",
+    "views",
+    "resolution",
+    "steps_coarse",
+    "steps_sos",
+    "learning_rate",
+    "content_weight",
+    "near",
+    "seed",
+    "memory_limit",
+    "max_seconds",
+    "target_loss",
+    "coarsest_side",
+    "prune_weight",
+    "similar_views",
+    "workers",
+]
+
+
+def told(client: httpx.Client, parameters: str) -> httpx.Response:
+    """The answer to a job of these parameters; its files, which are looked for after them, are not there."""
+    body = f'{{"scene": "upl_00000000000", "style": "upl_00000000000", "parameters": {parameters}}}'
+    return post(client, body.encode(), "application/json")
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_numbers_that_are_none(client: httpx.Client, field: str) -> None:
+    refused(told(client, "{}"), 422, "unknown-upload")
+    for number in NUMBERS:
+        if field in MAY_BE_0 and number == "1.5e-400":
+            continue  # is 0
+        refused(told(client, f'{{"{field}": {number}}}'), 422, "invalid-request", "invalid-settings")
+
+
+TEXTS = [
+    '{"background": [NaN, 0, 0]}',
+    '{"background": [1e999, 0, 0]}',
+    '{"background": [2, 0, 0]}',
+    '{"background": [0, 0, 0, 0]}',
+    '{"background": "black"}',
+    '{"name": "\\ud800"}',
+    '{"name": "a\\u0000b"}',
+    '{"name": {"$ne": null}}',
+    '{"name": ["a"]}',
+    '{"\\ud800": 1}',
+    '{"' + "x" * 50_000 + '": 1}',
+    '{"__proto__": {}}',
+    '{"__class__": "x"}',
+    "{" + ",".join(f'"a{i}": 1' for i in range(3000)) + "}",
+    '{"drop_invalid": "maybe"}',
+    '{"preset": "../../preview"}',
+    '{"backbone": "/etc/passwd"}',
+    '{"up": null}',
+    "null",
+    "1",
+    '"x"',
+    "[]",
+    '{"a":' * 10_000,
+    "[" * 60_000 + "]" * 5_000,
+    "{'seed': 1}",
+    '{"seed": 1} {"seed": 2}',
+]
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=[text[:25] for text in TEXTS])
+def test_parameters_that_are_none(client: httpx.Client, files: Files, text: str) -> None:
+    refused(told(client, text), 422, "invalid-request", "invalid-settings")
+    answer = post(client, part('Content-Disposition: form-data; name="parameters"', text.encode()) + END)
+    refused(answer, 422, "invalid-request", "invalid-settings")
+
+
+JSON_BODIES = [
+    b"",
+    b"{",
+    b"null",
+    b"[]",
+    b"{}",
+    b'{"scene": 1, "style": 2}',
+    b"\xff",
+    b"[" * 900_000,
+    b'{"scene": "\\ud800", "style": "x"}',
+    b'{"scene": "upl_00000000000", "style": "upl_00000000000", "webhook": "\\ud800"}',
+    b'{"scene": "../../x", "style": "/etc/passwd"}',
+    b'{"scene": "upl_00000000000\\u0000", "style": "x"}',
+    b'{"scene": "x", "style": "x", "photos": [' + b'"x",' * 20_000 + b'"x"]}',
+    b'{"scene": "x", "style": "x", "cameras": [' + b'"x",' * 9 + b'"x"]}',
+    b'{"scene": "x", "style": "x", "parameters": [1]}',
+    b'{"scene": "x", "style": "x", "webhook": "file:///etc/passwd"}',
+    b'{"scene": "job_00000000000", "style": "key_00000000000"}',
+]
+
+
+@pytest.mark.parametrize("body", JSON_BODIES, ids=[body[:30].decode("latin-1") for body in JSON_BODIES])
+def test_json_that_names_nothing(client: httpx.Client, body: bytes) -> None:
+    answer = post(client, body, "application/json")
+    refused(answer, 400 if body == b"\xff" else 422, "malformed-body", "invalid-request", "unknown-upload")
+
+
+def test_webhooks_are_refused_while_they_are_off(client: httpx.Client, files: Files) -> None:
+    for url in ("http://169.254.169.254/latest", "file:///etc/passwd", "http://[::1", "x" * 60_000):
+        refused(client.post("/v1/jobs", files=form(files), data={"webhook": url}), 422, "webhooks-off")
+
+
+# --- tus -----------------------------------------------------------------------------------------------------------
+
+
+def begin(client: httpx.Client, size: int) -> str:
+    answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(size)})
+    assert answer.status_code == 201, answer.text
+    return str(answer.headers["location"])
+
+
+def send(client: httpx.Client, where: str, offset: object, data: Any, **headers: Any) -> httpx.Response:
+    fixed = {**TUS, "Upload-Offset": str(offset), "Content-Type": OFFSET_STREAM}
+    return client.patch(where, content=data, headers={**fixed, **headers})
+
+
+def test_uploads_that_begin_wrong(client: httpx.Client) -> None:
+    for length in ("-1", "x", "1.5", "1e3", "0x10", "", str(2**60), "9" * 5000, "NaN"):
+        refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": length}), 422, "invalid-request")
+    refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "0"}), 400, "malformed-body")
+    refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(81 * MB)}), 413, "too-large")
+    refused(
+        client.post("/v1/uploads", headers={"Tus-Resumable": "9", "Upload-Length": "5"}), 412, "unsupported-tus-version"
+    )
+    for metadata in (
+        b"filename !!!",
+        b"filename \xff\xfe",
+        b"filename /////w==",
+        b"filename YQ",
+        b"name =" + b"=" * 100,
+    ):
+        headers = {b"Upload-Length": b"5", b"Upload-Metadata": metadata}
+        refused(client.post("/v1/uploads", headers=headers), 400, "malformed-body")
+    refused(
+        client.post("/v1/uploads", headers={"Upload-Length": "5", "Upload-Metadata": "x" * 5000}),
+        422,
+        "invalid-request",
+    )
+
+
+def test_names_of_uploads_lead_nowhere(client: httpx.Client, service: Service) -> None:
+    for name in NAMES:
+        metadata = f"filename {base64.b64encode(name.encode()[:2900]).decode()}".strip()
+        answer = client.post("/v1/uploads", headers={"Upload-Length": "5", "Upload-Metadata": metadata})
+        if answer.status_code == 400:  # cut within a letter
+            continue
+        assert answer.status_code == 201, answer.text
+        shown = answer.json()["filename"]
+        assert not shown.startswith(("/", "."))
+        assert ".." not in shown.split("/")
+        assert client.delete(answer.headers["location"]).status_code == 204
+    assert not list((service.data / "uploads").iterdir())
+
+
+def test_uploads_that_go_on_wrong(client: httpx.Client, service: Service) -> None:
+    where = begin(client, 1000)
+    file = service.data / "uploads" / (where.rsplit("/", 1)[1] + ".part")
+    assert send(client, where, 0, bytes(100)).status_code == 204
+    for offset in (0, 99, 101, 1000, 2**59):
+        assert refused(send(client, where, offset, bytes(10)), 409, "conflict")["offset"] == 100
+    for offset in ("-1", "x", "1.5", str(2**60), "9" * 5000, ""):
+        refused(send(client, where, offset, bytes(10)), 422, "invalid-request")
+    wrong = base64.b64encode(bytes(32)).decode()
+    refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": f"sha256 {wrong}"}), 460, "checksum-mismatch")
+    refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": "sha256"}), 460, "checksum-mismatch")
+    for checksum in (b"sha256 \xff\xfe", b"sha256 !", b"sha512 x", b"__class__ x", b"x" * 5000):
+        refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": checksum}), 400, "malformed-body")
+    refused(
+        send(client, where, 100, bytes(10), **{"Content-Type": "application/octet-stream"}),
+        415,
+        "unsupported-media-type",
+    )
+    refused(send(client, where, 100, bytes(10), **{"Tus-Resumable": "0.2.2"}), 412, "unsupported-tus-version")
+    refused(send(client, where, 100, bytes(10), **{"Content-Encoding": "gzip"}), 415, "unsupported-media-type")
+    assert client.head(where).headers["upload-offset"] == "100"
+
+    sized = {"Upload-Checksum": f"sha256 {wrong}"}
+    refused(send(client, where, 100, bytes(901), **sized), 413, "too-large")
+    refused(send(client, where, 100, iter([bytes(MB)] * 70), **sized), 413, "too-large")
+    assert client.head(where).headers["upload-offset"] == "100"
+    assert file.stat().st_size <= 1000, "more is on the disk than was announced"
+    refused(send(client, where, 100, bytes(901)), 413, "too-large")
+    offset = int(client.head(where).headers["upload-offset"])
+    assert send(client, where, offset, bytes(1000 - offset)).status_code == 204
+    refused(send(client, where, 5, b"x"), 409, "conflict")
+    refused(send(client, where, 1000, b"x"), 413, "too-large")
+    assert client.get(where).json()["complete"]
+    assert not file.exists()
+    assert client.delete(where).status_code == 204
+
+
+def test_uploads_that_are_over(client: httpx.Client, store: Store, files: Files) -> None:
+    where = begin(client, 1000)
+    upload_id = where.rsplit("/", 1)[1]
+    with store.database.writing() as session:
+        session.get_one(UploadRow, upload_id).expires_at = time.time() - 1
+    refused(send(client, where, 0, bytes(10)), 404, "not-found")
+    refused(client.get(where), 404, "not-found")
+    assert client.head(where).status_code == 404
+    refused(client.delete(where), 404, "not-found")
+    refused(
+        post(client, json.dumps({"scene": upload_id, "style": upload_id}).encode(), "application/json"),
+        422,
+        "unknown-upload",
+    )
+    deleted = begin(client, 1000)
+    assert client.delete(deleted).status_code == 204
+    refused(send(client, deleted, 0, bytes(10)), 404, "not-found")
+    for name in ("upl_' OR 1=1", "..", "upl_" + "0" * 5000, "%00", "job_00000000000"):
+        assert client.get(f"/v1/uploads/{name}").status_code in (404, 405)
+
+
+def test_two_writers_of_one_upload(client: httpx.Client, service: Service) -> None:
+    where = begin(client, 1000)
+    head = f"PATCH {where} HTTP/1.1\nUpload-Offset: 0\nContent-Type: {OFFSET_STREAM}\nContent-Length: 1000"
+    with connect(service) as first:
+        first.sendall(lines(head + "\nExpect: 100-continue"))
+        assert b" 100 " in first.recv(100)  # it is this one's turn
+        first.sendall(bytes(10))
+        refused(send(client, where, 0, bytes(10)), 423, "upload-locked")
+    wait_for(lambda: client.head(where).headers["upload-offset"] == "10", "what has come to be saved")
+    assert send(client, where, 10, bytes(990)).status_code == 204
+
+
+# --- other people's things -----------------------------------------------------------------------------------------
+
+
+def test_ids_of_other_keys(client: httpx.Client, service: Service, store: Store, files: Files) -> None:
+    _, mine = store.keys.create("hostile-mine")
+    _, other = store.keys.create("hostile-other")
+    with service.client(mine) as me, service.client(other) as you:
+        job_id = me.post("/v1/jobs", files=form(files)).json()["id"]
+        where = begin(me, 5)
+        nothing = refused(you.get("/v1/jobs/job_0000000000000000000000000000000"), 404, "not-found")
+        for method, path in (
+            ("GET", ""), ("POST", "/cancel"), ("POST", "/retry"), ("DELETE", ""), ("GET", "/events"),
+            ("GET", "/artifacts"), ("GET", "/artifacts/stylized.ply"),
+        ):  # fmt: skip
+            problem = refused(you.request(method, f"/v1/jobs/{job_id}{path}"), 404, "not-found")
+            assert problem["detail"].replace(job_id, "") == nothing["detail"].replace("job_" + "0" * 31, "")
+        for method in ("GET", "DELETE"):
+            refused(you.request(method, where), 404, "not-found")
+        assert you.head(where).status_code == 404
+        refused(send(you, where, 0, b"12345"), 404, "not-found")
+        assert you.get("/v1/jobs", params={"cursor": job_id}).json()["jobs"] == []
+        assert me.get(f"/v1/jobs/{job_id}").json()["status"] == "queued"
+        assert me.get(where).json()["offset"] == 0
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"Bearer",
+        b"Bearer x y",
+        b"Basic eDp5",
+        b"bearer \xff\xfe",
+        b"Bearer " + b"x" * 50_000,
+        b"",
+        b"Bearer ' OR 1=1 --",
+    ],
+)
+def test_keys_that_are_none(client: httpx.Client, header: bytes) -> None:
+    answer = client.get("/v1/jobs", headers=[(b"authorization", header)])
+    refused(answer, 401, "unauthorized")
+    assert answer.headers["www-authenticate"] == "Bearer"
+
+
+# --- results -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A job with results, as a dispatcher leaves it; its name would like to be a header."""
+    with service.client() as client:
+        name = 'x"; Set-Cookie: a=b <script>/../../é'
+        data = {"parameters": json.dumps({"name": name})}
+        job_id = str(client.post("/v1/jobs", files=form(files), data=data).json()["id"])
+        for queued in client.get("/v1/jobs", params={"status": "queued", "limit": 200}).json()["jobs"]:
+            if queued["id"] != job_id:
+                client.post(f"/v1/jobs/{queued['id']}/cancel")
+    lease = store.jobs.lease("test")
+    while lease is not None and lease.job_id != job_id:
+        store.jobs.canceled(lease, 1000)
+        lease = store.jobs.lease("test")
+    assert lease is not None
+    made = tmp_path_factory.mktemp("results")
+    (made / "stylized.ply").write_bytes(files["scene"])
+    (made / "log.txt").write_bytes(b"")
+    (made / "report.html").write_text("<script>alert(1)</script>")
+    artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
+    published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(made.iterdir())]
+    published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", made / "log.txt"))
+    store.jobs.running(lease)
+    store.jobs.publish(lease, published)
+    store.jobs.succeed(lease, published[:-1], {}, 10_000)
+    return job_id
+
+
+RANGES: list[tuple[str, int]] = [
+    ("bytes=0-0", 206),
+    ("bytes=-1", 206),
+    ("bytes=-999999999999", 206),
+    ("bytes=0-999999999999999", 206),
+    ("bytes=-0", 416),
+    ("bytes=99999999-", 416),
+    ("bytes=99999999-999999999", 416),
+    ("bytes=999999999999999999-", 416),
+    ("bytes=0-0,1-1", 200),
+    ("bytes=" + ",".join(f"{i}-" for i in range(1000)), 200),
+    ("bytes=5-2", 200),
+    ("bytes=-", 200),
+    ("bytes=", 200),
+    ("bytes=a-b", 200),
+    ("bytes=0x0-0x5", 200),
+    ("bytes=--5", 200),
+    ("bytes=1-2-3", 200),
+    ("bytes=" + "9" * 5000 + "-", 200),
+    ("pages=1-2", 200),
+    ("bytes 0-5", 200),
+    ("", 200),
+    ("bytes=\xb2-\xb3", 200),
+]
+
+
+@pytest.mark.parametrize(("text", "status"), RANGES, ids=[text[:25] or "empty" for text, _ in RANGES])
+def test_ranges(client: httpx.Client, files: Files, done: str, text: str, status: int) -> None:
+    where = f"/v1/jobs/{done}/artifacts/stylized.ply"
+    answer = client.get(where, headers=[(b"range", text.encode("latin-1"))])
+    if status == 416:
+        refused(answer, 416, "range-not-satisfiable")
+        assert answer.headers["content-range"] == f"bytes */{len(files['scene'])}"
+        return
+    assert answer.status_code == status
+    assert answer.content in files["scene"]
+    assert len(answer.content) == int(answer.headers["content-length"])
+    assert (answer.content == files["scene"]) or status == 206
+    refused(
+        client.get(f"/v1/jobs/{done}/artifacts/log.txt", headers={"Range": "bytes=0-0"}), 416, "range-not-satisfiable"
+    )
+
+
+def test_headers_of_results(client: httpx.Client, done: str) -> None:
+    answer = client.get(f"/v1/jobs/{done}/artifacts/report.html")
+    assert re.fullmatch(r'inline; filename="[A-Za-z0-9._-]+"', answer.headers["content-disposition"])
+    assert "set-cookie" not in answer.headers
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    policy = answer.headers["content-security-policy"]
+    assert "sandbox" in policy
+    assert "allow-same-origin" not in policy
+
+
+PATHS = [
+    "../../../sgsst.db",
+    "..%2f..%2f..%2fsgsst.db",
+    "%2e%2e/%2e%2e/sgsst.db",
+    "..%5c..%5csgsst.db",
+    "/etc/passwd",
+    "%2fetc%2fpasswd",
+    ".checkpoint",
+    "%2echeckpoint",
+    "./.checkpoint",
+    "x/../.checkpoint",
+    "previews/../stylized.ply",
+    "stylized.ply/",
+    "stylized.ply%00",
+    "%00",
+    "stylized.ply%0d%0aSet-Cookie:%20a=b",
+    "%ff%fe",
+    "%ed%a0%80",
+    "x" * 5000,
+    "%",
+    "%%",
+    "",
+    "STYLIZED.PLY",
+    "stylized.ply;x",
+]
+
+
+def test_paths_of_results(service: Service, done: str) -> None:
+    for path in PATHS:
+        head, _ = exchange(
+            service, f"GET /v1/jobs/{done}/artifacts/{path} HTTP/1.1\nHost: 127.0.0.1\nConnection: close"
+        )
+        assert head.split()[1] in (b"404", b"307", b"400"), (path, head)
+        assert b"set-cookie" not in head.lower()
+
+
+# --- connections ---------------------------------------------------------------------------------------------------
+
+
+def connect(service: Service) -> socket.socket:
+    parts = urlsplit(service.url)
+    return socket.create_connection((str(parts.hostname), parts.port or 0), timeout=60)
+
+
+def lines(head: str) -> bytes:
+    if "Host:" not in head:
+        first, _, rest = head.partition("\n")
+        head = f"{first}\nHost: 127.0.0.1\n{rest}"
+    return head.rstrip("\n").replace("\n", "\r\n").encode("latin-1") + b"\r\n\r\n"
+
+
+def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, bytes]:
+    """Head and body of the answer to exactly these bytes, until the service closes."""
+    with connect(service) as connection:
+        connection.sendall(lines(head) + body)
+        answer = b""
+        while more := connection.recv(65536):
+            answer += more
+    found, _, rest = answer.partition(b"\r\n\r\n")
+    return found, rest
+
+
+def closed(connection: socket.socket) -> bytes:
+    """All that still comes until the service closes; fails if it does not."""
+    connection.settimeout(60)
+    answer = b""
+    try:
+        while more := connection.recv(65536):
+            answer += more
+    except ConnectionResetError:
+        pass
+    return answer
+
+
+def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: httpx.Client, files: Files) -> None:
+    """Many connections that say nothing, half a head, or half a body: others are served, and they all end."""
+    body = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
+    starts = [b"", b"GET /v1/jobs HTTP/1.1\r\nHost: 127.0", lines(body), lines(body) + part(FILE.format("scene"))[:60]]
+    slow = [connect(service) for _ in range(200)]
+    for number, connection in enumerate(slow):
+        connection.sendall(starts[number % len(starts)])
+    assert client.get("/v1/jobs").status_code == 200
+    assert client.post("/v1/jobs", files=form(files)).status_code == 202
+    for number, connection in enumerate(slow):
+        answer = closed(connection)
+        connection.close()
+        if number % len(starts) >= 2:
+            assert b" 408 " in answer.splitlines()[0]
+            assert b'"code":"too-slow"' in answer
+
+
+def test_clients_that_drip_are_cut_off(service: Service) -> None:
+    """A byte now and then is not standing still, but it is no rate at which anything could be sent."""
+    head = lines(
+        f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
+    )
+    rest = {0: b"GET /v1/jobs HTTP/1.1\r\nX: ", 1: head + part(FILE.format("scene"))[:70]}
+    for start in rest.values():
+        with connect(service) as connection:
+            connection.sendall(start)
+            connection.settimeout(0.3)
+            deadline = time.monotonic() + 60
+            ended = False
+            while not ended:
+                assert time.monotonic() < deadline, "it is still listened to"
+                try:
+                    connection.sendall(b"x")
+                    ended = bool(connection.recv(1000)) or True
+                except TimeoutError:
+                    continue
+                except OSError:
+                    ended = True
+
+
+def test_a_head_that_never_ends(service: Service) -> None:
+    for start, more in ((b"GET /", b"x"), (b"GET / HTTP/1.1\r\nX: ", b"x"), (b"GET / HTTP/1.1\r\n", b"X: y\r\n")):
+        with connect(service) as connection:
+            sent = 0
+            try:
+                connection.sendall(start)
+                while sent < 60 * MB:
+                    connection.sendall(more * (MB // len(more)))
+                    sent += MB
+            except OSError:
+                pass
+            assert sent < 60 * MB, "it was all taken in"
+
+
+HEADS: list[tuple[str, bytes]] = [
+    ("no HTTP", b"hello\r\n\r\n"),
+    ("zero bytes", b"\0" * 1000),
+    ("TLS", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(500)),
+    ("HTTP/2", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"),
+    ("two lengths", b"POST /v1/jobs HTTP/1.1\r\nHost: a\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nxxxxx"),
+    (
+        "length and chunks",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: a\r\nContent-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+    ),
+    ("negative length", b"POST /v1/jobs HTTP/1.1\r\nHost: a\r\nContent-Length: -5\r\n\r\n"),
+    ("length 2^70", b"POST /v1/jobs HTTP/1.1\r\nHost: a\r\nContent-Length: 1180591620717411303424\r\n\r\n"),
+    ("chunk of 2^70", b"POST /v1/jobs HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\nffffffffffffffffff\r\n"),
+    (
+        "no chunk size",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+    ),
+    ("folded header", b"GET / HTTP/1.1\r\nHost: a\r\n folded\r\n\r\n"),
+    ("zero byte in a header", b"GET / HTTP/1.1\r\nHost: a\r\nX: a\0b\r\n\r\n"),
+    ("line end in a header", b"GET / HTTP/1.1\r\nHost: a\r\nX: a\rb\r\n\r\n"),
+    ("no path", b"GET HTTP/1.1\r\n\r\n"),
+    ("CONNECT", b"CONNECT example.com:80 HTTP/1.1\r\nHost: a\r\n\r\n"),
+    ("another site's path", b"GET http://example.com HTTP/1.1\r\nHost: a\r\n\r\n"),
+    ("TRACE", b"TRACE / HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n"),
+]
+
+
+@pytest.mark.parametrize("data", [case[1] for case in HEADS], ids=[case[0] for case in HEADS])
+def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: bytes) -> None:
+    """Refused below the app; the connection ends, so that nothing of it passes for another request."""
+    with connect(service) as connection:
+        connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
+        answer = closed(connection)
+    if answer:  # half a request ends with its connection
+        head, _, body = answer.partition(b"\r\n\r\n")
+        problem = json.loads(body)
+        assert b"content-type: application/problem+json" in head.lower()
+        assert int(head.split()[1]) == problem["status"]
+        assert (problem["status"], problem["code"]) in (
+            (400, "malformed-request"),
+            (403, "foreign-site"),
+            (405, "method-not-allowed"),
+        )
+    assert client.get("/livez").status_code == 200
+
+
+def test_a_chunk_that_makes_no_sense(service: Service) -> None:
+    """Within a body that is being read: said once, and nothing behind it is taken for a request."""
+    start = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}"
+    with connect(service) as connection:
+        connection.sendall(lines(start + "\nTransfer-Encoding: chunked\nExpect: 100-continue"))
+        assert b" 100 " in connection.recv(100)  # the app is reading
+        connection.sendall(b"5\r\n--b0u\r\nnonsense\r\n" + lines("GET /livez HTTP/1.1"))
+        answer = closed(connection)
+    assert answer.count(b"HTTP/1.1") == 1
+    assert answer.startswith(b"HTTP/1.1 400 Bad Request\r\n")
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "malformed-request"
+
+
+def test_a_head_that_is_too_large(service: Service) -> None:
+    head = lines("GET /v1/jobs HTTP/1.1")[:-2] + b"X: y\r\n" * (MAX_HEAD_BYTES // 6)
+    with connect(service) as connection:
+        connection.sendall(head)  # no byte more than are read: the answer would be lost with them
+        answer = closed(connection)
+    assert answer.startswith(b"HTTP/1.1 431 Request Header Fields Too Large\r\n")
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "head-too-large"
+
+
+def test_nothing_of_all_that_is_left(service: Service, client: httpx.Client, store: Store) -> None:
+    """Runs last: the service is as ready as before, and every file has its row."""
+    assert client.get("/readyz").status_code == 200
+    metrics = client.get("/metrics").text
+    assert not re.findall(r'sgsst_requests_total\{[^}]*status="5\d\d"\} [1-9]', metrics)
+    known = store.inputs.locations()
+    found = {f"{path.parent.name}/{path.name}" for path in (service.data / "blobs").glob("*/*")}
+    assert found == known

@@ -1,0 +1,43 @@
+"""Results, in a local folder and in a store that only knows whole objects (as S3 does)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from service.files.artifacts import Artifacts
+
+
+@pytest.fixture(params=["file", "memory"])
+def artifacts(request: pytest.FixtureRequest, tmp_path: Path) -> Artifacts:
+    return Artifacts(f"file://{tmp_path / 'results'}" if request.param == "file" else f"memory://{tmp_path}")
+
+
+def test_a_file_comes_back_whole_and_in_parts(artifacts: Artifacts, tmp_path: Path) -> None:
+    source = tmp_path / "stylized.ply"
+    source.write_bytes(bytes(range(256)) * 9000)
+    put = artifacts.put("job_1", 1, "previews/x.jpg", source)
+    assert put.size == source.stat().st_size
+    assert b"".join(artifacts.read(put.location, 0, put.size)) == source.read_bytes()
+    assert b"".join(artifacts.read(put.location, 255, 258)) == b"\xff\x00\x01"
+    artifacts.fetch(put.location, tmp_path / "back")
+    assert (tmp_path / "back").read_bytes() == source.read_bytes()
+    with pytest.raises(OSError, match="shorter"):
+        list(artifacts.read(put.location, 0, put.size + 1))
+
+
+def test_what_no_row_refers_to_is_swept(artifacts: Artifacts, tmp_path: Path) -> None:
+    source = tmp_path / "plan.json"
+    source.write_bytes(b"{}")
+    old, new, later = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2, 10))
+    other = artifacts.put("job_2", 1, "plan.json", source)
+    artifacts.sweep("job_1", 2, {new.location})
+    assert b"".join(artifacts.read(later.location, 0, 2)) == b"{}", "of a lease whose rows are still to come"
+    assert b"".join(artifacts.read(new.location, 0, 2)) == b"{}"
+    with pytest.raises(FileNotFoundError):
+        list(artifacts.read(old.location, 0, 2))
+    artifacts.remove_job("job_1")
+    artifacts.remove_job("job_1")
+    artifacts.remove(new.location)
+    assert b"".join(artifacts.read(other.location, 0, 2)) == b"{}"

@@ -1,0 +1,90 @@
+"""Uploads whose API was killed between the last byte and the row that says so."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.files.blobs import BlobFolder
+from service.settings import ServiceSettings
+from service.store import open_store
+from tests.api.service import Service
+from tests.small_scenes import wall, write_files
+
+TUS = {"Tus-Resumable": "1.0.0"}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": ply, "cameras": cameras, "style": style}
+
+
+def append(service: Service, where: str, offset: int, content: bytes) -> httpx.Response:
+    headers = {**TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
+    return httpx.patch(f"{service.url}{where}", content=content, headers=headers, timeout=60)
+
+
+def begin(service: Service, path: Path) -> str:
+    """The path of an upload with all bytes but the last one."""
+    content = path.read_bytes()
+    headers = {**TUS, "Upload-Length": str(len(content))}
+    where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
+    assert append(service, where, 0, content[:-1]).status_code == 204
+    return where
+
+
+def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) -> None:
+    """Bring the disk and the store where the API is after the last byte; after the blob's link, if so."""
+    service.stop(signal.SIGKILL)
+    settings = ServiceSettings(data=service.data, min_free_bytes=0)
+    store = open_store(settings)
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
+    upload_id, content = where.rsplit("/", 1)[1], path.read_bytes()
+    part = blobs.upload_path(upload_id)
+    part.write_bytes(content)
+    store.inputs.advance_upload(upload_id, len(content), 3600)
+    if linked:
+        blobs.keep(part, hashlib.sha256(content).hexdigest(), len(content), leave=True)
+    store.close()
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_the_last_part_is_taken_up_again(files: dict[str, Path], tmp_path: Path, linked: bool) -> None:
+    content = files["scene"].read_bytes()
+    with Service(tmp_path / "data", alone=True) as service:
+        where = begin(service, files["scene"])
+        die_at_the_end(service, files["scene"], where, linked=linked)
+        service.start()
+        assert httpx.head(f"{service.url}{where}").headers["upload-offset"] == str(len(content))
+        assert append(service, where, len(content), b"").status_code == 204
+        shown = httpx.get(f"{service.url}{where}").json()
+        assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())
+        blobs = [path for path in (service.data / "blobs").glob("*/*") if path.is_file()]
+        assert [path.read_bytes() for path in blobs] == [content]
+        assert not any((service.data / "uploads").iterdir())
+
+
+def test_a_job_may_name_it_at_once(files: dict[str, Path], tmp_path: Path) -> None:
+    with Service(tmp_path / "data", alone=True) as service:
+        where = begin(service, files["scene"])
+        die_at_the_end(service, files["scene"], where, linked=True)
+        service.start()
+        body = {"style": ("style.png", files["style"].read_bytes())}
+        data = {"scene": where.rsplit("/", 1)[1], "parameters": '{"orbit": 2}'}
+        answer = httpx.post(f"{service.url}/v1/jobs", files=body, data=data, timeout=60)
+        assert answer.status_code == 202, answer.text
+        assert httpx.get(f"{service.url}{where}").json()["complete"]
+
+
+def test_missing_bytes_do_not_become_zeros(files: dict[str, Path], tmp_path: Path) -> None:
+    with Service(tmp_path / "data", alone=True) as service:
+        where = begin(service, files["scene"])
+        part = service.data / "uploads" / f"{where.rsplit('/', 1)[1]}.part"
+        part.unlink()
+        answer = append(service, where, files["scene"].stat().st_size - 1, b"x")
+        assert (answer.status_code, answer.json()["code"]) == (404, "not-found")

@@ -1,0 +1,152 @@
+"""Results in an S3-compatible bucket, against moto's server over HTTP."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.files.artifacts import Artifacts
+from sgsst_core.features.network_weights import BackboneWeights
+from tests.api.service import Service, undisturbed, wait_for
+from tests.small_scenes import wall, write_files
+
+#: More than one part of a multipart upload would hold, and no round number.
+SIZE = 6 * (1 << 20) + 17
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    """URL of a server that speaks S3."""
+    server_module = pytest.importorskip("moto.server", reason="moto's server is not installed: see the extra [dev]")
+    pytest.importorskip("s3fs", reason="s3fs is not installed: see the extra [s3]")
+    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def environment(endpoint: str) -> Iterator[dict[str, str]]:
+    """What tells clients of S3 where it is, and who they are; a bucket named `results` is there."""
+    values = {
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in values.items():
+            patch.setenv(name, value)
+        assert httpx.put(f"{endpoint}/results").status_code == 200
+        yield values
+
+
+@pytest.fixture
+def prefix() -> str:
+    return os.urandom(4).hex()
+
+
+@pytest.fixture
+def artifacts(environment: dict[str, str], prefix: str) -> Artifacts:
+    return Artifacts(f"s3://results/{prefix}")
+
+
+def write(folder: Path, size: int = SIZE) -> Path:
+    path = folder / "file"
+    path.write_bytes(os.urandom(size))
+    return path
+
+
+def test_what_is_put_is_read_and_fetched(artifacts: Artifacts, tmp_path: Path) -> None:
+    source = write(tmp_path)
+    content = source.read_bytes()
+    put = artifacts.put("job_1", 3, "previews/step_1.jpg", source)
+    assert (put.name, put.size, put.sha256) == ("previews/step_1.jpg", SIZE, hashlib.sha256(content).hexdigest())
+    assert not artifacts.local
+    assert b"".join(artifacts.read(put.location, 0, SIZE)) == content
+    assert b"".join(artifacts.read(put.location, SIZE - 5, SIZE)) == content[-5:]
+    assert b"".join(artifacts.read(put.location, 5_000_000, 5_300_000)) == content[5_000_000:5_300_000]
+    artifacts.fetch(put.location, tmp_path / "fetched")
+    assert (tmp_path / "fetched").read_bytes() == content
+    with pytest.raises(OSError, match="shorter"):
+        list(artifacts.read(put.location, 0, SIZE + 1))
+
+
+def test_a_name_is_never_written_twice(artifacts: Artifacts, tmp_path: Path) -> None:
+    first = artifacts.put("job_1", 1, "plan.json", write(tmp_path, 10))
+    second = artifacts.put("job_1", 1, "plan.json", write(tmp_path, 11))
+    assert first.location != second.location
+    assert len(b"".join(artifacts.read(first.location, 0, 10))) == 10
+
+
+def test_files_that_no_row_refers_to_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
+    source = write(tmp_path, 10)
+    kept, lost = (artifacts.put("job_1", epoch, "stylized.ply", source) for epoch in (2, 1))
+    other = artifacts.put("job_10", 1, "stylized.ply", source)
+    artifacts.sweep("job_1", 9, {kept.location})
+    assert b"".join(artifacts.read(kept.location, 0, 10)) == source.read_bytes()
+    with pytest.raises(FileNotFoundError):
+        list(artifacts.read(lost.location, 0, 10))
+    artifacts.remove_job("job_1")
+    with pytest.raises(FileNotFoundError):
+        list(artifacts.read(kept.location, 0, 10))
+    assert b"".join(artifacts.read(other.location, 0, 10)) == source.read_bytes()
+    artifacts.remove(kept.location)
+    artifacts.remove_job("job_1")
+
+
+def test_another_process_sees_what_was_put_since_it_looked(
+    artifacts: Artifacts, environment: dict[str, str], prefix: str, tmp_path: Path
+) -> None:
+    """fsspec keeps listings of folders; what one process puts, another one has to find nevertheless."""
+    source = write(tmp_path, 10)
+    first = artifacts.put("job_1", 1, "plan.json", source)
+    artifacts.sweep("job_1", 9, {first.location})
+    late = f"{environment['AWS_ENDPOINT_URL']}/results/{prefix}/job_1/2/x/late"
+    assert httpx.put(late, content=b"0123456789").status_code == 200
+    assert b"".join(artifacts.read("job_1/2/x/late", 0, 10)) == b"0123456789"
+    artifacts.sweep("job_1", 9, {first.location})
+    assert httpx.head(late).status_code == 404
+
+
+def test_a_bucket_that_is_not_there_is_not_ready(artifacts: Artifacts) -> None:
+    artifacts.ping()
+    with pytest.raises(OSError, match="nowhere"):
+        Artifacts("s3://nowhere/x").ping()
+
+
+def test_a_job_whose_results_are_in_a_bucket(
+    environment: dict[str, str], tmp_path: Path, vgg16_weights: BackboneWeights
+) -> None:
+    ply, cameras, style = write_files(tmp_path, wall())
+    files = {"scene": ply, "cameras": cameras, "style": style}
+    parameters = {"preset": "standard", "steps_sos": 4, "backbone": "vgg16", "early_stop": False, "seed": 1}
+    expected = undisturbed(files, parameters, tmp_path).read_bytes()
+    with Service(tmp_path / "data", SGSST_ARTIFACTS="s3://results/service") as service, service.client() as client:
+        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
+        assert answer.status_code == 202, answer.text
+        where = f"/v1/jobs/{answer.json()['id']}"
+
+        def ended() -> bool:
+            return client.get(where).json()["status"] in ("succeeded", "failed")
+
+        wait_for(ended, "the job's end", service.said)
+        found = client.get(where).json()
+        assert found["status"] == "succeeded", found["error"]
+        result = client.get(f"{where}/artifacts/stylized.ply")
+        assert result.content == expected
+        tail = client.get(f"{where}/artifacts/stylized.ply", headers={"Range": "bytes=-100"})
+        assert (tail.status_code, tail.content) == (206, expected[-100:])
+        assert not (service.data / "artifacts").exists()
+        assert client.delete(where).status_code == 204
+        assert client.get(f"{where}/artifacts/stylized.ply").status_code == 404
+    listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/"})
+    assert "<Key>" not in listing.text

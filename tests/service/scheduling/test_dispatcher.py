@@ -1,0 +1,116 @@
+"""What a dispatcher does beside running jobs: it is there, keeps house, and takes over from those that are gone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from service.files.artifacts import Artifacts
+from service.files.blobs import BlobFolder
+from service.scheduling.dispatcher import Dispatcher, is_dead, own_name
+from service.scheduling.machine import Machine
+from service.scheduling.packing import Grant, Room
+from service.scheduling.running import RunningAttempt
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import Lease, NewJob
+from tests.api.service import wait_for
+
+SHA = "a" * 64
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> ServiceSettings:
+    return ServiceSettings(data=tmp_path / "data", poll_seconds=0.05)
+
+
+@pytest.fixture
+def store(settings: ServiceSettings) -> Iterator[Store]:
+    made = open_store(settings)
+    made.inputs.add_blob(SHA, "aa/blob", 3)
+    yield made
+    made.close()
+
+
+@contextmanager
+def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
+    """A dispatcher that runs in a thread."""
+    dispatcher = Dispatcher(settings, store, Machine(("0", "1"), 2, 10**10))
+    thread = threading.Thread(target=dispatcher.run)
+    thread.start()
+    try:
+        yield dispatcher
+    finally:
+        dispatcher.stop()
+        thread.join()
+
+
+def leased(store: Store, dispatcher: str) -> Lease:
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+    found = store.jobs.lease(dispatcher)
+    assert found is not None
+    return found
+
+
+def test_it_is_known_while_it_is_at_work(settings: ServiceSettings, store: Store) -> None:
+    with at_work(settings, store) as dispatcher:
+        found = wait_for(store.operations.dispatchers, "the dispatcher to be known")
+        assert [(row.name, row.places, row.free) for row in found] == [(dispatcher.name, 2, 2)]
+    assert store.operations.dispatchers() == []
+
+
+def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+    held = leased(store, "one")
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
+    artifacts = Artifacts(settings.artifacts_url)
+    grant = Grant(3, ("5", "6", "7"))
+    attempt = RunningAttempt(held, grant, tmp_path, store, blobs, artifacts, settings, cluster=False)
+    room = Room(Machine(grant.gpus, 2, 10**10), None)
+    assert room.free([attempt.grant]) == 0
+    for gpu in ("7", "5"):
+        attempt._hear({"kind": "left-out", "gpus": [gpu]})
+    assert attempt.grant == Grant(1, ("6",))
+    following = room.grant(held.job, [attempt.grant], 1)
+    assert following == Grant(2, ("5", "7"))
+
+
+def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
+    script = "from service.scheduling.dispatcher import own_name; print(own_name())"
+    dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
+    assert is_dead(dead)
+    assert not is_dead(own_name())
+    held = leased(store, dead)
+    store.jobs.cancel(held.job_id, None)
+    store.operations.beat(dead, 8, 0)
+    with at_work(settings, store) as dispatcher:
+        wait_for(lambda: store.jobs.get(held.job_id, None).status == "canceled", "the lost job to be settled")
+        wait_for(
+            lambda: [row.name for row in store.operations.dispatchers()] == [dispatcher.name],
+            "the dead to be forgotten",
+        )
+
+
+def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+    """It died after its job had succeeded: the job has nobody who would look after it again."""
+    artifacts = Artifacts(settings.artifacts_url)
+    source = tmp_path / "stylized.ply"
+    source.write_bytes(b"ply")
+    held = leased(store, "elsewhere")
+    artifacts.put(held.job_id, held.epoch, "previews/cut_off.jpg", source)
+    result = artifacts.put(held.job_id, held.epoch, "stylized.ply", source)
+    store.jobs.succeed(held, [result], {}, 1000.0)
+    running = leased(store, "elsewhere")
+    published_next = artifacts.put(running.job_id, running.epoch, "stylized.ply", source)
+    with at_work(settings, store):
+        wait_for(lambda: store.jobs.unswept(10) == [], "the job to be swept")
+    left = {path.name for path in (settings.folder / "artifacts" / held.job_id).rglob("*.*")}
+    assert left == {"stylized.ply"}
+    assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"
+    assert b"".join(artifacts.read(published_next.location, 0, 3)) == b"ply", "of a job that has not ended"

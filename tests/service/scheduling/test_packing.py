@@ -1,0 +1,219 @@
+"""How jobs share a machine: the real store and dispatcher, and machines that are only described."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.machine import Machine
+from service.scheduling.packing import Grant, Room
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.tables import JobRow
+
+GB = 1_000_000_000
+SHA = "a" * 64
+
+
+def machine(gpus: int, **more: Any) -> Machine:
+    return Machine(tuple(f"gpu{number}" for number in range(gpus)), 16, 100 * GB, **more)
+
+
+class Queue:
+    """A store with jobs, and a dispatcher that is asked what it would start; nothing is run."""
+
+    def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None) -> None:
+        self.now = 1_000_000.0
+        settings = ServiceSettings(data=folder, parallel_jobs=parallel_jobs)
+        self.store = open_store(settings, lambda: self.now)
+        self.store.inputs.add_blob(SHA, "aa/blob", 3)
+        self.dispatcher = Dispatcher(settings, self.store, machine(gpus))
+        self.held: dict[str, Grant] = {}
+
+    def add(self, owner: str = "local", priority: int = 0, **parameters: Any) -> str:
+        self.now += 1
+        scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+        return self.store.jobs.create(NewJob(owner, "", priority, parameters, [scene]), limit=100)[0].id
+
+    def start(self) -> list[str]:
+        """Start what there is room for, as the dispatcher does; ids in the order of their start."""
+        started = []
+        while (found := self.dispatcher.next_job(list(self.held.values()))) is not None:
+            lease, grant = found
+            self.held[lease.job_id] = grant
+            started.append(lease.job_id)
+        taken = [gpu for grant in self.held.values() for gpu in grant.gpus]
+        assert len(taken) == len(set(taken)), "a GPU was given to two jobs"
+        return started
+
+    def ranks(self) -> list[int]:
+        assert all(len(grant.gpus) == grant.ranks for grant in self.held.values())
+        return [grant.ranks for grant in self.held.values()]
+
+
+@pytest.fixture
+def eight(tmp_path: Path) -> Iterator[Queue]:
+    queue = Queue(tmp_path, gpus=8)
+    yield queue
+    queue.store.close()
+
+
+def test_a_job_that_is_alone_is_offered_everything_and_gives_back_what_its_plan_does_without(eight: Queue) -> None:
+    big = eight.add()
+    assert eight.start() == [big]
+    assert eight.ranks() == [8]
+    second = eight.add()
+    assert eight.start() == []
+    kept = eight.held[big].gpus[:3]
+    eight.held[big] = replace(eight.held[big], ranks=3, gpus=kept)
+    assert eight.start() == [second]
+    assert eight.ranks() == [3, 5]
+
+
+@pytest.mark.parametrize(("jobs", "ranks"), [(2, [4, 4]), (3, [2, 3, 3]), (8, [1] * 8), (20, [1] * 8)])
+def test_jobs_that_wait_share_the_gpus(eight: Queue, jobs: int, ranks: list[int]) -> None:
+    added = [eight.add() for _ in range(jobs)]
+    assert eight.start() == added[:8]
+    assert eight.ranks() == ranks
+
+
+def test_a_user_decides_for_a_job(eight: Queue) -> None:
+    for workers in (2, 5, 100):
+        eight.add(workers=workers)
+    eight.start()
+    assert eight.ranks() == [2, 5]
+    eight.held.clear()
+    eight.start()
+    assert eight.ranks() == [8], "no more than there are"
+
+
+def test_a_big_job_waits_for_its_gpus_and_nothing_overtakes_it(eight: Queue) -> None:
+    small = [eight.add(workers=1) for _ in range(7)]
+    assert eight.start() == small
+    big = eight.add(workers=8)
+    for job_id in small:
+        eight.add(workers=1)
+        assert eight.start() == []
+        del eight.held[job_id]
+    assert eight.start() == [big]
+    urgent = eight.add(priority=1)
+    del eight.held[big]
+    assert eight.start()[0] == urgent, "but for one of a higher priority"
+
+
+def test_keys_take_turns_whatever_they_get(eight: Queue) -> None:
+    alice = [eight.add("alice", workers=2) for _ in range(4)]
+    bob = [eight.add("bob", workers=2) for _ in range(2)]
+    assert eight.start() == [alice[0], bob[0], alice[1], bob[1]]
+
+
+def test_dispatchers_share_the_queue(eight: Queue) -> None:
+    for name in ("here", "there"):
+        eight.store.operations.beat(name, 8, 8)
+    first, _ = eight.add(), eight.add()
+    found = eight.dispatcher.next_job([])
+    assert found is not None
+    assert (found[0].job_id, found[1].ranks) == (first, 8), "the other job is for the other dispatcher"
+
+
+def test_no_more_jobs_than_the_operator_wants(tmp_path: Path) -> None:
+    queue = Queue(tmp_path, gpus=8, parallel_jobs=2)
+    for _ in range(5):
+        queue.add()
+    queue.start()
+    assert queue.ranks() == [4, 4]
+    queue.store.close()
+
+
+def test_without_gpus_one_job_at_a_time_has_the_machine(tmp_path: Path) -> None:
+    queue = Queue(tmp_path, gpus=0)
+    first = queue.add()
+    queue.add()
+    assert queue.start() == [first]
+    assert queue.held[first] == Grant(1), "and computes as `sgsst stylize` would"
+    queue.held.clear()
+    queue.add("other", priority=1, workers=2)
+    queue.start()
+    assert [grant.ranks for grant in queue.held.values()] == [2]
+    queue.store.close()
+
+
+def job(scene: int, **parameters: Any) -> JobRow:
+    return JobRow(parameters=parameters, inputs=[{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}])
+
+
+def test_a_cluster_gives_its_memory_out_itself() -> None:
+    assert Room(machine(0, cluster=True), 4).grant(job(50 * GB, workers=3), [], 1) == Grant(3)
+
+
+def test_places_are_parts_of_cores_and_memory() -> None:
+    room = Room(machine(0), 4)
+    small = room.grant(job(GB), [], 9)
+    assert small is not None
+    assert (small.places, small.threads) == (1, 4)
+    assert small.memory == 20 * GB - 2 * GB
+    large = room.grant(job(12 * GB), [small], 9)
+    assert large is not None
+    assert (large.places, large.threads) == (2, 8)
+    assert room.free([small, large]) == 1
+    assert room.grant(job(12 * GB), [small, large], 9) is None, "two places, and one is free"
+    asked = room.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
+    assert asked is not None
+    assert (asked.places, asked.memory) == (1, 3 * GB)
+    assert room.grant(job(1), [small, large, asked], 9) is None
+
+
+@given(
+    st.integers(1, 9),
+    st.lists(st.tuples(st.integers(1, 60 * GB), st.none() | st.integers(1, 200 * GB)), max_size=12),
+)
+def test_jobs_side_by_side_never_plan_with_more_memory_than_there_is(
+    places: int, jobs: list[tuple[int, int | None]]
+) -> None:
+    room, held, planned = Room(machine(0), places), [], []
+    for scene, limit in jobs:
+        grant = room.grant(job(scene, memory_limit=limit), held, len(jobs))
+        if grant is not None:
+            held.append(grant)
+            planned.append((grant.memory or 0) + 2 * scene)
+    assert bool(held) == bool(jobs), "the first one always runs, were it too big"
+    assert len(held) < 2 or sum(planned) <= 100 * GB
+
+
+def test_gpus_of_the_machine_and_of_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,GPU-1f")
+    assert Machine.find(ServiceSettings()).gpus == ("4", "GPU-1f")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert Machine.find(ServiceSettings()).gpus == ()
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    found = Machine.find(ServiceSettings(cluster_gpus=3))
+    assert (len(found.gpus), found.cluster) == (3, True)
+
+
+def test_the_store_counts_what_could_be_started(eight: Queue) -> None:
+    store: Store = eight.store
+    assert store.jobs.waiting() == 0
+    eight.add()
+    second = eight.add()
+    assert store.jobs.waiting() == 2
+    found = store.jobs.lease("one")
+    assert found is not None
+    assert store.jobs.waiting() == 1
+    store.jobs.fail(found, {"code": "x", "message": "x"}, permanent=False, retention=1.0)
+    assert store.jobs.waiting() == 1, "the other one has to wait for its second attempt"
+    store.jobs.cancel(second, "local")
+    assert store.jobs.waiting() == 0
+    eight.now += 100
+    assert store.jobs.lease("one") is not None
+    assert store.jobs.waiting() == 0
+    eight.now += 100
+    assert store.jobs.waiting() == 1, "nobody renewed its lease"

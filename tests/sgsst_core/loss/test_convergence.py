@@ -1,0 +1,40 @@
+"""When a run may end before its schedule."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from sgsst_core.loss.convergence import has_converged, has_reached, smoothed, window_length
+
+
+def test_windows_are_whole_rounds() -> None:
+    assert window_length(1) == 24
+    assert window_length(7) == 28
+    assert window_length(97) == 97
+
+
+def test_smoothed_is_a_geometric_mean_of_the_last() -> None:
+    assert smoothed([100.0, 1.0, 4.0], 2) == pytest.approx(2.0)
+    assert smoothed([8.0, 2.0], 10) == pytest.approx(4.0)
+    assert smoothed([0.0, 0.0], 2) < 1e-200
+
+
+def test_views_that_differ_do_not_look_like_convergence_or_its_absence() -> None:
+    """Losses of three views, 1 : 10 : 100, come in turn."""
+    views = [1.0, 10.0, 100.0]
+    falling = [views[step % 3] * math.exp(-0.01 * step) for step in range(120)]
+    assert not has_converged(falling, 3)
+    assert has_converged([views[step % 3] for step in range(60)], 3)
+    assert not has_converged([views[step % 3] for step in range(47)], 3)  # two windows of 24 are not yet there
+
+
+def test_a_rising_loss_has_stopped_falling() -> None:
+    assert has_converged([1.0 + 0.01 * step for step in range(60)], 1)
+
+
+def test_reached_needs_a_whole_round() -> None:
+    assert not has_reached([0.1], 0.5, 2)
+    assert has_reached([0.9, 0.2], 0.5, 2)
+    assert not has_reached([0.9, 0.9], 0.5, 2)

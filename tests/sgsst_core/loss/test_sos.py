@@ -1,0 +1,191 @@
+"""The SOS gradient of any partition against the untiled autograd reference, with the real VGG16."""
+
+import pytest
+import torch
+
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, Activations, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.loss.sos_reference import sos_reference
+from sgsst_core.scene import pyramid
+from sgsst_core.scene.pyramid import scale_count, style_size
+from tests.sgsst_core.pictures import picture, relative_error
+
+#: Gradients below agree to these: float64 against the reference; float32 tiled against float32 whole.
+FLOAT64_TOLERANCE = 1e-9
+FLOAT32_TOLERANCE = 1e-5
+
+
+def setting(size, *, covered=False):
+    """(image, style, content, coverage) for views of a size, float64."""
+    image, content = picture(*size, seed=1), picture(*size, seed=2)
+    style = resize_area(picture(600, 500, seed=3) ** 2, style_size((600, 500), size))
+    coverage = None
+    if covered:
+        coverage = (picture(*size, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+        coverage[: size[0] // 3] = 0
+    return image, style, content, coverage
+
+
+def evaluate(network, case, tile_size, **options):
+    image, style, content, coverage = (None if t is None else t.to(network.dtype) for t in case)
+    loss = SosLoss(network, tile_size=tile_size, **options)
+    targets = loss.style_targets(style, image.shape[:2])
+    return loss.evaluate(image, targets, loss.view_target(content, coverage))
+
+
+@pytest.mark.parametrize(
+    ("size", "tile_sizes", "covered"),
+    [
+        ((160, 233), [None, 64, 96], False),
+        ((129, 350), [64, 160], True),
+        ((200, 333), [128], False),
+    ],
+)
+def test_float64_agrees_with_untiled_autograd(vgg16_weights, size, tile_sizes, covered):
+    coarsest = 100  # several scales of small views: float64 convolutions are slow
+    case = setting(size, covered=covered)
+    image, style, content, coverage = case
+    expected, expected_gradient = sos_reference(
+        vgg16_weights, image, style, content, coverage=coverage, coarsest=coarsest
+    )
+    network = FeatureNetwork(vgg16_weights, dtype=torch.float64)
+    for tile_size in tile_sizes:
+        result = evaluate(network, case, tile_size, coarsest=coarsest)
+        assert len(result.terms) == pyramid.scale_count(*size, coarsest)
+        assert result.loss == pytest.approx(expected, rel=FLOAT64_TOLERANCE)
+        assert relative_error(result.image_gradient, expected_gradient) < FLOAT64_TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("size", "tile_sizes", "covered"),
+    [
+        ((160, 233), [64], False),
+        ((500, 730), [304], False),
+        ((333, 517), [128], True),
+        ((256, 1031), [512], False),
+        ((520, 600), [272], True),
+    ],
+)
+def test_float32_does_not_depend_on_the_partition(vgg16_weights, size, tile_sizes, covered):
+    network = FeatureNetwork(vgg16_weights)
+    case = setting(size, covered=covered)
+    whole = evaluate(network, case, None, memory=1 << 34)
+    for tile_size in tile_sizes:
+        tiled = evaluate(network, case, tile_size)
+        assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
+        assert relative_error(tiled.image_gradient, whole.image_gradient) < FLOAT32_TOLERANCE
+
+
+class DecisionsOf(FeatureNetwork):
+    """A float64 network that back-propagates through the ReLU masks and pool positions that float32 arrived at."""
+
+    def __init__(self, weights, other: FeatureNetwork):
+        super().__init__(weights, dtype=torch.float64)
+        self.other = other
+        self.flips = 0
+        self.decisions = 0
+
+    def forward(self, rgb, *, keep=True) -> Activations:
+        own = super().forward(rgb, keep=keep)
+        theirs = self.other.forward(rgb.float(), keep=keep)
+        for mine, other in zip(own.outputs, theirs.outputs, strict=True):
+            same = mine == other if mine.dtype == torch.int64 else (mine > 0) == (other > 0)
+            self.flips += int((~same).sum())
+            self.decisions += same.numel()
+        own.outputs = [output if output.dtype == torch.int64 else output.double() for output in theirs.outputs]
+        return own
+
+
+def test_float32_differs_from_float64_by_flips_and_little_else(vgg16_weights):
+    case = setting((160, 233))
+    image, style, content, _ = case
+    _, exact = sos_reference(vgg16_weights, image, style, content)
+    network = FeatureNetwork(vgg16_weights)
+    found = evaluate(network, case, None).image_gradient
+    same_decisions = DecisionsOf(vgg16_weights, network)
+    expected = evaluate(same_decisions, case, None).image_gradient
+    with_flips, without = relative_error(found, exact), relative_error(found, expected)
+    flipped = same_decisions.flips / same_decisions.decisions
+    print(f"float32 against float64: {with_flips:.1e}, of it without flips {without:.1e}; {flipped:.1e} flipped")
+    assert without < 1e-5
+    assert same_decisions.flips > 0
+    assert flipped < 1e-5
+    assert with_flips < 5e-3
+
+
+@pytest.mark.parametrize("memory", [1, 120 << 20])
+def test_memory_budget_changes_no_result(vgg16_weights, memory):
+    """Nothing kept, some tiles kept: second forwards give the same gradient."""
+    network = FeatureNetwork(vgg16_weights)
+    case = setting((200, 330))
+    whole = evaluate(network, case, None, memory=1 << 34)
+    tight = evaluate(network, case, None, memory=memory)
+    assert relative_error(tight.image_gradient, whole.image_gradient) < FLOAT32_TOLERANCE
+
+
+def test_content_features_kept_or_computed_again(vgg16_weights):
+    network = FeatureNetwork(vgg16_weights)
+    image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
+    loss = SosLoss(network)
+    targets = loss.style_targets(style, (200, 300))
+    kept = loss.evaluate(image, targets, loss.view_target(content))
+    again = loss.evaluate(image, targets, loss.view_target(content, keep_content=False))
+    assert kept.loss == again.loss
+    assert torch.equal(kept.image_gradient, again.image_gradient)
+    assert kept.terms[0].content > 0
+
+
+def test_left_out_content_and_layers(vgg16_weights):
+    """Without content weight the content layer is not needed; deeper layers than the deepest used are not computed."""
+    image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
+    full = SosLoss(FeatureNetwork(vgg16_weights, (*STYLE_LAYERS, CONTENT_LAYER)), content_weight=0)
+    lean = SosLoss(FeatureNetwork(vgg16_weights, STYLE_LAYERS), content_weight=0)
+    results = [
+        loss.evaluate(image, loss.style_targets(style, (200, 300)), loss.view_target(content)) for loss in (full, lean)
+    ]
+    assert torch.equal(results[0].image_gradient, results[1].image_gradient)
+    shallow = FeatureNetwork(vgg16_weights, ("relu1_1", "relu2_1"))
+    assert len(shallow.forward(image).outputs) == 4  # conv1_1, conv1_2, pool1, conv2_1
+
+
+def test_loss_only_is_the_same_loss(vgg16_weights):
+    network = FeatureNetwork(vgg16_weights)
+    image, style, content, coverage = (t.float() for t in setting((200, 300), covered=True))
+    loss = SosLoss(network)
+    targets, view = loss.style_targets(style, (200, 300)), loss.view_target(content, coverage)
+    only = loss.evaluate(image, targets, view, gradient=False)
+    assert only.image_gradient is None
+    assert only.terms == loss.evaluate(image, targets, view).terms
+
+
+@pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (3, 200)])
+def test_tiny_views_use_the_layers_that_they_reach(vgg16_weights, size):
+    case = (picture(*size, seed=1), picture(40, 30, seed=2), picture(*size, seed=3), None)
+    result = evaluate(FeatureNetwork(vgg16_weights), case, None)
+    assert torch.isfinite(result.image_gradient).all()
+    assert result.image_gradient.abs().max() > 0
+
+
+def test_uncovered_pixels_get_no_gradient_of_their_own(vgg16_weights):
+    """Beyond the receptive field of every covered cell, nothing pulls at a pixel."""
+    size = (400, 300)
+    coverage = torch.zeros(size)
+    coverage[:64] = 1
+    image, style, content, _ = (None if t is None else t.float() for t in setting(size))
+    loss = SosLoss(FeatureNetwork(vgg16_weights))
+    result = loss.evaluate(image, loss.style_targets(style, size), loss.view_target(content, coverage))
+    assert result.image_gradient[:64].abs().max() > 0
+    assert result.image_gradient[64 + 16 + 64 :].abs().max() == 0
+
+
+def test_scales_are_averaged(vgg16_weights):
+    size = (520, 600)
+    assert scale_count(*size) == 2
+    image, style, content, _ = (None if t is None else t.float() for t in setting(size))
+    loss = SosLoss(FeatureNetwork(vgg16_weights))
+    targets, view = loss.style_targets(style, size), loss.view_target(content)
+    both = loss.evaluate(image, targets, view)
+    single = [loss.evaluate(image, targets, view, [scale]) for scale in (0, 1)]
+    assert both.loss == pytest.approx((single[0].loss + single[1].loss) / 2, rel=1e-12)
+    mean = (single[0].image_gradient + single[1].image_gradient) / 2
+    assert relative_error(both.image_gradient, mean) < 1e-6

@@ -1,0 +1,83 @@
+import pytest
+import torch
+
+from sgsst_core.features.statistics import layer_statistics
+from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget, content_loss, style_loss
+from tests.sgsst_core.pictures import relative_error
+
+
+def make_features(height, width, channels, seed, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn((height, width, channels), generator=generator, dtype=torch.float64)
+    return (x @ torch.randn((channels, channels), generator=generator, dtype=torch.float64)).relu().to(dtype)
+
+
+def autograd_style(x, target, weights):
+    """Style loss by its definition, gradient by autograd."""
+    x = x.double().clone().requires_grad_()
+    flat = x.reshape(-1, x.shape[-1])
+    a = torch.ones(len(flat), dtype=torch.float64) if weights is None else weights.double().reshape(-1)
+    n, c = a.sum(), flat.shape[1]
+    mean = (a[:, None] * flat).sum(0) / n
+    gram = (a[:, None] * flat).T @ flat / n
+    std = ((a[:, None] * (flat - mean) ** 2).sum(0) / n).sqrt()
+    loss = (
+        GRAM_WEIGHT / c**2 * (gram - target.gram).square().mean()
+        + MEAN_WEIGHT * (mean - target.mean).square().mean()
+        + STD_WEIGHT * (std - target.std).square().mean()
+    )
+    return loss.item(), torch.autograd.grad(loss, x)[0]
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_style_gradient_agrees_with_autograd(weighted, dtype, tolerance):
+    x = make_features(17, 23, 12, 1, dtype)
+    a = torch.rand((17, 23), dtype=torch.float64) if weighted else None
+    target = LayerTarget.of(layer_statistics(make_features(30, 20, 12, 2)))
+    expected, expected_gradient = autograd_style(x, target, a)
+    terms, gradient = style_loss(layer_statistics(x, a), target, feature_eps=torch.finfo(dtype).eps)
+    assert terms.total == pytest.approx(expected, rel=tolerance)
+    assert relative_error(gradient.apply(x, a), expected_gradient) < tolerance
+
+
+def test_zero_at_the_target():
+    x = make_features(17, 23, 12, 1)
+    terms, gradient = style_loss(layer_statistics(x), LayerTarget.of(layer_statistics(x)))
+    assert terms.total == 0
+    assert gradient.apply(x).abs().max() == 0
+
+
+@pytest.mark.parametrize("dead_in", ["view", "style", "both"])
+def test_dead_channels_give_finite_gradients(dead_in):
+    view, style = make_features(17, 23, 12, 1, torch.float32), make_features(17, 23, 12, 2, torch.float32)
+    for name, x in (("view", view), ("style", style)):
+        if dead_in in (name, "both"):
+            x[..., :5] = 0
+    terms, gradient = style_loss(layer_statistics(view), LayerTarget.of(layer_statistics(style)))
+    result = gradient.apply(view)
+    assert torch.isfinite(result).all()
+    assert terms.total > 0
+    if dead_in == "style":
+        _, expected = autograd_style(view, LayerTarget.of(layer_statistics(style)), None)
+        assert relative_error(result, expected) < 1e-5
+
+
+def test_gradient_survives_a_large_mean_to_sigma_ratio():
+    generator = torch.Generator().manual_seed(0)
+    x = (1e4 + torch.randn((60, 50, 8), generator=generator, dtype=torch.float64)).float()
+    style = (1e4 + 2 * torch.randn((60, 50, 8), generator=generator, dtype=torch.float64)).float()
+    target = LayerTarget.of(layer_statistics(style))
+    _, expected = autograd_style(x, target, None)
+    _, gradient = style_loss(layer_statistics(x), target)
+    assert relative_error(gradient.apply(x), expected) < 1e-4
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_content_gradient_agrees_with_autograd(weighted):
+    x, content = make_features(9, 11, 6, 1).requires_grad_(), make_features(9, 11, 6, 2)
+    a = torch.rand((9, 11), dtype=torch.float64) if weighted else torch.ones((9, 11), dtype=torch.float64)
+    expected = 0.7 * (a[:, :, None] * (x - content) ** 2).sum() / (a.sum() * 6)
+    loss, gradient = content_loss(x.detach(), content, float(a.sum()), 0.7, a if weighted else None)
+    assert loss == pytest.approx(expected.item(), rel=1e-12)
+    torch.testing.assert_close(gradient, torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)

@@ -1,0 +1,210 @@
+"""What is left out changes nothing, and the plan says what and why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.planning import planner
+from sgsst_core.planning.planner import choose_network
+from sgsst_core.planning.pruning import distinct_views, pruned_image_error
+from sgsst_core.planning.survey import survey
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import EVERYTHING, Item, make_settings
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.unseen import neighbours_change
+from tests.sgsst_core.pictures import picture, relative_error
+from tests.small_scenes import ball, cameras, wall
+
+
+def behind(scene: Scene, count: int = 10) -> Scene:
+    """The scene with its last Gaussians put behind the cameras, where no view sees them."""
+    moved = scene.means.clone()
+    moved[-count:, 2] *= -1
+    return replace(scene, means=moved)
+
+
+def higher_bands_of_zeros(scene: Scene) -> Scene:
+    return replace(scene, sh_rest=torch.zeros((len(scene), 15, 3)))
+
+
+def make(scene: Scene, views: list[Camera], weights: BackboneWeights, **values: Any) -> Stylizer:
+    settings = make_settings(**{"steps_coarse": 0, "steps_sos": 4, "learning_rate": 0.05, **values})
+    return Stylizer(scene, views, picture(60, 70, seed=9).float(), settings, weights=weights)
+
+
+SCENES = {
+    "wall of degree 3, some behind the cameras": behind(wall(sh_degree=3)),
+    "wall with bands of zeros": higher_bands_of_zeros(wall()),
+    "ball, some behind the cameras": behind(ball()),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_is_left_out_changes_nothing(vgg16_weights: BackboneWeights, name: str) -> None:
+    scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
+    lean, full = (make(scene, views, vgg16_weights, keep=keep) for keep in ((), EVERYTHING))
+    first = [stylizer.run_step() for stylizer in (lean, full)]
+    # The first step's loss comes from equal colours: nothing but rounding may differ.
+    assert first[0].loss == pytest.approx(first[1].loss, rel=1e-5)
+    for stylizer in (lean, full):
+        run(stylizer)
+    # Later steps differ by what Adam makes of rounding: gradients that are 0 but for it move by the learning rate too.
+    assert lean.history[-1].loss == pytest.approx(full.history[-1].loss, rel=1e-3)
+    assert relative_error(lean.stylized() - scene.sh_dc, full.stylized() - scene.sh_dc) < 0.02
+
+
+@pytest.mark.parametrize("item", EVERYTHING)
+def test_each_item_alone_changes_nothing(vgg16_weights: BackboneWeights, item: Item) -> None:
+    """Enough steps for blend weights to be kept, on a scene in which every item has something to leave out."""
+    scene, views = higher_bands_of_zeros(behind(ball())), cameras(1)
+    lean, other = (make(scene, views, vgg16_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
+    losses = [stylizer.run_step().loss for stylizer in (lean, other)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    gradients = [stylizer.gradient(0, [0])[0] for stylizer in (lean, other)]
+    if item == "unseen":
+        gradients[1] = gradients[1][lean.plan.seen]
+    assert relative_error(gradients[0], gradients[1]) < 1e-4
+    assert lean.plan.kept_weights == "float32"
+    assert (other.plan.kept_weights == "none") == (item == "blend-weights")
+
+
+def test_blend_weights_are_kept_as_memory_and_visits_allow(vgg16_weights: BackboneWeights) -> None:
+    scene, views = wall(), cameras(3)
+    assert make(scene, views, vgg16_weights, steps_sos=14).plan.kept_weights == "none"  # fewer than 5 visits a view
+    lean = make(scene, views, vgg16_weights, steps_sos=30)
+    assert lean.plan.kept_weights == "float32"
+    little = make(scene, views, vgg16_weights, steps_sos=30, memory_limit=400_000)
+    assert little.plan.kept_weights == "half"
+    assert make(scene, views, vgg16_weights, steps_sos=30, kept_weights="none").views.rasterizer.name == "cpu"
+    decision = next(d for d in little.plan.decisions if d.item == "blend weights")
+    assert "half precision" in decision.decision
+    assert "1/4096" in decision.error
+
+
+def test_pruning_stays_within_its_bound_and_is_made_up_for(vgg16_weights: BackboneWeights) -> None:
+    scene, views = behind(ball(600)), cameras(3)
+    whole = make(scene, views, vgg16_weights)
+    threshold = float(whole.plan.survey.total_weights.quantile(0.5))
+    pruned = make(scene, views, vgg16_weights, prune_weight=threshold)
+    left_out = ~pruned.plan.seen
+    assert 0.4 < float(left_out.double().mean()) < 0.6
+    bound = pruned_image_error(left_out, views, [0, 1, 2], make_rasterizer("cpu", scene))
+    for index in range(3):
+        images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (whole, pruned)]
+        reach = float(max(image.max() for image in images))
+        difference = (images[0] - images[1]).abs()
+        assert 0 < float(difference.max()) <= bound.largest * reach
+    run(pruned)
+    assert bool((pruned.stylized()[left_out] != scene.sh_dc[left_out]).any(dim=1).all())
+    assert any(decision.item == "pruned Gaussians" for decision in pruned.plan.decisions)
+
+
+def test_pruning_everything_is_refused(vgg16_weights: BackboneWeights) -> None:
+    with pytest.raises(SettingsError, match="largest total blend weight"):
+        make(wall(), cameras(1), vgg16_weights, prune_weight=1e9)
+
+
+def test_similar_views_are_left_out_only_when_asked(vgg16_weights: BackboneWeights) -> None:
+    scene = wall()
+    views = [camera for camera in cameras(3) for _ in range(2)]  # every view twice
+    assert make(scene, views, vgg16_weights).plan.covered == [0, 1, 2, 3, 4, 5]
+    plan = make(scene, views, vgg16_weights, similar_views=1e-4).plan
+    assert plan.covered == [0, 2, 4]
+    assert any(decision.item == "similar views" for decision in plan.decisions)
+
+
+def test_distinct_views_by_their_shift() -> None:
+    """Views 0.3 apart of a wall at distance 3, focal length of one width: shifted by 0.1 of the width."""
+    scene, views = wall(), cameras(3)
+    turned = [replace(camera, world_to_camera=camera.world_to_camera.clone()) for camera in views]
+    for camera, x in zip(turned, (-0.3, 0.0, 0.3), strict=True):
+        camera.world_to_camera[:] = torch.eye(4)
+        camera.world_to_camera[0, 3] = -x
+    weights = torch.ones(len(scene), dtype=torch.float64)
+    assert distinct_views(scene, turned, [0, 1, 2], weights, 0.09) == [0, 1, 2]
+    assert distinct_views(scene, turned, [0, 1, 2], weights, 0.11) == [0, 2]
+
+
+def test_bfloat16_is_left_out_where_it_is_slower(
+    vgg16_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The two timings are all that is replaced: which of them is shorter depends on the processor."""
+    for slower, dtype in ((torch.bfloat16, torch.float32), (torch.float32, torch.bfloat16)):
+        monkeypatch.setattr(planner, "_convolution_seconds", lambda d, device, s=slower: 2.0 if d == s else 1.0)
+        network, decisions = choose_network(vgg16_weights, make_settings(precision="bfloat16"))
+        assert network.dtype == dtype
+        assert [decision.item for decision in decisions] == ["precision"]
+
+
+def test_rendering_without_unseen_gaussians_is_bitwise_the_same(vgg16_weights: BackboneWeights) -> None:
+    scene, views = behind(wall(sh_degree=2), 100), cameras(3)
+    lean, full = (make(scene, views, vgg16_weights, keep=keep) for keep in ((), EVERYTHING))
+    assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
+    for index in range(3):
+        images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (lean, full)]
+        assert torch.equal(*images)
+
+
+def test_decisions_name_what_is_left_out(vgg16_weights: BackboneWeights) -> None:
+    near = ball()
+    scene = higher_bands_of_zeros(behind(replace(near, means=near.means + torch.tensor([0.0, 0, 4]))))
+    views = [resized(camera, 320) for camera in cameras(2)]
+    plan = make(scene, views, vgg16_weights, content_weight=0, steps_coarse=3).plan
+    decisions = {decision.item: decision for decision in plan.decisions}
+    assert set(decisions) >= {
+        "unseen Gaussians",
+        "spherical harmonics",
+        "uncovered pixels",
+        "position weights",
+        "phase 1",
+        "content",
+        "partition",
+    }
+    assert decisions["uncovered pixels"].seconds is not None
+    assert decisions["uncovered pixels"].seconds > 0
+    assert (decisions["unseen Gaussians"].bytes or 0) == int((~plan.seen).sum()) * 48
+    assert plan.steps_coarse == 0
+    assert plan.prediction is not None
+    assert plan.prediction.seconds > 0
+
+
+def test_survey_finds_weights_regions_and_blind_views() -> None:
+    scene = behind(ball(), 10)
+    views = cameras(2)
+    away = replace(views[0], world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64)))
+    rasterizer = make_rasterizer("cpu", replace(scene, means=scene.means.clamp_min(0)))
+    found = survey(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
+    assert found.covered == [0, 1]
+    expected = sum(rasterizer.coverage(camera).double().sum() for camera in views)
+    assert float(found.total_weights.sum()) == pytest.approx(float(expected), rel=1e-5)
+    coverage = rasterizer.coverage(views[0])
+    outside = coverage.clone()
+    outside[found.regions[0].slices] = 0
+    assert outside.max() == 0
+    assert 0 < found.regions[0].pixels < coverage.numel()
+
+
+def test_unseen_gaussians_follow_their_seen_neighbours() -> None:
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.1, 0, 0], [50, 0, 0]])
+    change = torch.tensor([[1.0, 0, 0], [0, 1, 0], [9, 9, 9], [9, 9, 9]])
+    found = neighbours_change(means, change, torch.tensor([3e-9, 1e-9, 0, 0], dtype=torch.float64))
+    torch.testing.assert_close(found, torch.tensor([[0.75, 0.25, 0], [0.75, 0.25, 0]]))
+    assert neighbours_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
+
+
+def test_unseen_gaussians_keep_their_colour_in_paper(vgg16_weights: BackboneWeights) -> None:
+    scene = behind(wall())
+    for preset, moved in (("paper", False), ("standard", True)):
+        settings = make_settings(preset, steps_coarse=0, steps_sos=2)
+        stylizer = Stylizer(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=vgg16_weights)
+        run(stylizer)
+        assert bool((stylizer.stylized()[-10:] != scene.sh_dc[-10:]).any()) == moved

@@ -1,0 +1,79 @@
+"""The planner's model of several ranks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.parallel.division import Piece
+from sgsst_core.planning.ranks_model import IterationWork, Link, choose_ranks
+
+FREE = Link(math.inf, 0.0)
+SLOW = Link(1e6, 1e-3)
+
+
+def work(height: int = 720, width: int = 1280, scales: int = 2) -> IterationWork:
+    pieces = tuple(Piece(s, (height >> s, width >> s), Rectangle(0, 0, height >> s, width >> s)) for s in range(scales))
+    return IterationWork(pieces, halo=64, pixel=1e-6, raster=0.1, fixed=0.01, gaussians=50_000)
+
+
+def test_one_rank_tells_nobody_anything() -> None:
+    assert work().communication(1, SLOW) == 0
+    assert work().seconds(1, SLOW) == pytest.approx(1e-6 * 1.25 * 720 * 1280 + 0.11)
+
+
+def test_links_are_counted_as_rings_move_bytes() -> None:
+    link = Link(bandwidth=1e9, latency=1e-4)
+    assert link.gather(4_000_000, 4) == pytest.approx(3 * (1e-4 + 1e-3))
+    assert link.sum(4_000_000, 4) == pytest.approx(2 * link.gather(4_000_000, 4))
+
+
+def test_kept_coarse_weights_need_no_image() -> None:
+    whole, coarse = work(), replace(work(), whole_image=False)
+    difference = whole.communication(4, SLOW) - coarse.communication(4, SLOW)
+    assert difference == pytest.approx(2 * SLOW.gather(720 * 1280 * 12, 4))
+
+
+def test_a_free_link_makes_every_rank_worth_it_and_a_slow_one_none() -> None:
+    phases = [(10, [work()]), (20, [work()])]
+    free = choose_ranks(phases, 1, 4, FREE)
+    assert free.ranks == 4
+    assert free.speed_up == pytest.approx(free.seconds[1] / free.seconds[4])
+    assert 2.5 < free.speed_up < 4
+    slow = choose_ranks(phases, 1, 4, SLOW)
+    assert slow.ranks == 1
+    assert slow.speed_up == 1
+
+
+def test_further_ranks_must_be_worth_it() -> None:
+    """A view that is all halo: no number of ranks is faster by more than its raster part."""
+    small = replace(work(40, 40, 1), raster=1e-6)
+    assert choose_ranks([(0, [small]), (10, [small])], 1, 8, FREE).ranks == 1
+
+
+def test_groups_take_views_side_by_side() -> None:
+    """Two views a step on two ranks: no halos, twice as fast but for the sum of colours."""
+    phases = [(0, [work()]), (10, [work()])]
+    found = choose_ranks(phases, 2, 2, FREE)
+    assert found.speed_up == pytest.approx(2.0)
+
+
+def test_many_ranks_are_looked_at_in_steps() -> None:
+    found = choose_ranks([(0, [work()]), (1, [work()])], 1, 64, FREE)
+    assert {1, 2, 3, 4, 8, 64} <= set(found.seconds)
+    assert len(found.seconds) < 25
+
+
+def test_what_does_not_fit_the_memory_goes_forward_twice() -> None:
+    """Two ranks of one machine have half of its memory each, and hold all scales at once."""
+    pixels = 1.25 * 720 * 1280
+    roomy = replace(work(), forward=1e-6, held=2 * pixels, working=0.1, sharing=2)
+    tight = replace(roomy, held=pixels)
+    assert tight.computing(1) == roomy.computing(1) == replace(roomy, held=math.inf).computing(1)
+    assert tight.computing(2) > 1.1 * roomy.computing(2)
+    assert replace(tight, sharing=1).computing(2) == roomy.computing(2)
+    assert tight.computing(1, groups=2) > tight.computing(1), "groups share memory as well"
+    assert roomy.computing(2) == pytest.approx(work().computing(2))

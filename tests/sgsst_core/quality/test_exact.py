@@ -1,0 +1,65 @@
+"""Approximations against exact."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.planning import planner
+from sgsst_core.quality.exact import ExactTwin, approximations
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
+from tests.small_scenes import ball, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(weights: BackboneWeights, scene: object = None, **values: object) -> Stylizer:
+    settings = make_settings(**{"steps_coarse": 0, "steps_sos": 12, **values})
+    return Stylizer(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
+
+
+def test_an_exact_job_agrees_with_its_twin(vgg16_weights: BackboneWeights) -> None:
+    stylizer = make(vgg16_weights, wall(sh_degree=2))
+    stylizer.run_step()
+    twin = ExactTwin(stylizer)
+    error = twin.gradient_error()
+    assert approximations(stylizer) == []
+    assert error.relative_error < 1e-5
+    assert error.cosine == pytest.approx(1, abs=1e-6)
+    expected = mean_loss(stylizer.evaluate([0, 1]))
+    assert mean_loss(twin.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
+
+
+def test_half_precision_weights_have_a_small_error(vgg16_weights: BackboneWeights) -> None:
+    stylizer = make(vgg16_weights, kept_weights="half")
+    run(stylizer)
+    assert approximations(stylizer) == ["half-precision blend weights"]
+    error = ExactTwin(stylizer).gradient_error()
+    assert 1e-6 < error.relative_error < 0.05
+    assert error.seconds > 0
+    assert error.seconds_exact > 0
+
+
+def test_pruning_has_an_error_that_grows_with_what_is_pruned(vgg16_weights: BackboneWeights) -> None:
+    weights = make(vgg16_weights).plan.survey.total_weights
+    errors = []
+    for share in (0.2, 0.7):
+        stylizer = make(vgg16_weights, prune_weight=float(weights.quantile(share)))
+        stylizer.run_step()
+        assert approximations(stylizer) == ["pruned Gaussians"]
+        errors.append(ExactTwin(stylizer).gradient_error().relative_error)
+    assert 0 < errors[0] < errors[1]
+
+
+def test_bfloat16_has_an_error_between_rounding_and_nonsense(
+    vgg16_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planner, "_convolution_seconds", lambda dtype, device: 1.0 if dtype == torch.bfloat16 else 2.0)
+    stylizer = make(vgg16_weights, precision="bfloat16")
+    assert approximations(stylizer) == ["bfloat16 features"]
+    error = ExactTwin(stylizer).gradient_error()
+    assert 1e-3 < error.relative_error < 0.8
+    assert error.cosine > 0.6

@@ -1,0 +1,173 @@
+"""What `sgsst check` finds in scenes, views and styles that are extreme in one respect each."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sgsst_core.constants import NEAR
+from sgsst_core.files.ply import SceneFile, read_scene, write_scene
+from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views, scene_extent
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from tests.small_scenes import ball, blind_camera, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def stored(folder: Path, scene: Scene) -> SceneFile:
+    write_scene(folder / "scene.ply", scene)
+    return read_scene(folder / "scene.ply", drop_invalid=True)
+
+
+def found_in(folder: Path, scene: Scene) -> dict[str, Finding]:
+    return {finding.what: finding for finding in check_scene(stored(folder, scene))}
+
+
+def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Finding]:
+    file = stored(folder, scene)
+    rasterizer = make_rasterizer("cpu", file.scene)
+    return {finding.what: finding for finding in check_views(file, views, rasterizer, near=NEAR)}
+
+
+def the(found: dict[str, Finding], text: str) -> Finding:
+    (match,) = [finding for what, finding in found.items() if text in what]
+    return match
+
+
+def test_nothing_extreme_is_found_in_an_ordinary_scene(tmp_path: Path) -> None:
+    scene = replace(wall(), opacities=torch.full((len(wall()),), -1.0))
+    assert found_in(tmp_path, scene) == {}
+    # the wall is larger than what its cameras see of it
+    found = seen_by(tmp_path, wall(), cameras())
+    assert {what.split(":")[0] for what in found} == {"in no view", "hardly seen"}
+    assert check_style(style(), cameras()) == []
+
+
+@pytest.mark.parametrize(
+    ("column", "rows", "value", "what", "worst"),
+    [
+        ("quats", [4, 9], 0.0, "quaternion of length 0", "Gaussian 4: 0"),
+        ("quats", [3], 1e-20, "quaternion shorter than 0.001", "Gaussian 3: 2e-20"),
+        ("quats", [3], 1e20, "quaternion longer than 1000", "Gaussian 3: 2e+20"),
+        ("scales", [5, 6], 200.0, "size that overflows", "Gaussian 5: 200"),
+        ("scales", [7], 5.0, "longer than the scene's extent", "Gaussian 7: "),
+        ("scales", [7, 8, 9], -1e6, "smaller than 1e-07", "Gaussian 7: "),
+        ("opacities", [11, 12], -20.0, "opacity below 1/255", "Gaussian 11: 2.06e-09"),
+        ("opacities", [11], 30.0, "opacity above 0.99", "Gaussian 11: 1"),
+        ("sh_dc", [2, 13], -1e4, "DC SH coefficients above 20", "Gaussian 2: 1e+04"),
+        ("sh_rest", [13], 50.0, "higher SH coefficients above 20", "Gaussian 13: 50"),
+    ],
+)
+def test_extreme_gaussians_are_counted_and_the_worst_is_named(
+    tmp_path: Path, column: str, rows: list[int], value: float, what: str, worst: str
+) -> None:
+    scene = replace(wall(sh_degree=1), opacities=torch.full((len(wall()),), 2.0))
+    getattr(scene, column)[rows] = value
+    finding = the(found_in(tmp_path, scene), what)
+    assert (finding.count, finding.total) == (len(rows), len(scene))
+    assert finding.worst.startswith(worst)
+    assert finding.done
+
+
+def test_needles_are_found_and_discs_are_not(tmp_path: Path) -> None:
+    scene = wall()
+    scene.scales[:] = torch.tensor([0.1, 0.1, 1e-6]).log()
+    scene.scales[6] = torch.tensor([0.5, 1e-5, 1e-6]).log()
+    finding = the(found_in(tmp_path, scene), "needles")
+    assert (finding.count, finding.worst) == (1, "Gaussian 6: 5e+04")
+
+
+def test_invalid_rows_are_told_and_indices_are_those_of_the_file(tmp_path: Path) -> None:
+    scene = wall()
+    scene.means[2, 1] = math.nan
+    scene.sh_dc[5, 0] = math.inf
+    scene.quats[20] = 0
+    found = found_in(tmp_path, scene)
+    invalid = the(found, "NaN or infinite")
+    assert (invalid.count, invalid.total, invalid.worst) == (2, len(scene), "first: Gaussian 2")
+    assert "--drop-invalid" in invalid.done
+    assert the(found, "length 0").worst == "Gaussian 20: 0"
+
+
+def test_a_world_far_from_its_origin_is_told_with_what_is_lost(tmp_path: Path) -> None:
+    scene = replace(wall(), means=wall().means + torch.tensor([1e6, 0.0, 0.0]))
+    finding = the(found_in(tmp_path, scene), "far from its origin")
+    assert "positions step by 0.0625" in finding.worst
+
+
+def test_extent_ignores_a_few_floaters() -> None:
+    scene = wall()
+    _, before = scene_extent(scene)
+    scene.means[:3] = 1e9
+    _, after = scene_extent(scene)
+    assert after < 1.5 * before
+
+
+def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_path: Path) -> None:
+    scene = wall()
+    scene.means[:10, 2] = -3.0  # behind every camera
+    scene.means[10:12] = torch.tensor([0.0, 0.0, 5.0])  # behind two opaque layers, faint
+    front = replace(wall(), means=wall().means * torch.tensor([0.9, 0.9, 0.9]))
+    scene = Scene(*(torch.cat([getattr(scene, n), getattr(front, n)]) for n in Scene.__dataclass_fields__))
+    found = seen_by(tmp_path, scene, cameras())
+    file = stored(tmp_path, scene)
+    rasterizer = make_rasterizer("reference", file.scene)
+    weights = sum(rasterizer.colour_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
+    unseen = the(found, "in no view")
+    assert unseen.count == int((weights == 0).sum()) >= 10
+    hardly = the(found, "hardly seen")
+    assert hardly.count == int(((weights > 0) & (weights < 1 / 255)).sum()) > 0
+
+
+def test_views_of_an_object_are_told_apart_from_views_of_nothing(tmp_path: Path) -> None:
+    found = seen_by(tmp_path, ball(), [*cameras(), blind_camera()])
+    assert the(found, "see no Gaussian").worst.startswith("'blind'")
+    uncovered = the(found, "uncovered")
+    assert (uncovered.count, uncovered.total) == (3, 4)
+
+
+def test_extreme_lenses_and_sizes_are_told(tmp_path: Path) -> None:
+    view = cameras(1)[0]
+    views = [
+        replace(view, name="wide", fx=3.0, fy=3.0),
+        replace(view, name="narrow", fx=1e5, fy=1e5),
+        replace(view, name="shifted", cx=-70.0),
+        replace(view, name="small", height=9, cy=4.5),
+    ]
+    found = seen_by(tmp_path, wall(), views)
+    assert the(found, "above 140 degrees").worst.startswith("'wide': 169")
+    assert the(found, "below 1 degree").worst.startswith("'narrow'")
+    assert the(found, "principal point").worst.startswith("'shifted'")
+    assert the(found, "fewer than 16 pixels").worst == "'small': 9"
+
+
+def test_cameras_inside_the_scene_are_told(tmp_path: Path) -> None:
+    scene = wall()
+    scene.means[:4] = cameras()[1].centre.float() + 0.05
+    finding = the(seen_by(tmp_path, scene, cameras()), "inside the scene")
+    assert (finding.count, finding.worst) == (1, "'view_1': 4")
+
+
+def test_a_view_with_too_many_intersections_is_told_not_raised(tmp_path: Path) -> None:
+    scene = wall(50, 43)
+    scene.scales[:] = 6.0
+    scene.opacities[:] = 2.0
+    view = replace(cameras(1)[0], width=16384, height=16384, fx=8e3, fy=8e3, cx=8192, cy=8192)
+    finding = the(seen_by(tmp_path, scene, [view]), "cannot be rendered")
+    assert "can be addressed" in finding.worst
+
+
+def test_extreme_styles_are_told() -> None:
+    views = cameras()
+    (flat,) = check_style(torch.full((60, 60, 3), 0.4), views)
+    assert flat.what == "one colour throughout"
+    (tiny,) = check_style(torch.rand(8, 9, 3), views)
+    assert tiny.worst == "used at 9 x 8"
+    (long,) = check_style(torch.rand(1000, 50, 3), views)
+    assert long.worst == "50 x 1000"

@@ -1,0 +1,385 @@
+"""Held-out views: where they stand, and what is measured on them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import random
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core import Stylizer, make_settings, run
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.loss.sos_reference import box_average_reference, features_reference
+from sgsst_core.loss.terms import GRAM_WEIGHT
+from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE
+from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, held_out_cameras, moments
+from sgsst_core.quality.lpips import Lpips
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene import pyramid
+from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from tests.small_scenes import ball, blind_camera, cameras, style, wall
+
+AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
+
+
+def rotation(angle: float, axis: Tensor = AXIS) -> Tensor:
+    """[3, 3]: Rodrigues' formula."""
+    x, y, z = (axis / axis.norm()).tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def posed(turned: Tensor, centre: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
+    """A camera of a rotation (world to camera) at a centre."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = turned
+    pose[:3, 3] = -turned @ torch.as_tensor(centre, dtype=torch.float64)
+    return Camera(name, width, 40, 55.0, 56.0, 31.0, 19.0, pose)
+
+
+def angle_between(first: Camera, second: Camera) -> float:
+    relative = first.world_to_camera[:3, :3] @ second.world_to_camera[:3, :3].T
+    # sine and cosine, so that small angles keep their digits
+    sine = torch.stack(
+        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
+    )
+    return math.atan2(float(sine.norm()) / 2, (float(relative.trace()) - 1) / 2)
+
+
+def ring(count: int, radius: float = 3.0) -> list[Camera]:
+    """Cameras around the origin that look at it."""
+    origin, up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
+    angles = [2 * math.pi * i / count for i in range(count)]
+    return [
+        look_at(
+            str(i),
+            torch.tensor([radius * math.sin(a), 0, radius * math.cos(a)]),
+            origin,
+            up,
+            width=64,
+            height=48,
+            focal=60,
+        )
+        for i, a in enumerate(angles)
+    ]
+
+
+def names(found: list[Camera]) -> list[str]:
+    return [camera.name for camera in found]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "middle"),
+    [
+        (0.2, 1.0, 0.6),
+        (-0.4, 0.4, 0.0),
+        (-0.1, 2 * math.pi - 0.3, -0.2),
+        (0.0, math.pi - 1e-3, math.pi / 2 - 5e-4),
+        (3.0, -3.0, math.pi),
+    ],
+)
+def test_halfway_is_half_of_the_shortest_turn_and_of_the_way(first: float, second: float, middle: float):
+    found = between(posed(rotation(first), (1, -2, 3), "left"), posed(rotation(second), (2, 4, -5), "right", width=90))
+    assert found.name == "left–right"
+    torch.testing.assert_close(found.world_to_camera[:3, :3], rotation(middle), rtol=0, atol=1e-13)
+    torch.testing.assert_close(found.centre, torch.tensor([1.5, 1, -1], dtype=torch.float64), rtol=0, atol=1e-13)
+    assert (found.width, found.height, found.fx, found.fy, found.cx, found.cy) == (60, 40, 55.0, 56.0, 31.0, 19.0)
+    assert found.world_to_camera[3].tolist() == [0, 0, 0, 1]
+
+
+def test_opposite_cameras_have_one_of_their_two_middles_and_equal_ones_themselves():
+    ends = posed(rotation(0.0), (0, 0, 0)), posed(rotation(math.pi), (2, 0, 0))
+    found = between(*ends)
+    assert [angle_between(found, end) for end in ends] == pytest.approx([math.pi / 2] * 2, abs=1e-7)
+    turned = found.world_to_camera[:3, :3]
+    torch.testing.assert_close(turned @ turned.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
+    assert float(torch.linalg.det(turned)) == pytest.approx(1)
+    assert found.centre.tolist() == pytest.approx([1, 0, 0])
+    same = posed(rotation(2.0), (0.3, 0.2, 0.1))
+    torch.testing.assert_close(between(same, same).world_to_camera, same.world_to_camera, rtol=0, atol=1e-14)
+
+
+def test_halfway_on_a_ring_looks_at_its_centre():
+    for found in held_out_cameras(ring(9), range(9)):
+        direction = found.world_to_camera[2, :3]
+        torch.testing.assert_close(direction, -found.centre / found.centre.norm(), rtol=0, atol=1e-7)
+        assert float(found.centre.norm()) == pytest.approx(3 * math.cos(math.pi / 9))
+
+
+def test_one_camera_between_each_and_the_next():
+    row = cameras(5)
+    assert names(held_out_cameras(row, range(5))) == [f"view_{i}–view_{i + 1}" for i in range(4)]
+    assert names(held_out_cameras(row, [0, 1, 3])) == ["view_0–view_1", "view_1–view_3"]
+    assert names(held_out_cameras(row[:2], [0, 1])) == ["view_0–view_1"]
+    assert held_out_cameras(row, [2]) == held_out_cameras(row, []) == held_out_cameras([], []) == []
+    assert held_out_cameras([row[0]] * 3, range(3)) == []
+    assert names(held_out_cameras([row[0], *row], range(6)))[0] == "view_0–view_1"
+
+
+def test_no_camera_across_a_jump_or_a_wide_turn():
+    near, far = ring(20), [replace(c, name="far " + c.name) for c in ring(20, radius=30)]
+    found = names(held_out_cameras([*near[:8], *far[:8]], range(16)))
+    assert found == [f"{i}–{i + 1}" for i in range(7)] + [f"far {i}–far {i + 1}" for i in range(7)]
+    assert len(held_out_cameras(ring(6), range(6))) == 5  # 60 degrees each
+    assert held_out_cameras(ring(5), range(5)) == []
+    assert held_out_cameras([cameras(1)[0], blind_camera()], [0, 1]) == []
+    upright = cameras(4)
+    lying = [
+        posed(rotation(math.pi / 2, torch.tensor([0.0, 0, 1])) @ c.world_to_camera[:3, :3], c.centre)
+        for c in upright[2:]
+    ]
+    assert names(held_out_cameras([*upright[:2], *lying], range(4))) == ["view_0–view_1", "a–a"]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_unordered_list_is_put_in_order(seed: int):
+    shuffled = ring(40)
+    random.Random(seed).shuffle(shuffled)
+    by_name = {camera.name: camera for camera in shuffled}
+    found = held_out_cameras(shuffled, range(40))
+    assert len(found) >= 38
+    for camera in found:
+        parents = [by_name[name] for name in camera.name.split("–")]
+        assert angle_between(*parents) < math.radians(3.5 * 360 / 40)
+    following = [angle_between(*pair) for pair in itertools.pairwise(found)]
+    assert sum(angle < math.radians(2.5 * 360 / 40) for angle in following) >= 36
+
+
+@pytest.mark.parametrize(
+    ("total", "expected"),
+    [
+        (20_000, [0, 625, 1250, 2500, 5000, 10_000, 20_000]),
+        (150, [0, 4, 9, 18, 37, 75, 150]),
+        (3, [0, 1, 3]),
+        (1, [0, 1]),
+        (0, [0]),
+    ],
+)
+def test_moments_are_geometric_and_hold_both_ends(total: int, expected: list[int]):
+    assert moments(total) == expected
+
+
+@pytest.fixture(scope="module")
+def network(vgg16_weights) -> FeatureNetwork:
+    return FeatureNetwork(vgg16_weights)
+
+
+@pytest.fixture(scope="module")
+def lpips(vgg16_weights) -> Lpips:
+    return Lpips("alex")
+
+
+#: Shorter side of the coarsest scale where a test wants two scales of its small views.
+COARSEST = 40
+
+
+def held_out(
+    scene: Scene, views: list[Camera], network: FeatureNetwork, coarsest: int = COARSEST_SHORTER_SIDE, **options
+) -> HeldOut:
+    """Of a job whose every view is covered and of one size."""
+    loss = SosLoss(network, coarsest=coarsest)
+    rasterizer = make_rasterizer("cpu", scene, background=(0.2, 0.3, 0.4))
+    targets = {}
+
+    def style_targets(camera: Camera):
+        size = (camera.height, camera.width)
+        if size not in targets:
+            targets[size] = loss.style_targets(style(), size)
+        return targets[size]
+
+    options = {"covered": range(len(views)), "weighted": False, **options}
+    return HeldOut(views, scene=scene, rasterizer=rasterizer, loss=loss, style_targets=style_targets, **options)
+
+
+def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | None) -> dict[int, float]:
+    """Scale to the sum over layers of w_G mean((G - G_v)^2), float64."""
+
+    def gram(features: Tensor, position: Tensor | None) -> Tensor:
+        flat = features.reshape(-1, features.shape[-1])
+        a = torch.ones(len(flat), dtype=torch.float64) if position is None else position.reshape(-1)
+        return (flat * a[:, None]).T @ flat / a.sum()
+
+    result = {}
+    for scale in range(pyramid.scale_count(image.shape[0], image.shape[1], COARSEST)):
+        side = 1 << scale
+        seen, wanted = (
+            features_reference(weights, box_average_reference(picture.double(), side)) for picture in (image, painting)
+        )
+        result[scale] = 0.0
+        for layer in STYLE_LAYERS:
+            position = None
+            if coverage is not None:
+                position = box_average_reference(coverage.double()[..., None], side * layer_stride(layer))[..., 0]
+            error = gram(seen[layer], position) - gram(wanted[layer], None)
+            result[scale] += GRAM_WEIGHT / error.shape[0] ** 2 * float(error.square().mean())
+    return result
+
+
+@pytest.mark.parametrize(("scene", "weighted"), [(wall(sh_degree=1), False), (ball(), True)], ids=["wall", "ball"])
+def test_gram_distance_is_that_of_float64(vgg16_weights, network, scene: Scene, weighted: bool):
+    views = cameras(6)
+    measured = held_out(scene, views, network, coarsest=COARSEST, weighted=weighted)
+    assert measured.views == [0, 1, 2, 3]
+    sh_dc = 4 * scene.sh_dc  # colours far outside 0..1
+    reference = make_rasterizer("reference", scene, background=(0.2, 0.3, 0.4))
+    painting = resize_area(style(), pyramid.style_size((96, 80), (48, 64)))
+    expected: dict[int, float] = {0: 0.0, 1: 0.0}
+    for first, second in itertools.pairwise(views[:5]):
+        camera = between(first, second)
+        image = reference.render(view_colours(sh_dc, rest_colours(scene.sh_rest, scene.means, camera)), camera)
+        assert float(image.max()) > 1.2
+        coverage = reference.coverage(camera) if weighted else None
+        for scale, value in gram_reference(vgg16_weights, image.clamp(0, 1), painting, coverage).items():
+            expected[scale] += value / 4
+    assert measured.measure(sh_dc).gram == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_first_measurement_is_the_measure_of_the_others(network):
+    scene, views = wall(), cameras(4)
+    measured = held_out(scene, views, network)
+    first = measured.measure(scene.sh_dc)
+    assert first.gram_relative == 1.0
+    assert measured.measure(scene.sh_dc) == first
+    grey = measured.measure(torch.zeros_like(scene.sh_dc))
+    assert grey.gram_relative == pytest.approx(grey.gram[0] / first.gram[0])
+    assert abs(grey.gram_relative - 1) > 0.1
+    resumed = held_out(scene, views, network, first=first.gram)
+    assert resumed.measure(torch.zeros_like(scene.sh_dc)) == grey
+
+
+def test_what_is_kept_changes_nothing_and_the_job_s_loss_is_left_alone(network, lpips):
+    scene, views = wall(sh_degree=1), cameras(10)
+    kept = held_out(scene, views, network, weighted=True, lpips=lpips)
+    nothing_kept = held_out(scene, views, network, weighted=True, lpips=lpips, memory=0)
+    moment = kept.measure(scene.sh_dc)
+    assert moment == nothing_kept.measure(scene.sh_dc) == kept.measure(scene.sh_dc)
+    assert {gap: len(pairs) for gap, pairs in kept.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
+
+
+def test_consistency_does_not_see_what_cannot_be_seen(network, lpips):
+    front, back = wall(), wall()
+    back = replace(back, means=back.means * torch.tensor([1.0, 1, -1]))  # behind all cameras
+    both = Scene(*(torch.cat([getattr(front, f), getattr(back, f)]) for f in Scene.__dataclass_fields__))
+    measured = held_out(both, cameras(10), network, lpips=lpips)
+    before = measured.measure(both.sh_dc)
+    noise = torch.randn(len(back), 3, generator=torch.Generator().manual_seed(0))
+    after = measured.measure(torch.cat([front.sh_dc, noise]))
+    assert before == after
+    assert before.short.compared > 0.5
+    seen = measured.measure(torch.cat([noise, back.sh_dc]))
+    assert seen.short.rmse != before.short.rmse
+
+
+def test_colours_that_depend_on_the_view_are_less_consistent(network, lpips):
+    views = cameras(10)
+    plain = wall(sh_degree=1)
+    smooth = torch.sin(plain.means @ torch.tensor([[1.5, 0.3, -1], [0.5, 1, 1], [0, 0, 0]]))
+    plain = replace(plain, sh_dc=smooth, sh_rest=torch.zeros_like(plain.sh_rest))
+    generator = torch.Generator().manual_seed(3)
+    noisy = replace(plain, sh_rest=1.5 * torch.randn(plain.sh_rest.shape, generator=generator))
+    calm, rough = (held_out(s, views, network, lpips=lpips).measure(s.sh_dc) for s in (plain, noisy))
+    for before, after in ((calm.short, rough.short), (calm.long, rough.long)):
+        assert after.compared == before.compared > 0.5
+        assert after.rmse > 3 * before.rmse
+        assert after.lpips > 2 * before.lpips
+    assert rough.long.rmse > rough.short.rmse
+
+
+def test_a_view_inside_of_something_is_not_measured(network):
+    up = torch.tensor([0.0, -1.0, 0.0])
+    positions = [(-0.65, 0, 0), (0.65, 0, 0), (0.65, 0.35, 0), (0.65, 0.7, 0)]
+    views = [
+        look_at(str(i), torch.tensor(p), torch.tensor([p[0], p[1], 3.0]), up, width=64, height=48, focal=64)
+        for i, p in enumerate(positions)
+    ]
+    shell = ball(400)
+    centred = shell.means - torch.tensor([0.0, 0, 3])
+    shell = replace(shell, means=centred * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
+    room = wall()
+    both = Scene(*(torch.cat([getattr(room, f), getattr(shell, f)]) for f in Scene.__dataclass_fields__))
+    empty, filled = held_out(room, views, network), held_out(both, views, network)
+    assert names(empty.cameras) == names(filled.cameras) == ["0–1", "1–2", "2–3"]
+    assert (empty.views, empty.pairs[SHORT_RANGE]) == ([0, 1], [(0, 1), (1, 2)])
+    assert (filled.views, filled.pairs[SHORT_RANGE]) == ([1], [(1, 2)])
+
+
+def test_jobs_of_one_and_of_two_cameras(network, lpips):
+    scene = wall()
+    alone = held_out(scene, cameras(1), network)
+    nothing = alone.measure(scene.sh_dc)
+    assert (alone.cameras, alone.views) == ([], [])
+    assert nothing.as_dict(0, 0.0) == {
+        "step": 0,
+        "seconds": 0.0,
+        "gram": {},
+        "gram_relative": None,
+        "consistency": {"short": None, "long": None},
+    }
+    blind = held_out(scene, [*cameras(1), blind_camera()], network, covered=[0])
+    assert blind.views == []
+    two = held_out(scene, cameras(2), network, lpips=lpips).measure(scene.sh_dc)
+    assert set(two.gram) == {0}
+    assert two.short is two.long is None
+
+
+def test_a_moment_is_plain_json(network, lpips):
+    scene = wall()
+    measured = held_out(scene, cameras(9), network, lpips=lpips)
+    moment = measured.measure(scene.sh_dc)
+    values = json.loads(json.dumps(moment.as_dict(7, 1.5), allow_nan=False))
+    assert list(values) == ["step", "seconds", "gram", "gram_relative", "consistency"]
+    assert (values["step"], values["seconds"]) == (7, 1.5)
+    assert values["gram"] == {"0": moment.gram[0]}
+    assert values["consistency"]["short"] == {
+        "gap": 1,
+        "pairs": 4,
+        "compared": moment.short.compared,
+        "rmse": moment.short.rmse,
+        "lpips": moment.short.lpips,
+    }
+    assert (values["consistency"]["long"]["gap"], values["consistency"]["long"]["pairs"]) == (7, 1)
+    without = held_out(scene, cameras(3), network).measure(scene.sh_dc).as_dict(0, 0.0)["consistency"]
+    assert without["short"]["lpips"] is None
+    assert without["short"]["rmse"] > 0
+    assert without["long"] is None
+
+
+def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, vgg16_weights, lpips):
+    folder = shared_data / "scenes" / "snowmiku_plush"
+    scene = read_scene(folder / "point_cloud.ply").scene
+    views = [resized(camera, 120) for camera in spread(read_cameras(folder / "cameras.json"), 10)]
+    painting = load_image(shared_data / "styles" / "starry_night.jpg")
+    settings = make_settings(steps_coarse=0, steps_sos=10, learning_rate=0.2, learning_rate_end=0.1)
+    stylizer = Stylizer(scene, views, painting, settings, weights=vgg16_weights)
+    measured = HeldOut(
+        stylizer.views.cameras,
+        stylizer.views.covered,
+        scene,
+        make_rasterizer("cpu", scene),
+        stylizer.loss,
+        stylizer.style_targets,
+        weighted=stylizer.views.weighted,
+        lpips=lpips,
+    )
+    assert len(measured.cameras) >= 6
+    assert len(measured.views) >= 3
+    before = measured.measure(stylizer.stylized())
+    assert run(stylizer) == "finished"
+    after = measured.measure(stylizer.stylized())
+    print(f"gram {after.gram_relative:.3f}, short {before.short} to {after.short}")
+    assert after.gram_relative < 0.8
+    assert after.short.compared == before.short.compared > 0.05
+    assert 0 < before.short.rmse < 0.2
+    assert after.short.rmse < 0.4

@@ -1,0 +1,254 @@
+"""`coarse` against the float64 reference and the box average, and the edges of both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.coarse import CoarseRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import add_upscaled_, downscale
+from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
+from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, single, turned_pose
+
+#: Float32 moves a decision only within this relative distance of its cut.
+CLOSE = 2e-5
+SCALES = [1, 2, 3, 4, 5]
+BACKGROUND = (1.0, 0.25, 0.5)
+
+#: No side is a multiple of 16 but of the last, which a square of any tested scale divides.
+CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
+    "cloud": lambda: (cloud(), camera()),
+    "turned": lambda: (cloud(600, seed=1), camera(73, 39, pose=turned_pose())),
+    "crowded": lambda: (
+        replace(cloud(1500, seed=2, log_scale=-1.5), opacities=torch.full((1500,), 3.0)),
+        camera(40, 33),
+    ),
+    "huge": lambda: (cloud(60, seed=3, log_scale=3.0), camera(50, 35)),
+    "tiny": lambda: (cloud(3000, seed=4, log_scale=-7.0), camera(81, 47)),
+    "whole squares": lambda: (cloud(seed=6), camera(64, 96)),
+}
+
+
+def coarse_pixels(view: Camera, scale: int, seed: int = 6) -> Tensor:
+    """A random gradient [H >> scale, W >> scale, 3] of a coarse image, float32."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(view.height >> scale, view.width >> scale, 3, generator=generator)
+
+
+def upscaled(gradient: Tensor, view: Camera, scale: int) -> Tensor:
+    """D^T of a coarse gradient: [H, W, 3], in its dtype."""
+    whole = torch.zeros(view.height, view.width, 3, dtype=gradient.dtype)
+    add_upscaled_(whole, gradient, scale)
+    return whole
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_agrees_with_the_average_of_the_reference(name: str) -> None:
+    scene, view = CASES[name]()
+    colours = colours_of(scene)
+    reference = ReferenceRasterizer(scene, background=BACKGROUND)
+    image, band = reference.render(colours, view), reference.near_cutoff(view, CLOSE)
+    coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
+    for scale in SCALES:
+        close = downscale(band.double(), scale) > 0
+        actual = coarse.render(colours, view, scale)
+        assert actual.dtype == torch.float32
+        assert_close_outside_band(actual, downscale(image, scale), close, tolerance=3e-6, largest_share=0.01)
+        pixels = coarse_pixels(view, scale)
+        pixels[close] = 0
+        gradient = coarse.colour_gradient(pixels, view, scale)
+        assert gradient.dtype == torch.float32
+        assert relative_error(gradient, reference.colour_gradient(upscaled(pixels.double(), view, scale), view)) < 1e-6
+        assert coarse.is_kept(view, scale)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_gradient_is_the_transpose(scale: int) -> None:
+    scene, view = cloud(seed=11), camera(107, 77)
+    coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
+    colours, pixels = colours_of(scene), coarse_pixels(view, scale)
+    black = coarse.render(torch.zeros_like(colours), view, scale).double()
+    forward = (coarse.render(colours, view, scale).double() - black) * pixels
+    backward = coarse.colour_gradient(pixels, view, scale).double() * colours
+    assert float(backward.sum()) == pytest.approx(float(forward.sum()), abs=1e-6 * float(forward.abs().sum()))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_what_fills_no_square_does_not_count(scale: int) -> None:
+    """The Gaussian covers the last pixel of the last row alone, which is in no square: nothing is kept of it."""
+    side = 1 << scale
+    view = camera(3 * side + 1, 2 * side + 1)
+    corner = ((view.width - 0.5 - view.cx) / view.fx, (view.height - 0.5 - view.cy) / view.fy, 1.0)
+    cpu = CpuRasterizer(single(corner, scales=(1e-3,) * 3, opacity=0.0045))
+    assert torch.nonzero(cpu.coverage(view)).tolist() == [[2 * side, 3 * side]]
+    coarse = CoarseRasterizer(cpu)
+    image = coarse.render(torch.ones(1, 3), view, scale)
+    assert image.shape == (2, 3, 3)
+    assert not image.any()
+    assert not coarse.colour_gradient(torch.ones(2, 3, 3), view, scale).any()
+    (operator,) = coarse._kept.values()
+    assert operator is not None
+    assert len(operator.pieces.slots) == 0
+
+
+def test_small_views_have_the_scales_whose_squares_they_hold() -> None:
+    scene, view = cloud(seed=12), camera(15, 17)
+    coarse, colours = CoarseRasterizer(CpuRasterizer(scene)), colours_of(scene)
+    assert [tuple(coarse.render(colours, view, scale).shape) for scale in (1, 2, 3)] == [
+        (8, 7, 3),
+        (4, 3, 3),
+        (2, 1, 3),
+    ]
+    for use in (
+        lambda: coarse.render(colours, view, 4),
+        lambda: coarse.colour_gradient(torch.zeros(1, 0, 3), view, 4),
+        lambda: coarse.operator_bytes(view, 4),
+    ):
+        with pytest.raises(ValueError, match="view 'test': 15x17 pixels hold no square of 16 pixels a side"):
+            use()
+    with pytest.raises(ValueError, match="1x1 pixels hold no square of 2 pixels"):
+        coarse.render(colours, camera(1, 1), 1)
+
+
+def test_arguments_are_checked_before_any_work() -> None:
+    scene, view = cloud(10), camera()
+    coarse = CoarseRasterizer(CpuRasterizer(scene))
+    for scale in (0, -1):
+        with pytest.raises(ValueError, match="for scale 1 or more; use `cached`"):
+            coarse.render(colours_of(scene), view, scale)
+    with pytest.raises(ValueError, match="colours of shape"):
+        coarse.render(torch.zeros(9, 3), view, 1)
+    with pytest.raises(
+        ValueError, match=r"gradient of shape \(45, 70, 3\): scale 1 of view 'test' needs \(22, 35, 3\)"
+    ):
+        coarse.colour_gradient(pixels_like(view), view, 1)
+    assert coarse.kept_bytes == 0
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [empty_scene(), single((0, 0, -3.0)), single((1e6, 0, 1.0)), single((0, 0, 3.0), opacity=0.003)],
+    ids=["empty", "behind", "beside", "faint"],
+)
+def test_a_view_without_gaussians_is_background(scene: Scene) -> None:
+    view = camera()
+    coarse = CoarseRasterizer(CpuRasterizer(scene, background=(0.5, 0.25, 0.125)))
+    for scale in SCALES:
+        image = coarse.render(colours_of(scene), view, scale)
+        assert image.shape == (view.height >> scale, view.width >> scale, 3)
+        assert torch.equal(image.flatten(0, 1).unique(dim=0), torch.tensor([[0.5, 0.25, 0.125]]))
+        gradient = coarse.colour_gradient(coarse_pixels(view, scale), view, scale)
+        assert gradient.shape == (len(scene), 3)
+        assert not gradient.any()
+
+
+def test_background_fills_what_is_not_covered() -> None:
+    scene, view = cloud(100, seed=15), camera()
+    cpu, black = CpuRasterizer(scene, background=BACKGROUND), CpuRasterizer(scene)
+    left = 1 - cpu.coverage(view)
+    assert 0 < float(left.min()) < float(left.max()) == 1
+    for scale in SCALES:
+        expected = CoarseRasterizer(black).render(colours_of(scene), view, scale)
+        expected = expected + downscale(left, scale)[..., None] * torch.tensor(BACKGROUND)
+        assert torch.allclose(CoarseRasterizer(cpu).render(colours_of(scene), view, scale), expected, atol=1e-6)
+
+
+def test_many_gaussians_in_a_pixel_lose_no_digits() -> None:
+    """One coarse pixel sees 17,000 Gaussians: one float32 sum of all is wrong by 1e-6, one a pixel of `cpu` is not."""
+    count, view = 20_000, camera(16, 16, focal=16.0)
+    generator = torch.Generator().manual_seed(2)
+    scene = replace(
+        cloud(count),
+        means=torch.cat([torch.rand(count, 2, generator=generator) - 0.5, torch.ones(count, 1)], dim=1),
+        scales=torch.full((count, 3), -9.0),
+        opacities=torch.full((count,), math.log(0.008 / 0.992)),
+    )
+    colours, cpu = 1 + colours_of(scene), CpuRasterizer(scene)
+    expected = downscale(cpu.render(colours, view).double(), 4)
+    assert relative_error(CoarseRasterizer(cpu).render(colours, view, 4), expected) < 2e-7
+
+
+def test_what_does_not_fit_the_budget_is_recomputed() -> None:
+    scene = cloud(800, seed=20)
+    views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
+    colours, cpu = colours_of(scene), CpuRasterizer(scene, background=BACKGROUND)
+    for scale in SCALES:
+        pixels = coarse_pixels(views[0], scale)
+        sizes = [CoarseRasterizer(cpu).operator_bytes(view, scale) for view in views]
+        budget, whole = sizes[0] + sizes[1], CoarseRasterizer(cpu)
+        coarse = CoarseRasterizer(cpu, max_bytes=budget)
+        for _ in range(2):
+            for view in views:
+                image = downscale(cpu.render(colours, view), scale)
+                gradient = cpu.colour_gradient(upscaled(pixels, view, scale), view)
+                for one in (coarse, whole):
+                    assert torch.allclose(one.render(colours, view, scale), image, atol=1e-6)
+                    assert relative_error(one.colour_gradient(pixels, view, scale), gradient) < 1e-6
+        assert [coarse.is_kept(view, scale) for view in views] == [True, True, False]
+        assert coarse.kept_bytes == budget
+        assert sum(o.nbytes for o in coarse._kept.values() if o is not None) == budget
+        assert whole.kept_bytes == sum(sizes)
+
+
+def test_operators_are_far_smaller_than_the_weights_at_full_size() -> None:
+    scene, view = cloud(2000, seed=13), camera(200, 120)
+    coarse = CoarseRasterizer(CpuRasterizer(scene))
+    sizes = [CachedRasterizer(scene).operator_bytes(view)] + [coarse.operator_bytes(view, s) for s in (1, 2, 3, 4)]
+    assert sizes[1] < 0.6 * sizes[0]
+    assert sizes[2] < 0.2 * sizes[0]
+    assert sizes == sorted(sizes, reverse=True)
+    assert coarse.kept_bytes == 0
+    assert not coarse.is_kept(view, 1)
+
+
+def test_an_operator_belongs_to_a_camera_and_a_scale() -> None:
+    scene, view = cloud(seed=14), camera()
+    coarse = CoarseRasterizer(CpuRasterizer(scene))
+    coarse.render(colours_of(scene), view, 2)
+    assert coarse.is_kept(replace(view, name="another name"), 2)
+    assert not coarse.is_kept(view, 1)
+    assert not coarse.is_kept(replace(view, fx=view.fx * 1.01), 2)
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    scene, view = cloud(2000, seed=13), camera(203, 125)
+    colours, before = colours_of(scene), torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 2):
+            torch.set_num_threads(threads)
+            coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
+            for scale in SCALES:
+                image = coarse.render(colours, view, scale)
+                results.append((image, coarse.colour_gradient(coarse_pixels(view, scale), view, scale)))
+    finally:
+        torch.set_num_threads(before)
+    once, count = results[: len(SCALES)], len(SCALES)
+    assert all(
+        torch.equal(a, b) for i, other in enumerate(results) for a, b in zip(once[i % count], other, strict=True)
+    )
+
+
+def test_python_threads_can_share_a_rasterizer() -> None:
+    scene, view = cloud(500, seed=14), camera()
+    colours, pixels = colours_of(scene), coarse_pixels(view, 2)
+    alone = CoarseRasterizer(CpuRasterizer(scene))
+    image, gradient = alone.render(colours, view, 2), alone.colour_gradient(pixels, view, 2)
+    shared = CoarseRasterizer(CpuRasterizer(scene))
+    with ThreadPoolExecutor(4) as pool:
+        images = [pool.submit(shared.render, colours, view, 2) for _ in range(8)]
+        gradients = [pool.submit(shared.colour_gradient, pixels, view, 2) for _ in range(8)]
+    assert all(torch.equal(f.result(), image) for f in images)
+    assert all(torch.equal(f.result(), gradient) for f in gradients)
+    assert shared.kept_bytes == alone.kept_bytes

@@ -1,0 +1,127 @@
+"""The compiled projection against plain PyTorch and against exact rational arithmetic."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from sgsst_core.constants import ALPHA_MIN, EPS2D
+from sgsst_core.rasterizer.projection import Column, Outcome, project
+from sgsst_core.rasterizer.reference import splat
+from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, single, together, turned_pose
+
+_HALF_LOG2_E = 0.5 * math.log2(math.e)
+
+
+def test_agrees_with_plain_pytorch() -> None:
+    scene, view = cloud(3000, log_scale=-2.0), camera(pose=turned_pose())
+    fast, plain = project(scene, view), splat(scene, view)
+    place = {int(g): i for i, g in enumerate(plain.gaussians)}
+    assert set(fast.gaussians.tolist()) <= set(place), "the reference keeps what is off the image, never less"
+    rows = torch.tensor([place[int(g)] for g in fast.gaussians])
+    assert bool((rows.diff() > 0).all()), "both are in order of depth"
+    values = torch.from_numpy(fast.values)
+    p, det = plain.w_scale[rows].pow(-2), plain.w_scale[rows].pow(-2) / plain.u_scale[rows].square()
+    q = plain.skew[rows] * p
+    r = (det + q * q) / p
+    for column, expected in (
+        (Column.X, plain.x[rows]),
+        (Column.Y, plain.y[rows]),
+        (Column.SKEW, q / r),
+        (Column.U_SCALE, (_HALF_LOG2_E * r / det).sqrt()),
+        (Column.W_SCALE, (_HALF_LOG2_E / r).sqrt()),
+        (Column.LOG2_OPACITY, plain.opacity[rows].log2()),
+        (Column.EXTENT_X, plain.extent_x[rows]),
+        (Column.EXTENT_Y, plain.extent_y[rows]),
+    ):
+        assert torch.allclose(values[:, column], expected, rtol=1e-9, atol=1e-9), column.name
+    assert fast.outcomes[Outcome.VISIBLE] == len(fast.gaussians)
+    assert sum(fast.outcomes.values()) == len(scene)
+    assert all(fast.outcomes[o] > 0 for o in (Outcome.NEAR, Outcome.FAINT, Outcome.OUTSIDE))
+
+
+@pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
+def test_needles_keep_their_width(length: float) -> None:
+    """The determinant of a slanted needle, a million times longer than wide, against exact arithmetic."""
+    half = math.sqrt(0.5)
+    view = camera(focal=64.0)
+    scene = single((0.0, 0.0, 4.0), scales=(length, length * 1e-6, length * 1e-6), quat=(math.cos(0.3), 0, 0, half))
+    row = project(scene, view).values[0]
+    assert np.isfinite(row).all()
+    w, _, _, z = (Fraction(float(v)) for v in scene.quats[0])
+    n2 = w * w + z * z
+    cos, sin = (w * w - z * z) / n2, 2 * w * z / n2
+    s = [Fraction(float(v)) for v in scene.scales[0].double().exp()]
+    fx, fy = Fraction(view.fx) / 4, Fraction(view.fy) / 4
+    m0, m1 = (fx * cos * s[0], -fx * sin * s[1]), (fy * sin * s[0], fy * cos * s[1])
+    eps = Fraction(EPS2D)
+    p, q, r = m0[0] ** 2 + m0[1] ** 2 + eps, m0[0] * m1[0] + m0[1] * m1[1], m1[0] ** 2 + m1[1] ** 2 + eps
+    det = p * r - q * q
+    # 1e-7: the projection takes exponentials in float64 of logarithms in float32, as this test does
+    assert row[Column.SKEW] == pytest.approx(float(q / r), rel=1e-12)
+    assert row[Column.U_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E * float(r / det), rel=1e-9)
+    assert row[Column.W_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E / float(r), rel=1e-12)
+
+
+def test_the_near_plane_keeps_what_lies_on_it() -> None:
+    at, before, behind = 0.5, math.nextafter(0.5, 0), -1.0
+    scene = together([((0, 0, z), 0.9, (0.01,) * 3, (1, 0, 0, 0)) for z in (at, float(np.float32(before)), behind)])
+    scene.means[1, 2] = float(np.nextafter(np.float32(0.5), np.float32(0)))
+    found = project(scene, camera(), near=0.5)
+    assert found.gaussians.tolist() == [0]
+    assert found.outcomes[Outcome.NEAR] == 2
+    assert splat(scene, camera(), near=0.5).gaussians.tolist() == [0]
+    with pytest.raises(ValueError, match="must be positive"):
+        project(scene, camera(), near=0.0)
+
+
+def test_opacities_around_the_cut() -> None:
+    logit = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
+    scene = together([((0, 0, 4), 0.5, (2.0,) * 3, (1, 0, 0, 0))] * 5)
+    scene.opacities[:] = torch.tensor([logit - 1e-3, logit + 1e-3, -200.0, 200.0, -1e4])
+    found = project(scene, camera())
+    assert found.gaussians.tolist() == [1, 3]
+    assert found.outcomes[Outcome.FAINT] == 3
+    assert found.values[0, Column.EXTENT_X] < 0.1 * found.values[1, Column.EXTENT_X]
+    assert found.values[1, Column.LOG2_OPACITY] == pytest.approx(0, abs=1e-80)
+
+
+def test_equal_depths_keep_the_order_of_the_file() -> None:
+    scene = together([((0.01 * i, 0, 4.0 - (i == 3)), 0.5, (0.1,) * 3, (1, 0, 0, 0)) for i in range(6)])
+    assert project(scene, camera()).gaussians.tolist() == [3, 0, 1, 2, 4, 5]
+    assert splat(scene, camera()).gaussians.tolist() == [3, 0, 1, 2, 4, 5]
+
+
+def test_values_without_a_projection_are_left_out_and_counted() -> None:
+    scene = together([((0, 0, 4), 0.5, (0.1,) * 3, (1, 0, 0, 0))] * 4)
+    scene.quats[1] = 0
+    scene.quats[2] = 1e-30  # short, but a direction
+    scene.scales[3] = 500  # e^500 squared overflows
+    found = project(scene, camera())
+    assert found.gaussians.tolist() == [0, 2]
+    assert found.outcomes[Outcome.INVALID] == 2
+    assert splat(scene, camera()).gaussians.tolist() == [0, 2]
+
+
+def test_huge_gaussians_and_an_empty_scene() -> None:
+    found = project(single((0, 0, 4), scales=(1e12, 1e12, 1e12)), camera())
+    assert found.outcomes[Outcome.VISIBLE] == 1
+    assert np.isfinite(found.values).all()
+    assert len(project(empty_scene(), camera()).gaussians) == 0
+
+
+def test_a_world_moved_far_away_projects_alike() -> None:
+    scene, view = cloud(300), camera(pose=turned_pose())
+    scene = replace(scene, means=(scene.means * 16).round() / 16)
+    offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
+    pose = view.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    here = project(scene, view)
+    there = project(replace(scene, means=scene.means + offset.float()), replace(view, world_to_camera=pose))
+    assert here.gaussians.tolist() == there.gaussians.tolist()
+    assert np.allclose(here.values, there.values, rtol=1e-6, atol=1e-6)

@@ -1,0 +1,453 @@
+"""`cpu` and `cached` against `reference`, `reference` against a loop over pixels, and the edges of all of them."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from sgsst_core.errors import SettingsError, TooManyIntersectionsError
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.rasterizer import Rows, make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer, SparseOperator
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.raster_lists import MAX_INTERSECTIONS, check_intersections
+from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
+from sgsst_core.scene.camera import Camera, orbit, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
+from tests.sgsst_core.splat_scenes import (
+    camera,
+    cloud,
+    colours_of,
+    empty_scene,
+    pixels_like,
+    single,
+    together,
+    turned_pose,
+)
+
+#: Float32 moves a decision only within this relative distance of its cut.
+CLOSE = 2e-5
+FAST = ["cpu", "cached"]
+BLACK = (0.0, 0.0, 0.0)
+
+CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
+    "cloud": lambda: (cloud(), camera()),
+    "turned": lambda: (cloud(600, seed=1), camera(pose=turned_pose())),
+    "crowded": lambda: (
+        replace(cloud(1500, seed=2, log_scale=-1.5), opacities=torch.full((1500,), 3.0)),
+        camera(40, 33),
+    ),
+    "needles": lambda: (_needles(), camera(97, 61)),
+    "huge": lambda: (cloud(60, seed=3, log_scale=3.0), camera(50, 31)),
+    "tiny": lambda: (cloud(3000, seed=4, log_scale=-7.0), camera(80, 50)),
+    "faint": lambda: (replace(cloud(seed=5), opacities=torch.linspace(-5.6, -5.4, 400)), camera()),
+    "one pixel": lambda: (cloud(seed=6), camera(1, 1)),
+    "one row": lambda: (cloud(seed=7), camera(333, 1)),
+    "close by": lambda: (cloud(seed=8, depth=0.3), camera()),
+}
+
+
+def _needles() -> Scene:
+    """A million times longer than wide, at all angles, some far longer than the view."""
+    scene = cloud(200, seed=9)
+    long = torch.linspace(-3, 7, 200)[:, None]
+    return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
+    return CASES[request.param]()
+
+
+def test_fast_ones_agree_with_the_reference(case: tuple[Scene, Camera]) -> None:
+    scene, view = case
+    assert_agree(FAST, scene, view, (1.0, 0.25, 0.5))
+
+
+def assert_agree(
+    names: list[str], scene: Scene, view: Camera, background: tuple[float, float, float], rows: Rows | None = None
+) -> int:
+    """Images within 1e-4, gradients within 1e-5, but where a cut-off flips; returns how many pixels flipped at most."""
+    rows = (0, view.height) if rows is None else rows
+    colours, pixels = colours_of(scene), pixels_like(view)[rows[0] : rows[1]]
+    reference = ReferenceRasterizer(scene, background=background)
+    band = reference.near_cutoff(view, CLOSE, rows)
+    pixels[band] = 0
+    image, coverage = reference.render(colours, view, rows), reference.coverage(view, rows)
+    expected = reference.colour_gradient(pixels, view, rows)
+    flipped = 0
+    for name in names:
+        fast = make_rasterizer(name, scene, background=background)
+        flips = assert_close_outside_band(fast.render(colours, view, rows), image, band, tolerance=1e-4)
+        flipped = max(flipped, flips)
+        assert_close_outside_band(fast.coverage(view, rows), coverage, band, tolerance=1e-4)
+        actual = fast.colour_gradient(pixels, view, rows)
+        assert actual.dtype == torch.float32
+        assert relative_error(actual, expected) < 1e-5
+        assert float((actual - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
+    return flipped
+
+
+def test_reference_agrees_with_a_loop_over_pixels() -> None:
+    scene, view = cloud(80, seed=10, log_scale=-1.5), camera(19, 17, focal=15.0)
+    colours, background = colours_of(scene).double(), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    splats = splat(scene, view)
+    image = torch.empty(view.height, view.width, 3, dtype=torch.float64)
+    for y in range(view.height):
+        for x in range(view.width):
+            left, total = 1.0, torch.zeros(3, dtype=torch.float64)
+            for i, gaussian in enumerate(splats.gaussians):
+                dx, dy = x + 0.5 - float(splats.x[i]), y + 0.5 - float(splats.y[i])
+                p, q = float(splats.w_scale[i]) ** -2, float(splats.skew[i]) * float(splats.w_scale[i]) ** -2
+                det = p / float(splats.u_scale[i]) ** 2
+                r = (det + q * q) / p
+                power = (r * dx * dx - 2 * q * dx * dy + p * dy * dy) / det / 2
+                alpha = min(ALPHA_MAX, float(splats.opacity[i]) * math.exp(-power))
+                if alpha < ALPHA_MIN:
+                    continue
+                if left * (1 - alpha) <= TRANSMITTANCE_MIN:
+                    break
+                total += left * alpha * colours[gaussian]
+                left *= 1 - alpha
+            image[y, x] = total + left * background
+    rendered = ReferenceRasterizer(scene, background=tuple(background.tolist())).render(colours, view)
+    assert torch.allclose(rendered, image, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["reference", *FAST])
+def test_gradient_is_the_transpose_and_agrees_with_differences(name: str) -> None:
+    scene, view = cloud(seed=11), camera()
+    rasterizer = make_rasterizer(name, scene, background=(0.3, 0.6, 0.9))
+    colours, pixels = colours_of(scene).double(), pixels_like(view).double()
+    black = rasterizer.render(torch.zeros_like(colours), view).double()
+    gradient = rasterizer.colour_gradient(pixels, view).double()
+    assert float((gradient * colours).sum()) == pytest.approx(
+        float(((rasterizer.render(colours, view).double() - black) * pixels).sum()), rel=1e-5, abs=1e-4
+    )
+    # The image is linear in the colours, so a difference over a step of 1 is exact but for rounding.
+    for gaussian in gradient.abs().sum(1).topk(5).indices.tolist():
+        changed = colours.clone()
+        changed[gaussian, 1] += 1
+        difference = rasterizer.render(changed, view).double() - rasterizer.render(colours, view).double()
+        assert float((difference * pixels).sum()) == pytest.approx(float(gradient[gaussian, 1]), rel=2e-4, abs=2e-4)
+
+
+@pytest.mark.parametrize("name", ["reference", *FAST])
+@pytest.mark.parametrize("cuts", [(0, 7, 45), (0, 16, 32, 45), (0, 1, 44, 45)])
+def test_bands_put_together_are_the_whole(name: str, cuts: tuple[int, ...]) -> None:
+    scene, view = cloud(seed=12), camera()
+    colours, pixels = colours_of(scene), pixels_like(view)
+    bands = list(pairwise(cuts))
+    whole, parts = (make_rasterizer(name, scene, background=(1, 1, 1)) for _ in range(2))
+    image = torch.cat([parts.render(colours, view, band) for band in bands])
+    coverage = torch.cat([parts.coverage(view, band) for band in bands])
+    gradient = torch.stack([parts.colour_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
+    if name == "reference":
+        assert torch.allclose(image, whole.render(colours, view), atol=1e-14)
+    else:
+        assert torch.equal(image, whole.render(colours, view))
+        assert torch.equal(coverage, whole.coverage(view))
+    assert relative_error(gradient, whole.colour_gradient(pixels, view)) < 1e-6
+    # and bands that the whole view's operator serves are the same
+    of_band = [rasterizer.colour_gradient(pixels[5:20], view, (5, 20)) for rasterizer in (whole, parts)]
+    assert relative_error(*of_band) < 1e-6
+    assert torch.allclose(whole.render(colours, view, (5, 20)), image[5:20], atol=1e-14)
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
+    scene, view = cloud(2000, seed=13), camera(200, 120)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 2):
+            torch.set_num_threads(threads)
+            rasterizer = make_rasterizer(name, scene)
+            results.append((rasterizer.render(colours, view), rasterizer.colour_gradient(pixels, view)))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_python_threads_can_share_a_rasterizer(name: str) -> None:
+    scene, view = cloud(500, seed=14), camera()
+    colours, pixels = colours_of(scene), pixels_like(view)
+    rasterizer = make_rasterizer(name, scene)
+    image, gradient = rasterizer.render(colours, view), rasterizer.colour_gradient(pixels, view)
+    with ThreadPoolExecutor(4) as pool:
+        images = [pool.submit(rasterizer.render, colours, view) for _ in range(8)]
+        gradients = [pool.submit(rasterizer.colour_gradient, pixels, view) for _ in range(8)]
+    assert all(torch.equal(f.result(), image) for f in images)
+    assert all(torch.equal(f.result(), gradient) for f in gradients)
+
+
+@pytest.mark.parametrize("background", [BLACK, (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)])
+def test_background_fills_what_is_not_covered(background: tuple[float, float, float]) -> None:
+    scene, view = cloud(100, seed=15), camera()
+    colours, filling = colours_of(scene), torch.tensor(background)
+    for name in FAST:
+        over = make_rasterizer(name, scene, background=background)
+        coverage = over.coverage(view)
+        expected = make_rasterizer(name, scene).render(colours, view) + (1 - coverage)[..., None] * filling
+        assert torch.allclose(over.render(colours, view), expected, atol=1e-6)
+        assert 0 < float(coverage.max()) < 1
+        assert float(coverage.min()) == 0
+        assert torch.equal(over.render(colours, view)[coverage == 0].unique(dim=0), filling[None])
+
+
+@pytest.mark.parametrize("name", ["reference", *FAST])
+@pytest.mark.parametrize(
+    "scene",
+    [empty_scene(), single((0, 0, -3.0)), single((1e6, 0, 1.0)), single((0, 0, 3.0), opacity=0.003)],
+    ids=["empty", "behind", "beside", "faint"],
+)
+def test_a_view_without_gaussians_is_background(name: str, scene: Scene) -> None:
+    view, rasterizer = camera(), make_rasterizer(name, scene, background=(0.5, 0.25, 0.125))
+    image = rasterizer.render(colours_of(scene), view)
+    assert image[..., 0].eq(0.5).all()
+    assert image[..., 2].eq(0.125).all()
+    assert not rasterizer.coverage(view).any()
+    gradient = rasterizer.colour_gradient(pixels_like(view), view)
+    assert gradient.shape == (len(scene), 3)
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize("name", ["reference", *FAST])
+def test_equal_depths_blend_in_the_order_of_the_file(name: str) -> None:
+    scene = together([((0, 0, 4.0), 0.6, (0.5,) * 3, (1, 0, 0, 0))] * 2)
+    colours = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])
+    image = make_rasterizer(name, scene).render(colours, camera())
+    assert bool((image[..., 0] >= image[..., 1]).all())
+    assert float(image[..., 0].max()) == pytest.approx(0.6, abs=0.02)
+    assert float(image[..., 1].max()) == pytest.approx(0.24, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["reference", *FAST])
+def test_a_gaussian_that_would_end_a_pixel_is_not_blended(name: str) -> None:
+    """Two opaque Gaussians would leave (1 - 0.99)^2 = TRANSMITTANCE_MIN: the second one already is cut."""
+    scene = together([((0, 0, z), 0.9999, (50.0,) * 3, (1, 0, 0, 0)) for z in (3.0, 4.0, 5.0)])
+    image = make_rasterizer(name, scene).render(torch.eye(3), camera(20, 20))
+    assert float((image[..., 0] - 0.99).abs().max()) < 1e-6
+    assert not image[..., 1:].any()
+    assert float((make_rasterizer(name, scene).coverage(camera(20, 20)) - 0.99).abs().max()) < 1e-6
+
+
+def test_a_far_off_centre_keeps_its_digits() -> None:
+    """A Gaussian of a billion pixels whose edge crosses the view: float32 offsets would be off by tens of pixels."""
+    scene = single((-4e6, 0, 4.0), scales=(2e6, 1e-3, 1e-3), opacity=0.9)
+    view = camera(64, 16, focal=1e3)
+    # the perspective is linearised at the frustum's edge, so what matters is agreement, not the picture
+    assert_agree(FAST, scene, view, BLACK)
+    assert float(CpuRasterizer(scene).coverage(view).max()) > 0
+
+
+def test_far_off_worlds_render_alike() -> None:
+    scene, view = cloud(300, seed=16), camera(pose=turned_pose())
+    scene = replace(scene, means=(scene.means * 16).round() / 16)
+    offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
+    pose = view.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    moved, elsewhere = replace(scene, means=scene.means + offset.float()), replace(view, world_to_camera=pose)
+    image = CpuRasterizer(scene).render(colours_of(scene), view)
+    band = ReferenceRasterizer(scene).near_cutoff(view, 1e-4)
+    assert_close_outside_band(CpuRasterizer(moved).render(colours_of(scene), elsewhere), image, band, tolerance=1e-4)
+
+
+def test_another_clamp_is_followed_everywhere() -> None:
+    scene, view = replace(cloud(seed=17), opacities=torch.full((400,), 9.0)), camera()
+    colours = colours_of(scene)
+    reference = ReferenceRasterizer(scene, alpha_max=0.999)
+    band = reference.near_cutoff(view, CLOSE)
+    for rasterizer in (CpuRasterizer(scene, alpha_max=0.999), CachedRasterizer(scene, alpha_max=0.999)):
+        image = rasterizer.render(colours, view)
+        assert_close_outside_band(image, reference.render(colours, view), band, tolerance=1e-4)
+        assert float((image - CpuRasterizer(scene).render(colours, view)).abs().max()) > 1e-3
+
+
+def test_kept_weights_equal_recomputed_ones() -> None:
+    scene, view = cloud(1500, seed=18), camera(130, 70)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    cpu, kept = CpuRasterizer(scene), CachedRasterizer(scene)
+    assert not kept.is_kept(view)
+    assert torch.equal(kept.render(colours, view), cpu.render(colours, view))
+    assert torch.equal(kept.coverage(view), cpu.coverage(view))
+    assert relative_error(kept.colour_gradient(pixels, view), cpu.colour_gradient(pixels, view)) < 1e-6
+    assert kept.is_kept(view)
+    assert kept.is_kept(replace(view, name="another name"))
+
+
+def test_half_precision_weights_are_rounded_to_float16() -> None:
+    scene, view = cloud(1500, seed=19), camera(130, 70)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    full, half = CachedRasterizer(scene), CachedRasterizer(scene, precision="half")
+    image = full.render(colours, view)
+    # each weight has a relative error of at most 2^-11, and all are positive
+    assert bool(((half.render(colours, view) - image).abs() <= 2**-11 * image + 1e-6).all())
+    assert relative_error(half.colour_gradient(pixels, view), full.colour_gradient(pixels, view)) < 5e-4
+    assert half.kept_bytes < 0.65 * full.kept_bytes
+    (one,), (two,) = full._kept.values(), half._kept.values()
+    assert one is not None
+    assert two is not None
+    exact, rounded = (kept.operator.triplets()[2] for kept in (one, two))  # type: ignore[union-attr]
+    assert np.array_equal(rounded, (exact * np.float32(2**14)).astype(np.float16).astype(np.float32) / 2**14)
+    assert float(exact.min()) < 1e-5
+
+
+def test_what_does_not_fit_the_budget_is_recomputed() -> None:
+    scene = cloud(800, seed=20)
+    views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
+    colours, pixels = colours_of(scene), pixels_like(views[0])
+    sizes = [CachedRasterizer(scene).operator_bytes(view) for view in views]
+    budget = sizes[0] + sizes[1]
+    kept, cpu = CachedRasterizer(scene, max_bytes=budget), CpuRasterizer(scene)
+    for _ in range(2):
+        for view in views:
+            assert torch.equal(kept.render(colours, view), cpu.render(colours, view))
+            assert relative_error(kept.colour_gradient(pixels, view), cpu.colour_gradient(pixels, view)) < 1e-6
+    assert [kept.is_kept(view) for view in views] == [True, True, False]
+    assert kept.kept_bytes == budget
+    operators = [k.operator for k in kept._kept.values() if k is not None]
+    real = sum(array.nbytes for operator in operators for array in operator.strips)  # type: ignore[union-attr]
+    assert 0.7 * budget < real <= budget
+
+
+def test_lists_beyond_the_budget_are_held_one_at_a_time() -> None:
+    scene = cloud(300, seed=21)
+    views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
+    first = CpuRasterizer(scene).lists(views[0])
+    cpu = CpuRasterizer(scene, max_list_bytes=first.nbytes)
+    kept = [cpu.lists(view) for view in views]
+    assert cpu.lists(views[0]) is kept[0]
+    assert cpu.lists(views[2]) is kept[2]
+    assert cpu.lists(views[1]) is not kept[1]
+
+
+@pytest.mark.parametrize("precision", ["float32", "half"])
+def test_sparse_matrices_apply_the_same_weights(precision: str) -> None:
+    """What `cached` uses on other devices, here on the CPU."""
+    scene, view = cloud(600, seed=22), camera()
+    colours, pixels = colours_of(scene), pixels_like(view)
+    kept = CachedRasterizer(scene, precision=precision, background=(1, 1, 1))  # type: ignore[arg-type]
+    image, gradient = kept.render(colours, view), kept.colour_gradient(pixels, view)
+    (held,) = kept._kept.values()
+    assert held is not None
+    sparse = SparseOperator(held.operator, len(scene), torch.device("cpu"))  # type: ignore[arg-type]
+    assert torch.allclose(sparse.render(colours, torch.ones(3)), image, atol=2e-6)
+    assert relative_error(sparse.colour_gradient(pixels), gradient) < 1e-6
+
+
+def test_arguments_are_checked_before_any_work() -> None:
+    scene, view = cloud(10), camera()
+    for name in ("reference", *FAST):
+        rasterizer = make_rasterizer(name, scene)
+        for rows in ((0, 0), (5, 3), (-1, 4), (0, view.height + 1)):
+            with pytest.raises(ValueError, match="band of view 'test' lies within 0 to 45"):
+                rasterizer.render(colours_of(scene), view, rows)
+        with pytest.raises(ValueError, match="colours of shape"):
+            rasterizer.render(torch.zeros(9, 3), view)
+        with pytest.raises(ValueError, match="image gradient of shape"):
+            rasterizer.colour_gradient(torch.zeros(45, 70, 3), view, (0, 10))
+
+
+def test_unknown_rasterizers_and_devices_are_refused() -> None:
+    with pytest.raises(SettingsError, match="choose reference, cpu, cached or cuda"):
+        make_rasterizer("fast", cloud(10))
+    with pytest.raises(SettingsError, match="runs on the CPU"):
+        make_rasterizer("cpu", cloud(10), device="cuda")
+
+
+def test_too_many_intersections_are_an_error_with_figures() -> None:
+    check_intersections(MAX_INTERSECTIONS, 5, camera())
+    with pytest.raises(TooManyIntersectionsError, match=r"'test' \(70x45\): its 5 visible .* 2,147,483,648 times"):
+        check_intersections(MAX_INTERSECTIONS + 1, 5, camera())
+
+
+def test_kernels_run_where_no_folder_can_be_written(tmp_path: Path) -> None:
+    """Machine code is then kept in memory only: Numba's own answer would be an exception at import."""
+    package = Path(__file__).resolve().parents[3]
+    code = (
+        "import numba.core.caching as c\n"
+        "c.CacheImpl._locator_classes = []\n"
+        "from sgsst_core.compiled import compiled\n"
+        "@compiled()\n"
+        "def twice(x):\n    return 2 * x\n"
+        "assert twice(4) == 8\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(package)}
+    script = tmp_path / "kernel.py"
+    script.write_text(code)
+    finished = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """PyTorch on one thread: the reference makes thousands of small operations, for which waking threads costs more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+REAL = [("snowmiku_plush", 160), ("biker", 120), ("playbot_synthetic_sh2", 120)]
+
+
+@pytest.mark.parametrize(("name", "side"), REAL, ids=[name for name, _ in REAL])
+@pytest.mark.usefixtures("one_thread")
+def test_real_scenes_agree_with_the_reference(shared_data: Path, name: str, side: int) -> None:
+    folder = shared_data / "scenes" / name
+    scene = read_scene(folder / "point_cloud.ply").scene
+    file = folder / "cameras.json"
+    views = read_cameras(file) if file.is_file() else orbit(scene, 5)
+    view = resized(views[2], side)
+    background = BLACK if name == "snowmiku_plush" else (1.0, 1.0, 1.0)
+    middle = view.height // 2
+    flipped = assert_agree(FAST, scene, view, background, (middle - 10, middle + 11))
+    assert flipped <= 1e-3 * 21 * view.width
+
+
+def test_a_real_scene_looks_like_its_photo(shared_data: Path) -> None:
+    """Spherical harmonics, projection, order and blending together: 28 dB on average was measured after training."""
+    scene = read_scene(shared_data / "scenes" / "snowmiku_plush" / "point_cloud.ply").scene
+    view = read_cameras(shared_data / "scenes" / "snowmiku_plush" / "cameras.json")[0]
+    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, view))
+    image = CpuRasterizer(scene).render(colours, view).clamp(0, 1)
+    photo: Tensor = load_image(shared_data / "photos" / "snowmiku_plush" / "images" / f"{view.name}.jpg")
+    assert photo.shape == image.shape
+    psnr = -10 * math.log10(float((photo - image).square().mean()))
+    assert psnr > 25
+
+
+def test_kernels_leave_the_number_of_torch_threads_alone() -> None:
+    """In a fresh process: Numba's first kernel sets the OpenMP library that PyTorch may share to all cores."""
+    code = (
+        "import torch; torch.set_num_threads(1)\n"
+        "from tests.sgsst_core.splat_scenes import camera, cloud\n"
+        "from sgsst_core.rasterizer.cpu import CpuRasterizer\n"
+        "CpuRasterizer(cloud()).coverage(camera())\n"
+        "assert torch.get_num_threads() == 1, torch.get_num_threads()\n"
+    )
+    root = Path(__file__).resolve().parents[3]
+    finished = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr

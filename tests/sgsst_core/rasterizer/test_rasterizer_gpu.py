@@ -1,0 +1,94 @@
+"""gsplat's kernels against the reference with the same clamp; and the errors where gsplat or the GPU is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
+from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, pixels_like, turned_pose
+
+HAS_GSPLAT = importlib.util.find_spec("gsplat") is not None
+HAS_GPU = torch.cuda.is_available()
+needs_gpu = pytest.mark.skipif(not HAS_GPU, reason="no CUDA GPU that PyTorch can use")
+needs_gsplat = pytest.mark.skipif(not HAS_GSPLAT, reason="gsplat, the extra [cuda], is not installed")
+#: gsplat projects in float32 and takes exponentials with the fast intrinsic.
+CLOSE = 2e-3
+
+
+@pytest.mark.gpu
+@needs_gpu
+@needs_gsplat
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_cuda_agrees_with_the_reference(seed: int) -> None:
+    scene, view = cloud(800, seed=seed), camera(130, 75, pose=turned_pose())
+    background = (0.2, 0.5, 1.0)
+    cuda = CudaRasterizer(scene, background=background)
+    reference = ReferenceRasterizer(scene, background=background, alpha_max=cuda.alpha_max)
+    band = reference.near_cutoff(view, CLOSE)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    image = cuda.render(colours, view).cpu()
+    assert_close_outside_band(image, reference.render(colours, view), band, tolerance=1e-4, largest_share=1e-2)
+    assert_close_outside_band(
+        cuda.coverage(view).cpu(), reference.coverage(view), band, tolerance=1e-4, largest_share=1e-2
+    )
+    pixels[band] = 0
+    assert relative_error(cuda.colour_gradient(pixels, view).cpu(), reference.colour_gradient(pixels, view)) < 1e-4
+
+
+@pytest.mark.gpu
+@needs_gpu
+@needs_gsplat
+def test_bands_put_together_are_the_whole() -> None:
+    scene, view = cloud(800, seed=3, log_scale=-1.0), camera(130, 75)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    cuda = CudaRasterizer(scene)
+    bands = [(0, 21), (21, 64), (64, 75)]
+    parts = torch.cat([cuda.render(colours, view, band) for band in bands])
+    assert torch.allclose(parts, cuda.render(colours, view), atol=1e-5)
+    gradient = torch.stack([cuda.colour_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
+    assert relative_error(gradient, cuda.colour_gradient(pixels, view)) < 1e-4
+
+
+@pytest.mark.gpu
+@needs_gpu
+def test_cached_on_the_gpu_agrees_with_cpu() -> None:
+    scene, view = cloud(800, seed=4), camera(130, 75)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    cpu, cached = (
+        CpuRasterizer(scene, background=(1, 1, 1)),
+        CachedRasterizer(scene, background=(1, 1, 1), device="cuda"),
+    )
+    assert torch.allclose(cached.render(colours, view).cpu(), cpu.render(colours, view), atol=1e-5)
+    assert torch.allclose(cached.coverage(view, (3, 40)).cpu(), cpu.coverage(view, (3, 40)), atol=1e-6)
+    assert relative_error(cached.colour_gradient(pixels, view).cpu(), cpu.colour_gradient(pixels, view)) < 1e-5
+    assert cached.render(colours, replace(view, name="same content")).device.type == "cuda"
+
+
+@pytest.mark.skipif(HAS_GSPLAT, reason="gsplat is installed")
+def test_without_gsplat_the_error_names_the_extra() -> None:
+    with pytest.raises(SettingsError, match=r"sgsst-service\[cuda\]"):
+        make_rasterizer("cuda", cloud(10))
+
+
+@needs_gsplat
+@pytest.mark.skipif(HAS_GPU, reason="there is a GPU")
+def test_without_a_gpu_the_error_says_what_to_choose() -> None:
+    with pytest.raises(SettingsError, match="choose 'cpu' or 'cached'"):
+        make_rasterizer("cuda", cloud(10))
+
+
+@pytest.mark.parametrize(
+    ("version", "clamp"), [("1.5.3", 0.999), ("1.6.0", 0.99), ("1.6.0rc1+cu124", 0.99), ("2.0", 0.99)]
+)
+def test_the_clamp_follows_the_version(version: str, clamp: float) -> None:
+    assert gsplat_alpha_max(version) == clamp

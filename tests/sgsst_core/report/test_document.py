@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sgsst_core.errors import OutputError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.terms import LossTerms
+from sgsst_core.report.document import (
+    REPORT_VERSION,
+    Evaluation,
+    Sources,
+    bought,
+    build_report,
+    mean_loss,
+    running_mean,
+    write_contact_sheet,
+    write_json,
+    write_loss_curves,
+)
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import StepRecord, Stylizer
+from tests.small_scenes import ball, blind_camera, cameras, style
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def finished(vgg16_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evaluation]:
+    """Six views of a ball of which one sees nothing, after seven steps; the loss before and after."""
+    views = [*cameras(3), blind_camera(), *cameras(2)]
+    settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3)
+    stylizer = Stylizer(ball(), views, style(), settings, weights=vgg16_weights)
+    before = stylizer.evaluate(stylizer.evaluation_views)
+    run(stylizer)
+    return stylizer, before, stylizer.evaluate(stylizer.evaluation_views)
+
+
+@pytest.fixture(scope="module")
+def sources(vgg16_weights: BackboneWeights) -> Sources:
+    return Sources(Path("a/scene.ply"), 2, Path("style.png"), Path("cameras.json"), None, vgg16_weights)
+
+
+def test_evaluation_views_are_spread_over_those_that_see_anything(
+    finished: tuple[Stylizer, Evaluation, Evaluation],
+) -> None:
+    assert finished[0].evaluation_views == [0, 1, 4, 5]
+
+
+def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
+    stylizer, before, after = finished
+    report = build_report(stylizer, sources, "finished", before, after)
+    assert report["version"] == REPORT_VERSION
+    assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
+    assert report["scene"] == {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2}
+    assert report["style"] == {"path": "style.png", "width": 80, "height": 96}
+    assert report["cameras"]["count"] == 6
+    assert report["cameras"]["sizes"] == [[64, 48]]
+    assert report["cameras"]["seeing_nothing"] == ["blind"]
+    assert report["position_weights"]["used"] is True
+    assert 0.3 < report["position_weights"]["uncovered_share"] < 1
+    assert len(report["backbone"]["sha256"]) == 64
+    assert report["settings"] == stylizer.settings.model_dump(mode="json")
+    assert report["memory"]["peak_bytes"] > 50_000_000
+    parts = sum(report["seconds_by_part"].values())
+    assert 0.5 * report["seconds"] < parts <= report["seconds"] + 0.01
+
+
+def test_losses_in_the_report_are_those_of_the_steps(
+    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
+) -> None:
+    stylizer, before, after = finished
+    report = build_report(stylizer, sources, "max-seconds", before, after)
+    assert report["stopped"] == "max-seconds"
+    assert [entry["step"] for entry in report["history"]] == list(range(1, 8))
+    for entry, record in zip(report["history"], stylizer.history, strict=True):
+        terms = entry["scales"]["0"]
+        assert entry["loss"] == record.loss
+        assert terms["total"] == pytest.approx(terms["gram"] + terms["mean"] + terms["std"] + terms["content"])
+        assert entry["relative"] == pytest.approx(record.loss / mean_loss(before))
+        assert sum(entry["parts"].values()) == pytest.approx(sum(record.parts.values()), abs=1e-3)
+        assert entry["memory_bytes"] > 50_000_000
+    assert report["loss"]["relative"] == pytest.approx(mean_loss(after) / mean_loss(before))
+    assert report["loss"]["relative"] < 1
+    assert report["loss"]["views"] == ["view_0", "view_1", "view_0", "view_1"]
+
+
+def test_what_the_time_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
+    """Two views a round: the mean of the last two losses counts."""
+    stylizer = finished[0]
+    kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.views.covered
+    losses = [8.0, 8.0, 4.0, 4.0, 0.48, 0.48, 0.48]
+    stylizer.history = [
+        StepRecord(i + 1, "sos", i % 2, 10.0 * (i + 1), loss, {0: LossTerms(gram=loss)}, {}, 0)
+        for i, loss in enumerate(losses)
+    ]
+    stylizer.seconds, stylizer.views.covered = 70.0, [0, 1]
+    try:
+        found = bought(stylizer, {0: LossTerms(gram=8.0)})
+    finally:
+        stylizer.history, stylizer.seconds, stylizer.views.covered = kept, seconds, covered
+    assert found is not None
+    assert found["relative"] == pytest.approx(0.06)
+    assert [(entry["relative"], entry["step"]) for entry in found["reached"]] == [(0.5, 4), (0.2, 5), (0.1, 6)]
+    assert found["last_tenth"] == {"seconds": pytest.approx(7.0), "from": pytest.approx(0.06), "to": found["relative"]}
+
+
+def test_what_no_step_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
+    stylizer = finished[0]
+    kept, stylizer.history = stylizer.history, []
+    try:
+        assert bought(stylizer, {0: LossTerms(gram=8.0)}) is None
+    finally:
+        stylizer.history = kept
+
+
+def test_a_name_that_is_not_unicode_is_json_all_the_same(tmp_path: Path) -> None:
+    write_json(tmp_path / "r.json", {"path": "caf\udce9.ply"})
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8")) == {"path": "caf\udce9.ply"}
+
+
+def test_report_is_plain_json(
+    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, tmp_path: Path
+) -> None:
+    stylizer, before, after = finished
+    report = build_report(stylizer, sources, "finished", before, after)
+    write_json(tmp_path / "r.json", report)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"), parse_constant=refuse) == report
+
+
+def test_coarse_steps_are_relative_to_their_own_scale(
+    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
+) -> None:
+    stylizer = finished[0]
+    before = {0: LossTerms(gram=6.0), 1: LossTerms(gram=2.0)}
+    kept = stylizer.history
+    stylizer.history = [
+        StepRecord(1, "coarse", 0, 0.1, 1.0, {1: LossTerms(gram=1.0)}, {}, 0),
+        StepRecord(2, "sos", 0, 0.2, 1.0, {0: LossTerms(gram=1.0), 1: LossTerms(gram=1.0)}, {}, 0),
+    ]
+    try:
+        report = build_report(stylizer, sources, "finished", before, before)
+    finally:
+        stylizer.history = kept
+    assert [entry["relative"] for entry in report["history"]] == [0.5, 0.25]
+    assert [report["steps"][stage]["done"] for stage in ("coarse", "sos")] == [1, 1]
+
+
+def test_contact_sheet_shows_style_original_and_stylized(
+    finished: tuple[Stylizer, Evaluation, Evaluation], tmp_path: Path
+) -> None:
+    stylizer = finished[0]
+    write_contact_sheet(tmp_path / "s.jpg", stylizer)
+    with Image.open(tmp_path / "s.jpg") as image:
+        assert image.format == "JPEG"
+        sheet = np.asarray(image, dtype=np.float64) / 255
+    # cells of 64x48 views are 440x330; the style's column, 275 wide, comes first
+    left, cells = 12 + 275 + 12, []
+    for top in (18 + 12, 18 + 12 + 330 + 18 + 12):
+        cell = torch.from_numpy(sheet[top : top + 330, left : left + 440]).permute(2, 0, 1)
+        cells.append(torch.nn.functional.interpolate(cell[None], (48, 64), mode="area")[0].permute(1, 2, 0))
+    dcs = (stylizer.views.scene.sh_dc, stylizer.sh_dc.detach())
+    renders = [stylizer.views.render(0, stylizer.views.colours(0, dc)).clamp(0, 1) for dc in dcs]
+    distances = [[float((cell - render).abs().mean()) for render in renders] for cell in cells]
+    assert max(distances[0][0], distances[1][1]) < 0.02
+    assert min(distances[0][1], distances[1][0]) > 2 * max(distances[0][0], distances[1][1])
+
+
+def test_running_mean_is_geometric_and_centred() -> None:
+    values = [1.0, 10.0, 100.0, 1000.0, 10.0]
+    np.testing.assert_allclose(running_mean(values, 3), [1, 10, 100, 100, 10])
+    np.testing.assert_allclose(running_mean(values, 1), values)
+    np.testing.assert_allclose(running_mean(values, 99), [1, 10, math.prod(values) ** 0.2, 100, 10])
+    assert np.isfinite(running_mean([0.0, 1.0], 1)).all()
+    assert len(running_mean([], 3)) == 0
+
+
+@pytest.mark.parametrize("stages", [[], ["sos"], ["coarse"], ["coarse"] * 3, ["coarse", "coarse", "sos", "sos"]])
+def test_curves_of_any_history_are_a_picture(stages: list[str], tmp_path: Path) -> None:
+    history = [
+        StepRecord(
+            i + 1,
+            "coarse" if stage == "coarse" else "sos",
+            0,
+            0.5 * (i + 1),
+            10.0 / (i + 1),
+            {scale: LossTerms(gram=10.0 / (i + 1)) for scale in ((1,) if stage == "coarse" else (0, 1))},
+            {},
+            0,
+        )
+        for i, stage in enumerate(stages)
+    ]
+    write_loss_curves(tmp_path / "c.png", history, 3)
+    with Image.open(tmp_path / "c.png") as image:
+        assert image.format == "PNG"
+        assert np.asarray(image.convert("L")).min() < 100
+
+
+def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        write_json(tmp_path / "missing" / "r.json", {})
+    with pytest.raises(OutputError):
+        write_loss_curves(tmp_path / "missing" / "c.png", [], 1)
+    assert list(tmp_path.iterdir()) == []

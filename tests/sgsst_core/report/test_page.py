@@ -1,0 +1,581 @@
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sgsst_core.errors import OutputError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.report.document import Sources, build_report, running_mean
+from sgsst_core.report.figures import PLACES, draw_figures, thinned
+from sgsst_core.report.page import render_page, write_page
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.small_scenes import ball, cameras, style
+
+VOID = {"meta", "link", "img", "input", "br", "hr"}
+HOSTILE = '"><script>alert(\'x\')</script><b onclick="y">&amp; {{ 7 * 7 }} $x^2$ \u202egnp.\u540d\u524d'
+
+
+class Page(HTMLParser):
+    """Elements and text of a page; fails where tags do not nest."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.html = html
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.cells: list[str] = []
+        self.pieces: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert len(attrs) == len(dict(attrs)), f"<{tag}> has an attribute twice"
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "td":
+            self.cells.append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert "svg" in self.open, f"<{tag}/> outside of SVG does not close itself"
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.pieces.append(data)
+        if self.open and self.open[-1] == "td":
+            self.cells[-1] += data.replace("\u00a0", " ")
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.pieces).split())
+
+    @property
+    def drawings(self) -> list[str]:
+        return [attributes["aria-label"] or "" for tag, attributes in self.elements if tag == "svg"]
+
+    def assert_self_contained(self) -> None:
+        identifiers = [attributes["id"] for _, attributes in self.elements if "id" in attributes]
+        assert len(identifiers) == len(set(identifiers))
+        tags = {tag for tag, _ in self.elements}
+        assert not tags & {"script", "iframe", "object", "embed", "base", "form", "foreignobject"}
+        for _, attributes in self.elements:
+            for name, value in attributes.items():
+                assert not name.startswith("on")
+                assert name not in ("srcset", "action", "formaction", "poster", "srcdoc")
+                if name.removeprefix("xlink:") in ("href", "src"):
+                    assert value is not None
+                    assert value.startswith(("data:", "#"))
+                    assert value.startswith("data:") or value[1:] in identifiers
+                for target in re.findall(r"url\(([^)]*)\)", value or ""):
+                    assert target[0] == "#"
+                    assert target[1:] in identifiers
+        for sheet in re.findall(r"<style>(.*?)</style>", self.html, re.DOTALL):
+            assert "url(" not in sheet
+            assert "@import" not in sheet
+
+
+def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, Any]:
+    """A report of version 2 with a value in every field, of so many steps."""
+    history = [_record(step, "coarse" if step <= coarse else "sos", scales) for step in range(1, coarse + sos + 1)]
+    seconds = history[-1]["seconds"] if history else 0.0
+    before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}
+    after = {str(scale): _terms(1e5 / 4**scale) for scale in range(scales)}
+    return {
+        "version": 2,
+        "program": {"name": "sgsst-service", "version": "0.1.0"},
+        "created": "2026-01-02T03:04:05+00:00",
+        "stopped": "finished",
+        "steps": {"coarse": {"planned": coarse, "done": coarse}, "sos": {"planned": sos, "done": sos}},
+        "seconds": seconds,
+        "seconds_by_part": {"vgg_forward": 0.5 * seconds, "render": 0.2 * seconds, "optimiser": 0.1 * seconds},
+        "loss": {
+            "views": ["a", "b"],
+            "before": {"total": 6e5, "scales": before},
+            "after": {"total": 6e4, "scales": after},
+            "relative": 0.1,
+            "relative_by_scale": dict.fromkeys(before, 0.1),
+        },
+        "settings": {"preset": "preview", "seed": 3, "max_seconds": None, "background": [0.0, 0.5, 1.0]},
+        "backbone": {"name": "vgg16", "source": "package index", "sha256": "0123456789abcdef" * 4},
+        "scene": {"path": "folder/garden.ply", "gaussians": 123_456, "sh_degree": 3, "dropped": 0},
+        "style": {"path": "styles/wave.jpg", "width": 800, "height": 600},
+        "cameras": {
+            "path": None,
+            "form": "orbit",
+            "content": "unstylized renders",
+            "count": 5,
+            "sizes": [[640, 480], [1280, 720]],
+            "names": ["a", "b", "c", "d", "e"],
+            "seeing_nothing": ["e"],
+        },
+        "position_weights": {"used": True, "uncovered_share": 0.25},
+        "plan": {
+            "decisions": [_decision(index) for index in range(3)],
+            "prediction": {"seconds": 2.0, "peak_bytes": 3_000_000_000},
+            "measured": {"seconds": 2.5, "peak_bytes": 2_400_000_000},
+        },
+        "rasterizer": "cached",
+        "memory": {"limit_bytes": 8_000_000_000, "peak_bytes": 2_400_000_000},
+        "machine": {"processor": "some processor", "cores": 2, "device": "cpu"},
+        "history": history,
+        "held_out": {"views": ["c"], "lpips": "alex", "moments": [_moment(s, history) for s in (0, 4, coarse + sos)]},
+        "approximations": {
+            "what": ["bfloat16 features", "half-precision blend weights"],
+            "moments": [
+                {"step": step, "view": 1, "relative_error": e, "cosine": 0.97, "seconds": 0.5, "seconds_exact": 1.25}
+                for step, e in ((3, 0.21), (9, 0.24))
+            ],
+        },
+        "bought": {
+            "relative": 0.0987,
+            "reached": [{"relative": 0.5, "seconds": 1.5, "step": 7}, {"relative": 0.25, "seconds": 2.5, "step": 9}],
+            "last_tenth": {"seconds": 0.4, "from": 0.101, "to": 0.0987},
+        },
+        "findings": [
+            {
+                "subject": "scene",
+                "what": "needles",
+                "count": 1200,
+                "total": 5000,
+                "worst": "Gaussian 7",
+                "done": "drawn",
+            },
+            {"subject": "style", "what": "extreme aspect", "count": 1, "total": 1, "worst": "", "done": "used whole"},
+        ],
+    }
+
+
+def _terms(total: float) -> dict[str, float]:
+    shares = {"gram": 0.7, "mean": 0.15, "std": 0.1, "content": 0.05}
+    return {**{term: share * total for term, share in shares.items()}, "total": total}
+
+
+def _record(step: int, stage: str, scales: int) -> dict[str, Any]:
+    relative = (1 + 0.2 * math.sin(1.7 * step)) / step**0.5
+    chosen = range(scales - 1, scales) if stage == "coarse" else range(scales)
+    return {
+        "step": step,
+        "stage": stage,
+        "seconds": round(0.2 * step, 3),
+        "view": step % 4,
+        "loss": 6e5 * relative,
+        "relative": relative,
+        "scales": {str(scale): _terms(1e6 / 4**scale * relative) for scale in chosen},
+        "parts": {"render": 0.04, "vgg_forward": 0.1},
+        "memory_bytes": 2_000_000_000 + 1_000_000 * (step % 7),
+    }
+
+
+def _decision(index: int) -> dict[str, Any]:
+    """Decisions with and without seconds and bytes."""
+    saved = {"seconds": 0.25 * index or None, "bytes": 4_000_000 * index or None}
+    texts = {name: f"{name} number {index}" for name in ("item", "decision", "reason", "error")}
+    return {**texts, **saved}
+
+
+def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
+    relative = 1.0 if step == 0 else 0.9 / step**0.5
+    pairs = {"pairs": 4, "compared": 0.83, "rmse": 0.04 + 0.01 * relative, "lpips": 0.1 - 0.05 * relative}
+    return {
+        "step": step,
+        "seconds": 0.2 * step,
+        "gram": {"0": 1e5 * relative, "1": 3e4 * relative},
+        "gram_relative": relative,
+        "consistency": {"short": {"gap": 1, **pairs}, "long": {"gap": 7, **pairs, "lpips": None}},
+    }
+
+
+def sample_sheet() -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.arange(40 * 60 * 3, dtype=np.uint8).reshape(40, 60, 3)).save(file, format="JPEG")
+    return file.getvalue()
+
+
+def parsed(report: dict[str, Any], sheet: bytes | None = None) -> Page:
+    page = Page(render_page(report, sheet))
+    page.assert_self_contained()
+    return page
+
+
+def parsed_without_figures(report: dict[str, Any]) -> Page:
+    """Figures take most of a page's time, and some tests look at other things."""
+    return parsed({**report, "history": []})
+
+
+def losses_alone(coarse: int = 6, sos: int = 12) -> dict[str, Any]:
+    """A report whose only figures are those of the loss."""
+    report = sample_report(coarse, sos)
+    for record in report["history"]:
+        del record["memory_bytes"]
+    return {**report, "held_out": None, "approximations": None}
+
+
+def test_page_is_whole_and_refers_to_nothing_outside() -> None:
+    page = parsed(sample_report(), sample_sheet())
+    assert page.html.startswith("<!DOCTYPE html>")
+    assert "http:" not in page.html
+    assert "https:" not in page.html
+    policies = [attributes.get("content") for tag, attributes in page.elements if tag == "meta"]
+    assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in policies
+
+
+def test_sheet_is_in_the_page_byte_for_byte() -> None:
+    def pictures(sheet: bytes | None) -> list[str]:
+        page = parsed(sample_report(0, 0), sheet)
+        return [attributes["src"] or "" for tag, attributes in page.elements if tag == "img"]
+
+    (source,) = pictures(sample_sheet())
+    assert base64.b64decode(source.removeprefix("data:image/jpeg;base64,")) == sample_sheet()
+    assert pictures(None) == []
+
+
+def test_sections_are_in_order() -> None:
+    text = parsed(sample_report(), sample_sheet()).text
+    headings = [
+        "garden.ply in the style of wave.jpg",
+        "What error the time bought",
+        "Before and after",
+        "Curves",
+        "Where the time went",
+        "The plan",
+        "Stability",
+        "Approximations against exact",
+        "Everything else",
+    ]
+    places = [text.rindex(heading) for heading in headings]
+    assert places == sorted(places)
+
+
+def test_heading_says_what_came_out() -> None:
+    text = parsed_without_figures(sample_report()).text
+    assert "VGG16 preset preview 123,456 Gaussians 5 views, up to 1280 × 720 pixels" in text
+    assert "Relative loss 0.1 after 3.6 s and 18 steps: all planned steps were done." in text
+    assert "loss down to 50 % 1.5 s step 7, 42 % of the time" in text
+    assert "was 9.87 % of the start's" in text
+    assert "The last tenth of the time (0.4 s) took it from 10.1 % to 9.87 %" in text
+
+
+@pytest.mark.parametrize(
+    ("stopped", "words"),
+    [
+        ("max-seconds", "18 of 118 steps: stopped at the time limit."),
+        ("target-loss", "when the target loss was reached"),
+        ("converged", "when the loss had converged"),
+        ("some-other-word", "some-other-word"),
+    ],
+)
+def test_heading_says_how_it_stopped(stopped: str, words: str) -> None:
+    report = sample_report()
+    report["stopped"] = stopped
+    report["steps"]["sos"]["planned"] += 100
+    assert words in parsed_without_figures(report).text
+
+
+def test_every_figure_is_there_against_seconds_and_against_steps() -> None:
+    page = parsed(sample_report())
+    figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
+    assert figures == ["loss", "split", "consistency", "approximations", "memory"]
+    for against in ("seconds", "steps"):
+        assert sum(label.endswith(f", against {against}") for label in page.drawings) == len(figures)
+        inputs = [attributes for tag, attributes in page.elements if tag == "input"]
+        assert [i["id"] for i in inputs if i["type"] == "radio" and i["name"] == "against"] == [
+            "against-seconds",
+            "against-steps",
+        ]
+        assert [i["id"] for i in inputs if "checked" in i] == ["against-seconds"]
+        classes = [attributes.get("class") for tag, attributes in page.elements if tag == "div"]
+        assert classes.count(f"against-{against}") == len(figures)
+        assert f"#against-{against}:not(:checked) ~ .figures .against-{against} {{ display: none; }}" in page.html
+
+
+def test_lines_are_named_and_phases_marked() -> None:
+    loss = draw_figures(sample_report())[0].svg["steps"]
+    words = Page(loss).text
+    for name in ("scale 0 (full size)", "scale 1 (1/2)", "mean", "Gram distance, held-out views", "steps"):
+        assert name in words
+    assert "coarsest scale" in words
+    assert "all scales" in words
+
+
+def test_split_has_a_panel_for_each_scale() -> None:
+    words = Page(draw_figures(sample_report(scales=3))[1].svg["seconds"]).text
+    assert [words.count(f"scale {scale} (") for scale in range(4)] == [1, 1, 1, 0]
+    assert all(term in words for term in ("gram", "mean", "std", "content"))
+
+
+def test_both_axes_of_the_loss_are_logarithmic() -> None:
+    """Held-out points of which each has twice the step and half the value of the one before lie evenly spaced."""
+    report = sample_report(0, 64)
+    for moment, step in zip(report["held_out"]["moments"], (0, 4, 8), strict=True):
+        moment.update(step=step, gram_relative=1 / step if step else 1.0)
+    report["held_out"]["moments"].append({**report["held_out"]["moments"][-1], "step": 16, "gram_relative": 1 / 16})
+    svg = draw_figures(report)[0].svg["steps"]
+    marks = [
+        (float(attributes["x"] or ""), float(attributes["y"] or ""))
+        for tag, attributes in Page(svg).elements
+        if tag == "use" and re.search("fill-opacity: 0(;|$)", attributes.get("style") or "")
+    ]
+    points = np.array(marks[:-1])  # the last one is in the legend
+    assert len(points) == 3
+    steps = np.diff(points, axis=0)
+    np.testing.assert_allclose(steps[0], steps[1], atol=0.05)
+    assert (steps > 1).all()
+
+
+def test_hostile_names_are_text() -> None:
+    report = sample_report()
+    report["scene"]["path"] = f"folder/{HOSTILE.replace('/', '∕')}.ply"
+    report["style"]["path"] = "<img src=x onerror=alert(1)>.jpg"
+    report["cameras"]["names"][1] = HOSTILE
+    report["cameras"]["seeing_nothing"] = [HOSTILE]
+    report["findings"][0]["worst"] = HOSTILE
+    report["plan"]["decisions"][0]["decision"] = HOSTILE
+    report["settings"]["preset"] = HOSTILE
+    report["stopped"] = HOSTILE
+    report["seconds_by_part"] = {HOSTILE: 1.0}
+    report["machine"] = {HOSTILE: HOSTILE}
+    report["history"][0]["stage"] = '"><script> $x^2$'
+    report["approximations"]["what"] = [HOSTILE]
+    page = parsed(report)
+    assert page.cells.count(HOSTILE) == 4  # finding, decision, and the view of both probes
+    assert "49" not in page.cells
+    assert "<img src=x onerror=alert(1)>.jpg" in page.text
+
+
+def test_names_that_are_no_unicode_cost_nothing_but_themselves(tmp_path: Path) -> None:
+    report = sample_report()
+    report["scene"]["path"] = "caf\udce9.ply"  # as Python names a file of another encoding
+    write_page(tmp_path / "page.html", report, None)
+    assert "caf?.ply" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_every_decision_and_finding_is_in_a_table() -> None:
+    report = sample_report()
+    cells = parsed_without_figures(report).cells
+    for decision in report["plan"]["decisions"]:
+        assert all(decision[name] in cells for name in ("item", "decision", "reason", "error"))
+    assert {"0.25 s", "0.5 s", "4 MB", "8 MB"} <= set(cells)
+    for finding in report["findings"]:
+        assert all(finding[name] in cells for name in ("subject", "what", "done"))
+    assert {"1,200 of 5,000", "Gaussian 7", "1 of 1"} <= set(cells)
+
+
+def test_prediction_stands_beside_the_measurement() -> None:
+    cells = parsed_without_figures(sample_report()).cells
+    place = cells.index("a step on all scales")
+    assert cells[place : place + 8] == [
+        "a step on all scales",
+        "2 s",
+        "2.5 s",
+        "1.25",
+        "peak memory",
+        "3 GB",
+        "2.4 GB",
+        "0.8",
+    ]
+
+
+def test_speed_up_of_several_ranks_stands_beside_its_prediction() -> None:
+    report = sample_report()
+    report["plan"]["prediction"] |= {"seconds_one_rank": 3.6, "communication": 0.1}
+    report["plan"]["measured"] |= {"communication": 0.2, "speed_up": 1.44}
+    cells = parsed_without_figures(report).cells
+    place = cells.index("of it waiting for other ranks")
+    assert cells[place : place + 8] == [
+        "of it waiting for other ranks",
+        "0.1 s",
+        "0.2 s",
+        "2",
+        "speed-up over one rank",
+        "1.8",
+        "1.44",
+        "0.8",
+    ]
+
+
+def test_approximations_stand_beside_the_exact_ones() -> None:
+    page = parsed_without_figures(sample_report())
+    place = page.cells.index("0.21")
+    assert page.cells[place - 2 : place + 5] == ["3", "b", "0.21", "0.97", "0.5 s", "1.25 s", "2.5"]
+    assert "bfloat16 features, half-precision blend weights" in page.text
+
+
+def test_time_is_split_in_percent_with_the_rest() -> None:
+    page = parsed_without_figures(sample_report())
+    widths = [attributes["style"] for tag, attributes in page.elements if tag == "i"]
+    assert widths == ["width: 50.0%", "width: 20.0%", "width: 10.0%", "width: 20.0%"]
+    assert "feature network, forward 50.0 % 1.8 s" in page.text
+    assert "everything else 20.0 % 0.72 s" in page.text
+
+
+def test_held_out_moments_are_in_a_table() -> None:
+    page = parsed_without_figures(sample_report())
+    titles = ["scale 0, absolute", "RMSE, short range", "LPIPS, short range", "RMSE, long range"]
+    assert all(title in page.text for title in titles)
+    assert "LPIPS, long range" not in page.text  # a column without a value
+    place = page.cells.index("0.8 s")
+    row = ["4", "0.8 s", "0.45", "45,000", "13,500", "0.0445", "0.0775", "83 %", "0.0445", "83 %"]
+    assert page.cells[place - 1 : place + 9] == row
+
+
+def test_folded_part_holds_all_other_fields() -> None:
+    report = sample_report()
+    report["a_field_of_later"] = {"deep": [{"inside": True}], "bytes": 5_000_000}
+    text = parsed_without_figures(report).text
+    assert "sha256 " + "0123456789abcdef" * 4 in text
+    assert "path folder/garden.ply" in text
+    assert "deep" in text
+    assert "5 MB (5,000,000 bytes)" in text
+    assert "processor some processor" in text
+    assert "views c lpips alex" in text
+
+
+def test_reports_without_the_optional_parts() -> None:
+    report = sample_report()
+    report.update(held_out=None, approximations=None, bought=None, findings=[], seconds_by_part={})
+    report["plan"] = {"decisions": [], "prediction": None, "measured": {"seconds": None, "peak_bytes": 1}}
+    for record in report["history"]:
+        del record["memory_bytes"], record["parts"]
+    page = parsed(report)
+    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss", "split"]
+    assert "Nothing extreme was found." in page.text
+    assert "What error the time bought" not in page.text
+
+
+def test_held_out_views_without_numbers() -> None:
+    report = sample_report()
+    for moment in report["held_out"]["moments"]:
+        moment["consistency"] = {
+            "short": {"gap": 1, "pairs": 0, "compared": 0.0, "rmse": None, "lpips": None},
+            "long": None,
+        }
+        moment["gram_relative"] = math.nan
+    report["approximations"]["moments"] = []
+    report["bought"].update(reached=[], last_tenth=None)
+    page = parsed(report)
+    assert "consistency" not in [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
+    assert "They were not compared with the exact gradient." in page.text
+    report["held_out"]["moments"] = []
+    parsed(report)
+
+
+@pytest.mark.parametrize(("coarse", "sos"), [(1, 0), (0, 1), (1, 1), (0, 2), (3, 0)])
+def test_short_histories(coarse: int, sos: int) -> None:
+    page = parsed(losses_alone(coarse, sos))
+    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss", "split"]
+    styles = [attributes.get("style") or "" for tag, attributes in page.elements if tag == "use"]
+    marks = [style for style in styles if re.fullmatch(r"fill: (var\([^)]*\)); stroke: \1", style)]
+    assert bool(marks) == (1 in (coarse, sos))  # a single step is a mark: no line would show it
+
+
+def test_no_step_at_all() -> None:
+    report = sample_report(0, 0)
+    page = parsed(report)
+    assert "No step was made." in page.text
+    assert page.drawings == []
+    assert "No time was measured." in page.text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "where"), [(math.nan, "one"), (0.0, "all"), (math.nan, "all"), (math.inf, "all"), (-1.0, "all")]
+)
+def test_losses_that_a_logarithmic_axis_cannot_show(wrong: float, where: str) -> None:
+    report = losses_alone()
+    for record in report["history"][:1] if where == "one" else report["history"]:
+        record.update(loss=wrong, relative=wrong)
+        for terms in record["scales"].values():
+            terms.update(dict.fromkeys(terms, wrong))
+    report["loss"]["relative"] = wrong
+    count = {"one": 1, "all": 6 + 2 * 12}[where]
+    assert f"Not drawn: {count} of 30 values" in parsed(report).text
+
+
+def test_loss_that_starts_at_zero() -> None:
+    report = losses_alone()
+    for terms in report["loss"]["before"]["scales"].values():
+        terms["total"] = 0.0
+    parsed(report)
+
+
+@pytest.mark.parametrize("size", [1e-320, 1e-200, 1e200, 1e308])
+def test_extreme_losses(size: float) -> None:
+    report = losses_alone()
+    for index, record in enumerate(report["history"]):
+        record.update(loss=size, relative=size if index % 2 else 1.0)
+        for terms in record["scales"].values():
+            terms.update(dict.fromkeys(terms, size))
+    parsed(report)
+
+
+def test_long_history_stays_small() -> None:
+    report = sample_report(10_000, 10_000, scales=4)
+    page = parsed(report)
+    assert len(page.html.encode()) < 1_500_000  # leaves as much for the sheet
+    points = [attributes["d"] or "" for tag, attributes in page.elements if tag == "path"]
+    assert max(path.count("L") for path in points) < 2 * PLACES + 10
+
+
+def test_thinning_keeps_range_and_mean() -> None:
+    random = np.random.default_rng(1)
+    x = np.arange(1.0, 20_001.0)
+    values = np.exp(random.normal(size=len(x)))
+    line = thinned(x, values, 25, math.log(2e4) / PLACES)
+    assert len(line.x) <= PLACES + 1
+    assert (np.diff(line.x) > 0).all()
+    assert line.low.min() == values.min()
+    assert line.high.max() == values.max()
+    assert ((line.low <= line.high) & (line.x >= 1) & (line.x <= 2e4)).all()
+    places = np.floor(np.log(x) / (math.log(2e4) / PLACES))
+    smooth = running_mean(values, 25)
+    wanted = [math.exp(np.log(smooth[places == place]).mean()) for place in np.unique(places)]
+    np.testing.assert_allclose(line.mean, wanted, rtol=1e-10)
+
+
+def test_thinning_leaves_far_points_as_they_are() -> None:
+    x, values = np.array([1.0, 2.0, 4.0, 8.0]), np.array([4.0, math.nan, 2.0, 0.0])
+    line = thinned(x, values, 1, 0.01)
+    np.testing.assert_allclose(line.x, [1, 4])
+    for drawn in (line.mean, line.low, line.high):
+        np.testing.assert_allclose(drawn, [4, 2])
+
+
+def test_page_of_a_real_job(vgg16_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
+    stylizer = Stylizer(
+        ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=vgg16_weights
+    )
+    before = stylizer.evaluate(stylizer.evaluation_views)
+    stopped = run(stylizer)
+    sources = Sources(tmp_path / "ball.ply", 0, Path("style.png"), Path("cameras.json"), None, vgg16_weights)
+    after = stylizer.evaluate(stylizer.evaluation_views)
+    report = json.loads(json.dumps(build_report(stylizer, sources, stopped, before, after)))
+    (tmp_path / "sheet.jpg").write_bytes(sample_sheet())
+    write_page(tmp_path / "report.html", report, tmp_path / "sheet.jpg")
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    page.assert_self_contained()
+    assert "ball.ply in the style of style.png" in page.text
+    assert {decision["reason"] for decision in report["plan"]["decisions"]} <= set(page.cells)
+    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"][:2] == ["loss", "split"]
+
+
+def test_a_page_that_cannot_be_written_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        write_page(tmp_path / "missing" / "page.html", sample_report(0, 0), None)
+    with pytest.raises(OutputError, match="contact sheet"):
+        write_page(tmp_path / "page.html", sample_report(0, 0), tmp_path / "no.jpg")
+    assert list(tmp_path.iterdir()) == []

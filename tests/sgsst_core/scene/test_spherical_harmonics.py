@@ -1,0 +1,149 @@
+"""Spherical harmonics: the basis against its definition, the clamp and its gradient, far-off worlds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import SH_C0
+from sgsst_core.scene.spherical_harmonics import (
+    basis,
+    rest_colours,
+    view_colours,
+    view_colours_gradient,
+    view_directions,
+)
+from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
+
+
+def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
+    """Directions and weights of a product quadrature that is exact for these polynomials."""
+    step = 2 * math.pi / around
+    x, w = torch.from_numpy(_gauss(polar)[0]), torch.from_numpy(_gauss(polar)[1])
+    angle = torch.arange(around, dtype=torch.float64) * step
+    ring = (1 - x * x).sqrt()
+    directions = torch.stack(
+        [
+            (ring[:, None] * angle.cos()).flatten(),
+            (ring[:, None] * angle.sin()).flatten(),
+            x[:, None].expand(-1, around).flatten(),
+        ],
+        dim=-1,
+    )
+    return directions, (w[:, None] * step).expand(-1, around).flatten()
+
+
+def _gauss(count: int) -> tuple:
+    import numpy as np
+
+    return np.polynomial.legendre.leggauss(count)
+
+
+def test_basis_is_orthonormal() -> None:
+    directions, weights = sphere()
+    values = torch.cat([torch.full((len(directions), 1), SH_C0, dtype=torch.float64), basis(directions, 3)], dim=1)
+    products = values.T @ (weights[:, None] * values)
+    assert torch.allclose(products, torch.eye(16, dtype=torch.float64), atol=1e-12)
+
+
+def test_basis_has_the_signs_and_the_order_of_3dgs_files() -> None:
+    # Evaluated by hand at (x, y, z) = (2, 3, 6) / 7 with the tabulated constants of the real harmonics.
+    x, y, z = 2 / 7, 3 / 7, 6 / 7
+    expected = [
+        -0.48860251190292 * y,
+        0.48860251190292 * z,
+        -0.48860251190292 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    actual = basis(torch.tensor([x, y, z], dtype=torch.float64), 3)
+    assert torch.allclose(actual, torch.tensor(expected, dtype=torch.float64), atol=1e-14)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rest_colours_of_a_degree_use_only_its_coefficients(degree: int) -> None:
+    scene, view = cloud(50, degree=3), camera(pose=turned_pose())
+    count = (degree + 1) ** 2 - 1
+    alone = rest_colours(scene.sh_rest[:, :count], scene.means, view)
+    assert torch.equal(rest_colours(scene.sh_rest, scene.means, view, degree=degree), alone)
+    values = basis(view_directions(scene.means, view.centre), degree)
+    expected = (values[:, :, None] * scene.sh_rest[:, :count].double()).sum(1)
+    assert alone.dtype == torch.float32
+    assert torch.allclose(alone.double(), expected, atol=1e-6)
+    assert degree > 0 or not alone.any()
+
+
+def test_a_world_moved_far_away_keeps_its_colours() -> None:
+    scene, view = cloud(50, degree=3), camera(pose=turned_pose())
+    scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that moving it by 1e6 is exact
+    offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
+    moved_pose = view.world_to_camera.clone()
+    moved_pose[:3, 3] -= moved_pose[:3, :3] @ offset
+    moved = rest_colours(scene.sh_rest, scene.means + offset.float(), replace(view, world_to_camera=moved_pose))
+    assert torch.allclose(moved, rest_colours(scene.sh_rest, scene.means, view), atol=1e-5)
+
+
+def test_directions_of_extreme_length_are_unit_or_zero() -> None:
+    means = torch.tensor([[0.0, 0, 0], [1e-38, 0, 0], [1e38, 1e38, 0], [0, 0, -2.0]])
+    directions = view_directions(means, torch.zeros(3, dtype=torch.float64))
+    assert directions[0].tolist() == [0, 0, 0]
+    assert torch.allclose(directions[1:].norm(dim=-1), torch.ones(3, dtype=torch.float64), atol=1e-12)
+
+
+def test_colours_are_clamped_and_the_gradient_follows() -> None:
+    generator = torch.Generator().manual_seed(0)
+    sh_dc = 3 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    rest = torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    sh_dc.requires_grad_()
+    colours = view_colours(sh_dc, rest)
+    assert float(colours.detach().min()) == 0
+    assert float(colours.detach().max()) > 1
+    assert torch.autograd.gradcheck(lambda dc: view_colours(dc, rest), (sh_dc,))
+    gradient = torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    (expected,) = torch.autograd.grad(colours, sh_dc, gradient)
+    assert torch.allclose(view_colours_gradient(gradient, colours.detach()), expected, atol=1e-15)
+
+
+def test_revived_colours_only_come_back() -> None:
+    """Where the clamp holds a colour at 0, a gradient that would raise it passes, one that would lower it does not."""
+    colours = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
+    gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
+    found = view_colours_gradient(gradient, colours, revive=True)
+    torch.testing.assert_close(found, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
+
+
+def test_dark_colours_come_back_when_revived() -> None:
+    """Descent on |c - 0.6|^2 from far below 0: stuck without, at its target with."""
+    ends = []
+    for revive in (False, True):
+        sh_dc = torch.full((1, 3), -4.0)
+        for _ in range(400):
+            colours = view_colours(sh_dc, torch.zeros(1, 3))
+            sh_dc -= view_colours_gradient(2 * (colours - 0.6), colours, revive=revive)
+        ends.append(view_colours(sh_dc, torch.zeros(1, 3)))
+    assert bool((ends[0] == 0).all())
+    torch.testing.assert_close(ends[1], torch.full((1, 3), 0.6), rtol=1e-4, atol=0)
+
+
+def test_impossible_coefficients_are_refused() -> None:
+    scene, view = cloud(5, degree=1), camera()
+    with pytest.raises(ValueError, match="4 coefficients"):
+        rest_colours(torch.zeros(5, 4, 3), scene.means, view)
+    with pytest.raises(ValueError, match="degree 2 asked"):
+        rest_colours(scene.sh_rest, scene.means, view, degree=2)
+    with pytest.raises(ValueError, match="degree 4"):
+        basis(torch.zeros(1, 3), 4)

@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from sgsst_core.errors import CheckpointError, OutputError
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.terms import LossTerms
+from sgsst_core.planning.planner import Decision, Plan, Prediction
+from sgsst_core.planning.survey import Survey
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.checkpoint import (
+    Checkpoint,
+    Checkpoints,
+    fingerprint,
+    load_checkpoint,
+    save_checkpoint,
+    versions,
+)
+from sgsst_core.stylizing.stylizer import StepRecord, StylizerState
+from tests.small_scenes import cameras, style, wall
+
+
+@pytest.fixture
+def state() -> StylizerState:
+    generator = torch.Generator().manual_seed(7)
+    terms = {0: LossTerms(1.5, 2.5e-30, 1 / 3, 0.0), 1: LossTerms(1e300, 0.1, 0.2, 0.3)}
+    return StylizerState(
+        sh_dc=torch.randn(5, 3, generator=generator),
+        first_moment=torch.randn(5, 3, generator=generator),
+        second_moment=torch.rand(5, 3, generator=generator) * 1e-38,
+        step=2,
+        seconds=0.1 + 0.2,
+        generator=generator.get_state(),
+        queue=[4, 0, 2],
+        history=[
+            StepRecord(1, "coarse", 1, 0.1, 3.0, {1: terms[1]}, {"render": 0.1}, 10**10),
+            StepRecord(2, "sos", 3, 0.3, 4.0, terms, {"render": 0.2, "loss": 1 / 3}, 10**9),
+        ],
+        seconds_by_part={"render": 0.1},
+        memory=12345,
+        measured=[{"step": 0, "held_out": None, "approximation": {"cosine": 1 / 3}}],
+    )
+
+
+@pytest.fixture
+def kept(state: StylizerState) -> Checkpoint:
+    seen = torch.tensor([True, True, False, True, True])
+    looked = Survey(torch.rand(5, dtype=torch.float64), [0, 2], [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)], 1 / 3)
+    plan = Plan(
+        survey=looked,
+        optimised=seen,
+        seen=seen,
+        covered=[0, 2],
+        weighted=True,
+        steps_coarse=7,
+        kept_weights="half",
+        ranks=2,
+        decisions=[Decision("item", "decision", "reason", seconds=0.1, bytes=3)],
+        prediction=Prediction(0.1, 0.2, 3),
+    )
+    before = {0: LossTerms(1.0, 2.0, 1 / 3, 0.0)}
+    return Checkpoint(state, plan, 3, before, "run", versions())
+
+
+def assert_same(expected: object, found: object) -> None:
+    """Equal, tensors to the bit, field by field."""
+    assert type(expected) is type(found)
+    for name in type(expected).__dataclass_fields__:  # type: ignore[attr-defined]
+        one, other = getattr(expected, name), getattr(found, name)
+        if isinstance(one, torch.Tensor):
+            assert one.dtype == other.dtype, name
+            assert torch.equal(one, other), name
+        elif isinstance(one, StylizerState | Plan | Survey):
+            assert_same(one, other)
+        else:
+            assert one == other, name
+
+
+def test_everything_comes_back_exactly(kept: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", kept, "job")
+    loaded = load_checkpoint(tmp_path / "c", "job")
+    assert_same(kept, loaded)
+    torch.Generator().set_state(loaded.state.generator)
+
+
+def flipped(data: bytes, at: int) -> bytes:
+    """One bit of the data is another one."""
+    return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[: len(data) // 2],
+        lambda data: data[:-1],
+        lambda data: b"",
+        lambda data: b"no checkpoint at all",
+        lambda data: b"\xff" * 8 + data[8:],
+        lambda data: flipped(data, len(data) - 10),
+        lambda data: flipped(data, data.index(b'"seconds"') + 15),
+        lambda data: data.replace(b'"step":"2"', b'"step":"3"'),
+    ],
+)
+def test_a_damaged_file_is_refused(kept: Checkpoint, tmp_path: Path, damage: Any) -> None:
+    path = tmp_path / "c"
+    save_checkpoint(path, kept, "job")
+    before = path.read_bytes()
+    path.write_bytes(damage(before))
+    assert path.read_bytes() != before
+    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+        load_checkpoint(path, "job")
+
+
+def test_the_last_two_are_kept(kept: Checkpoint, tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
+    for step in (1, 2, 3):
+        checkpoints.save(replace(kept, state=replace(kept.state, step=step)), "job")
+    assert len(list(tmp_path.iterdir())) == 2
+    assert load_checkpoint(checkpoints.latest, "job").state.step == 3
+    assert load_checkpoint(checkpoints.previous, "job").state.step == 2
+    checkpoints.remove()
+    assert not checkpoints.exist
+
+
+@pytest.mark.parametrize("spoil", ["truncated", "missing", "foreign"])
+def test_the_one_before_takes_the_place_of_one_that_cannot_be_used(
+    kept: Checkpoint, tmp_path: Path, spoil: str
+) -> None:
+    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
+    checkpoints.save(kept, "job")
+    checkpoints.save(replace(kept, state=replace(kept.state, step=3)), "job")
+    if spoil == "truncated":
+        checkpoints.latest.write_bytes(checkpoints.latest.read_bytes()[:1000])
+    elif spoil == "missing":
+        checkpoints.latest.unlink()
+    else:
+        save_checkpoint(checkpoints.latest, kept, "another job")
+    warnings: list[str] = []
+    assert checkpoints.load("job", warnings.append).state.step == 2
+    assert len(warnings) == 1
+    assert "of step 2" in warnings[0]
+    with pytest.raises(CheckpointError, match="belongs to another job"):
+        checkpoints.load("yet another", warnings.append) if spoil == "foreign" else load_checkpoint(
+            checkpoints.previous, "yet another"
+        )
+
+
+def test_only_what_a_run_has_written_itself(kept: Checkpoint, tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
+    checkpoints.save(kept, "job")
+    assert checkpoints.load("job", pytest.fail, "run").run == "run"
+    with pytest.raises(CheckpointError, match="earlier run"):
+        checkpoints.load("job", pytest.fail, "another run")
+
+
+def test_a_full_disk_is_an_output_error_and_what_is_there_stays(kept: Checkpoint, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
+    checkpoints.save(kept, "job")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(OutputError, match="Free some space"):
+            checkpoints.save(kept, "job")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.iterdir()] == [checkpoints.latest.name]
+    assert load_checkpoint(checkpoints.latest, "job").state.step == 2
+
+
+def test_another_safetensors_file_is_refused(tmp_path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, tmp_path / "c")
+    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+        load_checkpoint(tmp_path / "c", "job")
+
+
+def test_another_job_and_a_missing_file_are_refused(kept: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", kept, "job")
+    with pytest.raises(CheckpointError, match="another job"):
+        load_checkpoint(tmp_path / "c", "other")
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        load_checkpoint(tmp_path / "missing", "job")
+
+
+def test_a_folder_that_is_not_there_is_an_output_error(kept: Checkpoint, tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        save_checkpoint(tmp_path / "missing" / "c", kept, "job")
+
+
+def test_fingerprint_tells_jobs_apart() -> None:
+    scene, views, image, settings = wall(), cameras(), style(), make_settings()
+    base = fingerprint(scene, views, image, settings, "w")
+    assert base == fingerprint(wall(), cameras(), style(), make_settings(), "w")
+    moved = scene.means.clone()
+    moved[-1, 2] = torch.nextafter(moved[-1, 2], torch.tensor(9.0))
+    others = [
+        fingerprint(replace(scene, means=moved), views, image, settings, "w"),
+        fingerprint(scene, views[::-1], image, settings, "w"),
+        fingerprint(scene, [replace(views[0], fx=65.0), *views[1:]], image, settings, "w"),
+        fingerprint(scene, views, image.transpose(0, 1), settings, "w"),
+        fingerprint(scene, views, image.reshape(80, 96, 3), settings, "w"),
+        fingerprint(scene, views, image, make_settings(seed=1), "w"),
+        fingerprint(scene, views, image, make_settings(background=(1, 1, 1)), "w"),
+        fingerprint(scene, views, image, settings, "v"),
+        fingerprint(scene, views, image, settings, "w", "photos"),
+    ]
+    assert len({base, *others}) == len(others) + 1
+
+
+def test_fingerprint_leaves_budgets_free() -> None:
+    scene, views, image = wall(), cameras(), style()
+    free = make_settings(max_seconds=3, memory_limit=10**9)
+    assert fingerprint(scene, views, image, free, "w") == fingerprint(scene, views, image, make_settings(), "w")

@@ -1,0 +1,41 @@
+"""The whole method on real scenes: the loss falls in every scale, and on views that were held out."""
+
+import pytest
+
+from sgsst_core import Stylizer, make_settings, run
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.scene.camera import orbit, resized, spread
+
+SIDE = 200
+
+
+def cameras_of(folder, scene, count):
+    if (folder / "cameras.json").exists():
+        return [resized(camera, SIDE) for camera in spread(read_cameras(folder / "cameras.json"), count)]
+    return orbit(scene, count, width=150, height=SIDE)
+
+
+@pytest.mark.parametrize("name", ["biker", "snowmiku_plush"])
+def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data, vgg16_weights, name):
+    folder = shared_data / "scenes" / name
+    scene = read_scene(folder / "point_cloud.ply").scene
+    cameras = cameras_of(folder, scene, 12)
+    style = load_image(shared_data / "styles" / "starry_night.jpg")
+    settings = make_settings(
+        steps_coarse=10, steps_sos=50, learning_rate=0.2, learning_rate_end=0.05, coarsest_side=100
+    )
+    chosen = [camera for index, camera in enumerate(cameras) if index % 3 != 1]
+    training = Stylizer(scene, chosen, style, settings, weights=vgg16_weights)
+    held_out = Stylizer(scene, cameras[1::3], style, settings, weights=vgg16_weights)
+
+    before = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, held_out)]
+    assert run(training) == "finished"
+    held_out.set_colours(training.stylized())
+    after = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, held_out)]
+    for first, last, bound in zip(before, after, (0.5, 0.75), strict=True):
+        assert set(first) == {0, 1}
+        for scale, terms in first.items():
+            print(f"{name}, scale {scale}: {last[scale].total / terms.total:.3f} of the loss at the start")
+            assert last[scale].total < bound * terms.total

@@ -1,0 +1,162 @@
+"""Faults at chosen places of a rank: real signals to real processes, at a moment that can be repeated."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import psutil
+
+from sgsst_core.settings import make_settings
+from tests.small_scenes import wall, write_files
+from worker.job import SceneRequest, StylizeRequest
+from worker.ranks.rank import RankProcess, Task
+
+Place = Literal[
+    "render", "loss", "optimiser", "gather_rows", "scatter_rows", "sum", "merge_statistics", "gather", "checkpoint"
+]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What happens to a rank, once.
+
+    Attributes:
+        rank: to which.
+        place: in which function.
+        call: at its so-manieth call.
+        what: signal that the rank gets; "full" for a disk that takes no more than a few bytes.
+        delay: seconds from the beginning of the call on.
+    """
+
+    rank: int
+    place: Place
+    call: int
+    what: Literal["SIGKILL", "SIGSTOP", "full"]
+    delay: float = 0.0
+
+    def write(self, request: StylizeRequest) -> None:
+        """Leave it where `FaultyRank` looks for it."""
+        _file(request).parent.mkdir(parents=True, exist_ok=True)
+        _file(request).write_text(json.dumps(asdict(self)))
+
+    def arm(self, request: StylizeRequest) -> None:
+        """Make it happen in this process."""
+        owner, name = _places()[self.place]
+        original: Callable[..., Any] = getattr(owner, name)
+        calls = 0
+
+        def wrapped(*arguments: Any, **options: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls != self.call:
+                return original(*arguments, **options)
+            _file(request).rename(_fired(request))  # the next attempt is left alone
+            os.utime(_fired(request))  # now: a file keeps its time under another name
+            if self.what == "full":
+                with _full_disk():
+                    return original(*arguments, **options)
+            threading.Thread(target=self._signal, daemon=True).start()
+            time.sleep(0)
+            return original(*arguments, **options)
+
+        setattr(owner, name, wrapped)
+
+    def _signal(self) -> None:
+        time.sleep(self.delay)
+        os.kill(os.getpid(), getattr(signal, self.what))
+
+
+class FaultyRank(RankProcess):
+    """A rank to which the fault that lies beside its output happens."""
+
+    def _work(self, task: Task) -> None:
+        if _file(task.request).exists():
+            fault = Fault(**json.loads(_file(task.request).read_text()))
+            if fault.rank == task.rank:
+                fault.arm(task.request)
+        super()._work(task)
+
+
+def fired(request: StylizeRequest) -> float | None:
+    """When the fault happened, seconds since the epoch; None where it has not."""
+    path = _fired(request)
+    return path.stat().st_mtime if path.exists() else None
+
+
+def forget(request: StylizeRequest) -> None:
+    """As if nothing had happened yet."""
+    _fired(request).unlink(missing_ok=True)
+
+
+def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
+    """A job of tiny views in which every rank takes part."""
+    inputs = folder / "inputs"
+    inputs.mkdir(parents=True, exist_ok=True)
+    ply, cameras, style = write_files(inputs, wall())
+    options = {"steps_sos": steps, "early_stop": False, "keep": ("ranks",), "rebalance": False, **settings}
+    source = SceneRequest(ply, cameras, None, "-y", None, None, 0.2, False)
+    return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
+
+
+def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
+    """Files of shared memory that processes have mapped."""
+    found = set()
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            found |= {Path(entry.path) for entry in process.memory_maps() if entry.path.startswith("/dev/shm/")}
+    return found
+
+
+def folders(processes: Iterable[psutil.Process]) -> set[Path]:
+    """Ray's folders that processes name in their commands."""
+    words = []
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            words += process.cmdline()
+    return {Path("/", *Path(word).parts[1:3]) for word in words if word.startswith("/tmp/sgsst-ray-")}
+
+
+def _file(request: StylizeRequest) -> Path:
+    return request.out.with_suffix(".fault")
+
+
+def _fired(request: StylizeRequest) -> Path:
+    return request.out.with_suffix(".fired")
+
+
+def _places() -> dict[str, tuple[Any, str]]:
+    from sgsst_core.loss.sos import SosLoss
+    from sgsst_core.stylizing import checkpoint
+    from sgsst_core.stylizing.stylizer import Stylizer
+    from sgsst_core.stylizing.views import Views
+    from worker.ranks.process_group import ProcessGroupCollectives
+
+    exchanges = ("gather_rows", "scatter_rows", "sum", "merge_statistics", "gather")
+    return {
+        "render": (Views, "render"),
+        "loss": (SosLoss, "evaluate"),
+        "optimiser": (Stylizer, "_update"),
+        "checkpoint": (checkpoint, "_write"),
+        **{name: (ProcessGroupCollectives, name) for name in exchanges},
+    }
+
+
+class _full_disk:  # noqa: N801 (reads as the state that it makes)
+    """Files of this process can have no more than a few bytes: the system says so as it does where a disk is full."""
+
+    def __enter__(self) -> None:
+        self._before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, self._before[1]))
+
+    def __exit__(self, *error: object) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, self._before)

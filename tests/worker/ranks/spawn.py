@@ -1,0 +1,56 @@
+"""Runs functions on several gloo ranks: real processes of one thread each, kept from test to test."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import multiprocessing
+import socket
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from datetime import timedelta
+from typing import Any
+
+import torch
+
+from worker.ranks.process_group import process_group
+
+MOST_RANKS = 4
+
+
+def on_ranks(size: int, function: Callable[..., Any], *arguments: Any, timeout: float = 60.0) -> list[Any]:
+    """What function(collectives, *arguments) returns on each rank; its first error is raised here.
+
+    The function and its arguments must be picklable. Ranks give each other up after `timeout` seconds.
+    """
+    address = f"127.0.0.1:{free_port()}"
+    futures = [_pool().submit(_run, rank, size, address, timeout, function, arguments) for rank in range(size)]
+    return [_result(future) for future in futures]
+
+
+@functools.cache
+def _pool() -> ProcessPoolExecutor:
+    # A rank waits for the others inside its task, so that no process takes two of them.
+    pool = ProcessPoolExecutor(MOST_RANKS, mp_context=multiprocessing.get_context("spawn"))
+    atexit.register(pool.shutdown, cancel_futures=True)
+    return pool
+
+
+def _run(
+    rank: int, size: int, address: str, timeout: float, function: Callable[..., Any], arguments: tuple[Any, ...]
+) -> Any:
+    torch.set_num_threads(1)
+    with process_group(rank, size, address, timeout=timedelta(seconds=timeout)) as collectives:
+        return function(collectives, *arguments)
+
+
+def _result(future: Future[Any]) -> Any:
+    return future.result(timeout=300)
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens at."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
+        return port

@@ -1,0 +1,265 @@
+"""Jobs on real ranks that are killed, stopped, cut off and cancelled: the result is that of an undisturbed run."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import psutil
+import pytest
+from PIL import Image
+
+from sgsst_core.errors import SceneError
+from sgsst_core.stylizing.loop import Progress
+from sgsst_core.stylizing.stylizer import mean_loss
+from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, shared_memory, small_request
+from worker.job import Prepared, StylizeRequest, execute, prepare
+from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
+from worker.ranks.cluster import Cluster
+
+pytestmark = [
+    pytest.mark.usefixtures("one_thread", "vgg16_weights"),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent"),
+]
+
+ROOT = Path(__file__).resolve().parents[3]
+STEPS = 24
+#: Largest relative difference of a loss to an undisturbed run's.
+TOLERANCE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *([before] if before else [])])
+    os.environ.pop("RAY_ADDRESS", None)
+    with Cluster(2) as opened:
+        yield opened
+    if before is None:
+        del os.environ["PYTHONPATH"]
+    else:
+        os.environ["PYTHONPATH"] = before
+
+
+@dataclass
+class Heard:
+    """What a job told, and when it is asked to stop."""
+
+    stop_at: int | None = None
+    prepared: list[Prepared] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)
+    happened: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    previews: list[Path] = field(default_factory=list)
+
+    def listener(self) -> Listener:
+        def progress(current: Progress) -> None:
+            self.steps.append(current.step)
+
+        def stop() -> bool:
+            return self.stop_at is not None and bool(self.steps) and self.steps[-1] >= self.stop_at
+
+        return Listener(
+            self.prepared.append, progress, self.happened.append, self.warnings.append, stop, self.previews.append
+        )
+
+
+def run(
+    request: StylizeRequest, cluster: Cluster, heard: Heard | None = None, fault: Fault | None = None, workers: int = 2
+) -> RanksResult:
+    """A job on ranks to which something may happen; checkpoints after nearly every step."""
+    if fault is not None:
+        fault.write(request)
+    options = WorkerOptions(
+        rank_timeout=5.0,
+        checkpoint_seconds=0.2,
+        preview_folder=request.out.with_name("previews"),
+        preview_seconds=0.1,
+        actor=FaultyRank,
+    )
+    return stylize_on_ranks(request, workers, (heard or Heard()).listener(), options=options, cluster=cluster)
+
+
+def loss_of(ended: RanksResult) -> float:
+    """On the evaluation views, at the end."""
+    assert ended.result is not None
+    return mean_loss(ended.result.after)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> tuple[float, bytes]:
+    """Loss and file of a run on two ranks to which nothing happens."""
+    request = small_request(tmp_path_factory.mktemp("undisturbed"), STEPS)
+    heard = Heard()
+    ended = run(request, cluster, heard)
+    assert ended.attempts == []
+    assert heard.steps[-1] == ended.total == STEPS
+    report = json.loads(request.out.with_name("s.report.json").read_text())
+    assert report["workers"]["used"] == 2
+    assert len(report["workers"]["ranks"]) == 2
+    assert heard.previews
+    for path in heard.previews:
+        with Image.open(path) as picture:
+            assert picture.format == "JPEG"
+    return loss_of(ended), request.out.read_bytes()
+
+
+def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path: Path) -> None:
+    job = prepare(small_request(tmp_path, STEPS))
+    alone = execute(job, progress=lambda step: None, stop=lambda: False, warn=pytest.fail)
+    assert undisturbed[0] == pytest.approx(mean_loss(alone.after), rel=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (Fault(1, "gather_rows", 30, "SIGKILL", 0.001), "was killed"),
+        (Fault(0, "checkpoint", 4, "SIGKILL"), "was killed"),
+        (Fault(1, "render", 25, "SIGSTOP"), "not answered"),
+    ],
+)
+def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
+    fault: Fault, reason: str, undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
+) -> None:
+    request, heard = small_request(tmp_path, STEPS), Heard()
+    ended = run(request, cluster, heard, fault)
+    assert fired(request) is not None
+    assert [reason in attempt.reason for attempt in ended.attempts] == [True]
+    lost = ended.attempts[0]
+    assert 0 < lost.saved_step <= lost.last_step
+    assert len(heard.prepared) == 1
+    assert "Going on from step" in heard.happened[-1]
+    # Two ranks again: the same sums in the same order, and so the same file.
+    assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
+    assert request.out.read_bytes() == undisturbed[1]
+    report = json.loads(request.out.with_name("s.report.json").read_text())
+    assert [entry["reason"] for entry in report["workers"]["attempts"]] == [lost.reason]
+    assert report["workers"]["seconds_lost"] > 0
+    assert len(report["history"]) == STEPS
+    assert {path.suffix for path in request.out.parent.iterdir()} & {".safetensors", ".part"} == set()
+
+
+def test_ray_itself_may_be_killed(undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path) -> None:
+    request, heard = small_request(tmp_path, STEPS), Heard()
+    killed: list[int] = []
+
+    def stop() -> bool:
+        if heard.steps and not killed:
+            raylet = next(child for child in psutil.Process().children() if child.name() == "raylet")
+            killed.append(raylet.pid)
+            raylet.kill()
+        return False
+
+    options = WorkerOptions(rank_timeout=5.0, checkpoint_seconds=0.2)
+    ended = stylize_on_ranks(request, 2, replace(heard.listener(), stop=stop), options=options, cluster=cluster)
+    assert killed
+    assert len(ended.attempts) == 1
+    assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
+
+
+def test_a_full_disk_costs_a_checkpoint_and_a_cancelled_job_goes_on(
+    undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
+) -> None:
+    request, heard = small_request(tmp_path, STEPS), Heard(stop_at=8)
+    ended = run(request, cluster, heard, Fault(0, "checkpoint", 1, "full"))
+    assert ["No checkpoint could be written" in line for line in heard.warnings] == [True]
+    assert ended.interrupted
+    assert ended.attempts == []
+    assert 8 <= ended.step < STEPS
+    assert ended.saved == ended.step
+    assert not request.out.exists()
+    heard = Heard()
+    ended = run(replace(request, resume=True), cluster, heard)
+    assert heard.prepared[0].step > 0
+    assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
+
+
+def test_a_bad_input_is_told_at_once_and_not_tried_again(cluster: Cluster, tmp_path: Path) -> None:
+    request, heard = small_request(tmp_path, STEPS), Heard()
+    request.source.scene.write_bytes(request.source.scene.read_bytes()[:-1000])
+    with pytest.raises(SceneError, match="truncated"):
+        run(request, cluster, heard)
+    assert heard.happened == []
+    assert not request.out.parent.exists()
+
+
+# --- the command ---------------------------------------------------------------------------------------------------
+
+
+def command(request: StylizeRequest, *options: str) -> list[str]:
+    """`sgsst stylize` of the same job."""
+    source = request.source
+    files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.style)]
+    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--keep-everything"]
+    return ["stylize", *files, "--out", str(request.out), *settings, "--workers", "2", *options]
+
+
+def start(arguments: list[str]) -> subprocess.Popen[str]:
+    """The command in a process of its own, which has printed what was decided."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    environment.pop("RAY_ADDRESS", None)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "api.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("schedule"):
+            return process
+    raise AssertionError(process.communicate()[1])
+
+
+def left_of(process: psutil.Process) -> list[psutil.Process]:
+    """A process's children and theirs, with Ray's folder in their command or open files."""
+    return [child for child in process.children(recursive=True) if child.is_running()]
+
+
+def test_a_killed_driver_leaves_nothing_behind(tmp_path: Path) -> None:
+    process = start(command(small_request(tmp_path, STEPS)))
+    family = left_of(psutil.Process(process.pid))
+    used = folders(family)
+    assert any("FaultyRank" in child.name() or "RankProcess" in child.name() for child in family)
+    assert used
+    stopped = next(child for child in family if "RankProcess" in child.name())
+    stopped.suspend()
+    shared = shared_memory(family)
+    process.kill()
+    process.communicate()
+    _, alive = psutil.wait_procs(family, timeout=30)
+    assert alive == []
+    deadline = time.monotonic() + 30
+    while any(folder.exists() for folder in used) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(folder.exists() for folder in used)
+    assert not any(path.exists() for path in shared)
+
+
+def test_ctrl_c_saves_and_the_command_that_it_prints_goes_on(tmp_path: Path) -> None:
+    request = small_request(tmp_path, STEPS)
+    arguments = command(request, "--max-seconds", "3")
+    process = start(arguments)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it: to Ray's processes too
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 130, error
+    assert "Traceback" not in error
+    assert f"saved in {request.out.with_name('s.checkpoint.safetensors')}" in error
+    go_on = shlex.split(error.strip().splitlines()[-1])
+    assert go_on == ["sgsst", *arguments, "--resume"]
+    process = start(go_on[1:])
+    shown, error = process.communicate(timeout=240)
+    assert process.returncode == 0, error
+    assert "time was up" in shown
+    report = json.loads(request.out.with_name("s.report.json").read_text())
+    assert report["workers"]["asked"] == report["workers"]["used"] == 2

@@ -1,0 +1,215 @@
+"""Several ranks give the gradient, the loss and the run that one rank gives, whatever the division of the work."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.survey import survey
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.views import Views
+from tests.sgsst_core.pictures import picture, relative_error
+from tests.small_scenes import ball, cameras, style, wall
+from tests.worker.ranks.spawn import on_ranks
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+#: Largest relative error of the colour gradient against one rank's.
+BOUNDS = {torch.float32: 1e-5, torch.float64: 1e-9}
+
+
+def gradient(
+    collectives: Collectives,
+    scene: Scene,
+    camera: Camera,
+    dtype: torch.dtype,
+    tile_size: int | None,
+    speeds: tuple[float, ...] | None = None,
+    memory: int = 1 << 34,
+) -> tuple[Tensor, float, list[bool]]:
+    """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
+    network = FeatureNetwork(load_weights("vgg16"), (*STYLE_LAYERS, CONTENT_LAYER), dtype)
+    loss = SosLoss(network, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives)
+    loss.speeds = speeds or loss.speeds
+    rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
+    looked = survey(scene, [camera], rasterizer)
+    weighted = looked.uncovered_share > 0.01
+    views = Views(
+        scene,
+        [camera],
+        rasterizer,
+        loss,
+        covered=[0],
+        weighted=weighted,
+        regions=looked.regions if weighted else None,
+        collectives=collectives,
+    )
+    scales = range(loss.scale_count(camera.height, camera.width))
+    target = views.target(0, scales)
+    targets = loss.style_targets(picture(90, 110, seed=4, dtype=dtype), (camera.height, camera.width))
+    colours = views.colours(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
+    result = loss.evaluate(views.render(0, colours), targets, target, scales)
+    assert result.image_gradient is not None
+    assert target.share is not None
+    kept = loss.kept([tile.outer.pixels for tiles in target.share.tiles.values() for tile in tiles])
+    return views.gradient(0, result.image_gradient, colours), result.loss, kept
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize(
+    ("ranks", "width", "height", "tile_size", "scene"),
+    [
+        (2, 128, 96, None, wall(sh_degree=1)),
+        (3, 128, 96, 64, wall()),
+        (4, 101, 83, None, wall()),
+        (2, 150, 70, 48, ball()),
+        (4, 48, 36, None, wall()),  # fewer rows of raster tiles, and hardly more cells, than ranks
+        (4, 17, 15, None, wall()),  # one piece of work
+    ],
+)
+def test_gradient_is_that_of_one_rank(
+    dtype: torch.dtype, ranks: int, width: int, height: int, tile_size: int | None, scene: Scene
+) -> None:
+    camera = cameras(1, width, height)[0]
+    expected, loss, _ = gradient(ALONE, scene, camera, dtype, tile_size)
+    results = on_ranks(ranks, gradient, scene, camera, dtype, tile_size)
+    for found, found_loss, _ in results:
+        assert relative_error(found, expected) < BOUNDS[dtype]
+        assert found_loss == pytest.approx(loss, rel=BOUNDS[dtype])
+        assert torch.equal(found, results[0][0])
+
+
+def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() -> None:
+    scene, camera = wall(), cameras(1, 128, 96)[0]
+    expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
+    for found, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
+        assert relative_error(found, expected) < 1e-9
+        assert found_loss == pytest.approx(loss, rel=1e-9)
+
+
+def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
+    scene, camera = wall(), cameras(1, 128, 96)[0]
+    expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
+    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, 70 << 20)
+    assert set(results[0][2]) == {True, False}
+    for found, found_loss, _ in results:
+        assert relative_error(found, expected) < 1e-9
+        assert found_loss == pytest.approx(loss, rel=1e-9)
+
+
+def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str, Any]) -> dict[str, Any]:
+    """A whole run."""
+    settings = make_settings("standard", keep=("ranks",), coarsest_side=40, **values)
+    stylizer = Stylizer(
+        scene, cameras(views), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+    )
+    stopped = run(stylizer)
+    return {
+        "stopped": stopped,
+        "colours": stylizer.stylized(),
+        "losses": [record.loss for record in stylizer.history],
+        "views": [record.view for record in stylizer.history],
+        "after": stylizer.evaluate(stylizer.evaluation_views),
+        "plan": [decision.item for decision in stylizer.plan.decisions],
+    }
+
+
+@pytest.mark.parametrize("scene", [wall(sh_degree=1), ball()], ids=["wall", "ball"])
+def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(
+    scene: Scene, vgg16_weights: BackboneWeights
+) -> None:
+    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False}
+    alone = stylize(ALONE, scene, 3, values)
+    first, second = on_ranks(2, stylize, scene, 3, values)
+    assert torch.equal(first["colours"], second["colours"])
+    assert first["losses"] == second["losses"]
+    assert first["losses"][-1] == pytest.approx(alone["losses"][-1], rel=1e-3)
+    assert first["views"] == alone["views"]
+    assert "ranks" in first["plan"]
+    again = on_ranks(2, stylize, scene, 3, values)[0]
+    assert torch.equal(again["colours"], first["colours"])
+    assert again["losses"] == first["losses"]
+
+
+@pytest.mark.parametrize(("ranks", "views_per_step"), [(1, 2), (2, 2), (4, 2), (3, 2), (2, 4)])
+def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, views_per_step: int) -> None:
+    scene = wall()
+    values = {"steps_coarse": 2, "steps_sos": 4, "views_per_step": views_per_step, "learning_rate": 0.01}
+    expected = stylize(ALONE, scene, 5, values)
+    found = on_ranks(ranks, stylize, scene, 5, values) if ranks > 1 else [expected]
+    for result in found:
+        assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
+        assert result["views"] == expected["views"]
+        assert torch.equal(result["colours"], found[0]["colours"])
+    assert expected["losses"] != stylize(ALONE, scene, 5, {**values, "views_per_step": 1})["losses"]
+
+
+def one_view_a_step_by_hand(views: list[int]) -> Tensor:
+    scene = wall()
+    settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
+    stylizer = Stylizer(scene, cameras(5), style(), settings, weights=load_weights("vgg16"))
+    gradients = [stylizer.gradient(view, range(stylizer.scale_count(view)))[0] for view in views]
+    return torch.stack(gradients).mean(dim=0)
+
+
+def test_gradients_of_a_steps_views_are_averaged() -> None:
+    scene = wall()
+    settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3)
+    stylizer = Stylizer(scene, cameras(5), style(), settings, weights=load_weights("vgg16"))
+    order = Stylizer(scene, cameras(5), style(), settings, weights=load_weights("vgg16"))
+    views = [order._next_view() for _ in range(3)]
+    stylizer.run_step()
+    assert stylizer.sh_dc.grad is not None
+    assert relative_error(stylizer.sh_dc.grad, one_view_a_step_by_hand(views)) < 1e-6
+
+
+def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=20, keep=("ranks",), rebalance=rebalance)
+    stylizer = Stylizer(
+        wall(), cameras(2, 192, 144), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+    )
+    forward = stylizer.network.forward
+
+    def slowly(rgb: Tensor, **options: Any) -> Any:
+        started = time.perf_counter()
+        result = forward(rgb, **options)
+        time.sleep(4 * (time.perf_counter() - started))
+        return result
+
+    if collectives.rank == 1:
+        stylizer.network.forward = slowly  # type: ignore[method-assign]
+    before = stylizer.gradient(0, [0])[0]
+    colours = stylizer.sh_dc.detach().clone()
+    for _ in range(8):
+        stylizer.run_step()
+    speeds = stylizer.loss.speeds
+    with torch.no_grad():
+        stylizer.sh_dc.copy_(colours)
+    return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}
+
+
+def test_a_slow_rank_gets_less_to_do_and_the_gradient_stays() -> None:
+    first, second = on_ranks(2, run_beside_a_slow_rank, True)
+    assert first["speeds"] == second["speeds"]
+    assert first["speeds"][0] > 1.3 * first["speeds"][1]
+    assert relative_error(first["after"], first["before"]) < 1e-5
+    assert torch.equal(first["after"], second["after"])
+
+
+def test_work_is_not_shared_out_anew_where_that_is_not_wanted() -> None:
+    first, _ = on_ranks(2, run_beside_a_slow_rank, False)
+    assert first["speeds"] == (1.0, 1.0)
+    assert torch.equal(first["after"], first["before"])

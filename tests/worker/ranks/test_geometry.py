@@ -1,0 +1,100 @@
+"""The scene is read once on a machine, shared without a trace, and refused where there is no room for it."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+
+from sgsst_core.errors import SceneError, SceneTooLargeError
+from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.scene.gaussians import Scene
+from tests.small_scenes import wall
+from tests.worker.ranks.spawn import on_ranks
+from worker.ranks.geometry import read_shared_scene
+
+linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
+
+
+def digest(scene: Scene) -> str:
+    """Of all bits of a scene."""
+    return hashlib.sha256(b"".join(getattr(scene, field.name).numpy().tobytes() for field in fields(Scene))).hexdigest()
+
+
+def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool, int, int, int]:
+    """What a rank has of a scene: its digest, whether it read it, dropped rows, mappings; and what is left of it."""
+    file, reader = read_shared_scene(path, collectives, drop_invalid=drop)
+    maps = Path("/proc/self/maps").read_text().count("memfd:sgsst-scene")
+    file.scene.sh_dc[0] += 1.0  # a rank's own business
+    collectives.gather(None)
+    again = read_scene(path, drop_invalid=drop).scene.sh_dc
+    assert float((file.scene.sh_dc - again).abs().sum()) == pytest.approx(3.0)
+    file.scene.sh_dc[0] = again[0]
+    found, dropped = digest(file.scene), file.dropped
+    del file
+    gc.collect()
+    left = sum(
+        "memfd:sgsst-scene" in os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()
+    )
+    return found, reader, dropped, maps, left
+
+
+@linux
+@pytest.mark.parametrize("drop", [False, True])
+def test_one_rank_reads_and_all_have_the_same(tmp_path: Path, drop: bool) -> None:
+    scene = wall(sh_degree=1)
+    if drop:
+        scene.opacities[7] = float("nan")
+    write_scene(tmp_path / "scene.ply", scene)
+    found = on_ranks(3, shared, tmp_path / "scene.ply", drop)
+    alone = digest(read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene)
+    assert [rank[0] for rank in found] == [alone] * 3
+    assert [rank[1] for rank in found] == [True, False, False]
+    assert [rank[2] for rank in found] == [int(drop)] * 3
+    assert all(rank[3] >= 1 for rank in found), "not mapped"
+    assert [rank[4] for rank in found] == [0, 0, 0], "left behind"
+
+
+def refused(collectives: Collectives, path: Path) -> str:
+    """The error that a rank gets."""
+    with pytest.raises(SceneError) as caught:
+        read_shared_scene(path, collectives)
+    return str(caught.value)
+
+
+def test_what_the_reader_refuses_is_refused_everywhere(tmp_path: Path) -> None:
+    scene = wall()
+    scene.scales[3, 1] = float("nan")
+    write_scene(tmp_path / "scene.ply", scene)
+    messages = on_ranks(2, refused, tmp_path / "scene.ply")
+    assert messages[0] == messages[1]
+    assert "scale_1" in messages[0]
+
+
+def test_a_scene_that_no_memory_holds_is_refused_with_figures(tmp_path: Path) -> None:
+    """A billion Gaussians, in a file of as many bytes as they take; none of them is ever stored."""
+    path = tmp_path / "scene.ply"
+    write_scene(path, wall(sh_degree=3))
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    rows = len(wall())
+    count = 1_000_000_000
+    path.write_bytes(head.replace(f"vertex {rows}".encode(), f"vertex {count}".encode()) + end)
+    try:
+        os.truncate(path, path.stat().st_size + count * (len(body) // rows))
+    except OSError as error:
+        pytest.skip(f"no file of this size here: {error}")
+    with pytest.raises(SceneTooLargeError, match=r"1,000,000,000 Gaussians need \d+\.\d+ GB .* are free"):
+        read_shared_scene(path, ALONE)
+
+
+def test_alone_nothing_is_copied(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.ply", wall())
+    file, reader = read_shared_scene(tmp_path / "scene.ply", ALONE)
+    assert reader
+    assert torch.equal(file.scene.means, read_scene(tmp_path / "scene.ply").scene.means)

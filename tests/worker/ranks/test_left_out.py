@@ -1,0 +1,85 @@
+"""Ranks that the plan does without end at once; what they had is there for others."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from sgsst_core.stylizing.loop import Progress
+from tests.worker.ranks.faults import Fault, FaultyRank, fired, small_request
+from worker.ranks import cluster
+from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+
+pytestmark = [
+    pytest.mark.usefixtures("one_thread", "vgg16_weights"),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent"),
+]
+
+ROOT = Path(__file__).resolve().parents[3]
+STEPS = 16
+
+
+def ranks_that_run() -> int:
+    """Processes of ranks below this one."""
+    children = psutil.Process().children(recursive=True)
+    return sum("FaultyRank" in " ".join(child.cmdline()) for child in children if child.is_running())
+
+
+def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_path: Path) -> None:
+    request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
+    ranks_alive: list[int] = []
+    listener = Listener(progress=lambda now: ranks_alive.append(ranks_that_run()))
+    ended = stylize_on_ranks(request, 2, listener, options=WorkerOptions(actor=FaultyRank))
+    assert ended.step == STEPS
+    assert ranks_alive[-1] == 1
+
+
+def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray is told of two GPUs that are not there: it gives them out all the same, and ranks compute on the CPU."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # Ray looks when it is imported, which is earlier here than otherwise
+    monkeypatch.setenv("RAY_AUTH_TOKEN", cluster._SECRET)
+    import ray
+
+    start = ray.init
+
+    def with_gpus(**options: Any) -> Any:
+        gpus = len(os.environ["CUDA_VISIBLE_DEVICES"].split(","))
+        return start(**{**options, "num_gpus": gpus, "num_cpus": gpus})
+
+    monkeypatch.setattr(ray, "init", with_gpus)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")  # which faulty ranks import before they are told their threads
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
+    Fault(0, "optimiser", 10, "SIGKILL").write(request)
+    given_back: list[str] = []
+    happened: list[str] = []
+    ranks_alive: list[int] = []
+
+    def left_out(gpus: Sequence[str]) -> None:
+        given_back.extend(gpus)
+
+    def progress(now: Progress) -> None:
+        if given_back:
+            ranks_alive.append(ranks_that_run())
+
+    options = WorkerOptions(checkpoint_seconds=0.2, actor=FaultyRank)
+    listener = Listener(progress=progress, left_out=left_out, happened=happened.append)
+    ended = stylize_on_ranks(request, 2, listener, options=options)
+    assert fired(request) is not None
+    assert [attempt.ranks for attempt in ended.attempts] == [2], happened
+    assert "with 1 worker," in happened[-1]
+    assert ended.step == STEPS
+    assert ranks_alive
+    assert max(ranks_alive) == 1
+    assert len(given_back) == 1, "told once: the second attempt has no rank too many"
+    assert {*given_back, os.environ["CUDA_VISIBLE_DEVICES"]} == {"5", "7"}

@@ -1,0 +1,196 @@
+"""The exchanges over torch.distributed against what they are defined to give."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import RanksDriftedError, SceneError
+from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
+from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
+from sgsst_core.parallel.division import divide_rows
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.pictures import relative_error
+from tests.small_scenes import cameras, style, wall
+from tests.worker.ranks.spawn import on_ranks
+
+HEIGHT = 70
+
+
+def image(rank: int, rows: int = HEIGHT) -> Tensor:
+    return torch.randn(rows, 9, 3, generator=torch.Generator().manual_seed(rank))
+
+
+def exchange_rows(collectives: Collectives, covered: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    bands = divide_rows(HEIGHT, collectives.size, covered)
+    start, stop = bands[collectives.rank]
+    gathered = collectives.gather_rows(image(7)[start:stop], bands)
+    return gathered, collectives.scatter_rows(image(collectives.rank), bands)
+
+
+@pytest.mark.parametrize(("ranks", "covered"), [(2, (0, HEIGHT)), (3, (20, 41)), (4, (60, 64))])
+def test_rows_are_gathered_and_scattered(ranks: int, covered: tuple[int, int]) -> None:
+    results = on_ranks(ranks, exchange_rows, covered)
+    total = torch.stack([image(rank) for rank in range(ranks)]).sum(dim=0)
+    for gathered, _ in results:
+        assert torch.equal(gathered, image(7))
+    assert torch.allclose(torch.cat([own for _, own in results]), total, atol=1e-6)
+
+
+def features(rank: int) -> Tensor:
+    """Layer features with a mean 1e4 times their spread, a channel that is constant, and one that is dead."""
+    values = torch.randn(11 + 3 * rank, 7, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(rank))
+    values[..., 1] += 1e4
+    values[..., 2] = 3.7
+    values[..., 3] = 0.0
+    return values
+
+
+def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatistics, float]]:
+    parts = [LayerStatistics.zero(5)] if collectives.rank == empty else [layer_statistics(features(collectives.rank))]
+    waiting = [collectives.merge_statistics(parts, 0.5 * (turn + 1)) for turn in range(3)]
+    merged = [wait() for wait in waiting]
+    return [(statistics[0], number) for statistics, number in merged]
+
+
+@pytest.mark.parametrize("empty", [None, 0, 2])
+def test_statistics_are_merged_as_if_all_positions_were_on_one_rank(empty: int | None) -> None:
+    present = [features(rank).reshape(-1, 5) for rank in range(3) if rank != empty]
+    expected = layer_statistics_reference(torch.cat(present)[None])
+    for result in on_ranks(3, merge, empty):
+        for turn, (found, number) in enumerate(result):
+            assert number == pytest.approx(1.5 * (turn + 1))
+            assert float(found.count) == float(expected.count)
+            assert relative_error(found.mean, expected.mean) < 1e-14
+            assert relative_error(found.std(), expected.std()) < 1e-10
+            assert relative_error(found.gram(), expected.gram()) < 1e-12
+            assert float(found.std()[2]) < 1e-12
+            assert float(found.std()[3]) == 0.0
+
+
+def test_nothing_at_all_stays_nothing() -> None:
+    for statistics in on_ranks(2, merge_nothing):
+        assert statistics.empty
+        assert not statistics.centred.any()
+
+
+def merge_nothing(collectives: Collectives) -> LayerStatistics:
+    return collectives.merge_statistics([LayerStatistics.zero(4)], 0.0)()[0][0]
+
+
+def values(collectives: Collectives) -> dict[str, Any]:
+    own = collectives.split(2)
+    part = collectives.first(2)
+    return {
+        "gathered": collectives.gather(collectives.rank),
+        "from_first": collectives.from_first(lambda: f"made by {collectives.rank}"),
+        "same": same_on_all(collectives, 5),
+        "different": same_on_all(collectives, collectives.rank),
+        "split": (own.rank, own.size, own.gather(collectives.rank)),
+        "first": None if part is None else (part.rank, part.size, part.gather(collectives.rank)),
+        "sum": float(collectives.sum(torch.tensor([float(collectives.rank)]))),
+        "local": collectives.local_size,
+    }
+
+
+def test_values_and_groups() -> None:
+    results = on_ranks(4, values)
+    for rank, found in enumerate(results):
+        assert found["gathered"] == [0, 1, 2, 3]
+        assert found["from_first"] == "made by 0"
+        assert found["same"]
+        assert not found["different"]
+        assert found["split"] == (rank % 2, 2, [0, 1] if rank < 2 else [2, 3])
+        assert found["first"] == ((rank, 2, [0, 1]) if rank < 2 else None)
+        assert found["sum"] == 6.0
+        assert found["local"] == 4
+
+
+def fail_on_first(collectives: Collectives) -> str:
+    def make() -> str:
+        raise SceneError("scene.ply: is empty.")
+
+    try:
+        return collectives.from_first(make)
+    except SceneError as error:
+        return str(error)
+
+
+def test_an_error_of_the_first_rank_is_raised_on_all() -> None:
+    assert on_ranks(2, fail_on_first) == ["scene.ply: is empty."] * 2
+
+
+def drift(collectives: Collectives) -> str:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=60, keep=("ranks",), early_stop=False)
+    stylizer = Stylizer(wall(), cameras(1), style(), settings, weights=load_weights("vgg16"), collectives=collectives)
+    if collectives.rank == 1:
+        stylizer.sh_dc.data[3, 1] += 1e-6
+    try:
+        for _ in range(50):
+            stylizer.run_step()
+    except RanksDriftedError as error:
+        return str(error)
+    return ""
+
+
+def test_ranks_that_drift_apart_are_found(vgg16_weights: BackboneWeights) -> None:
+    for message in on_ranks(2, drift):
+        assert message.startswith("Step 50: the ranks' colours are no longer the same.")
+
+
+def leave_out(collectives: Collectives) -> str | int:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=4)
+    try:
+        stylizer = Stylizer(
+            wall(), cameras(1, 32, 24), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+        )
+    except RankLeftOut:
+        return "left out"
+    decision = next(decision for decision in stylizer.plan.decisions if decision.item == "ranks")
+    assert "only add communication" in decision.reason
+    for _ in range(3):
+        stylizer.run_step()
+    return stylizer.collectives.size
+
+
+def test_ranks_that_would_only_add_communication_are_left_out(vgg16_weights: BackboneWeights) -> None:
+    """A view of 32 x 24 pixels: every tile is all halo."""
+    results = on_ranks(4, leave_out)
+    taking_part = [result for result in results if result != "left out"]
+    assert len(taking_part) < 4
+    assert taking_part == [len(taking_part)] * len(taking_part)
+
+
+def test_one_rank_has_nobody_to_tell() -> None:
+    band = image(0)
+    assert ALONE.gather_rows(band, [(0, HEIGHT)]) is band
+    assert ALONE.scatter_rows(band, [(0, HEIGHT)]) is band
+    assert ALONE.sum(band) is band
+    assert ALONE.gather("a") == ["a"]
+
+
+def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
+    """Whether rank 1 waits for rank 0, which comes three seconds late, where one second is the time-out."""
+    collectives.gather(None)
+    if expected is not None:
+        collectives.expect(expected)
+    if collectives.rank == 0:
+        time.sleep(3)
+    try:
+        collectives.gather(None)
+    except RuntimeError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("expected", "patient"), [(None, True), (20.0, True), (0.1, False)], ids=["preparing", "slow", "quick"]
+)
+def test_ranks_wait_as_long_as_an_iteration_may_take(expected: float | None, patient: bool) -> None:
+    assert on_ranks(2, keep_waiting, expected, timeout=1.0)[1] is patient

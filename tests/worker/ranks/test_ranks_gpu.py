@@ -1,0 +1,73 @@
+"""On GPUs: NCCL ranks against one rank, and one GPU against the CPU."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.multiprocessing as multiprocessing
+from torch import Tensor
+
+from sgsst_core.features.network_weights import load_weights
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.pictures import relative_error
+from tests.small_scenes import ball, cameras, style, wall
+from tests.worker.ranks.spawn import free_port
+from worker.ranks.process_group import process_group
+
+pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
+
+
+def gradient(collectives: Collectives, name: str) -> Tensor:
+    """Colour gradient [n, 3] of one view at two scales, as a step computes it on this machine's devices."""
+    scene = wall(sh_degree=1) if name == "wall" else ball()
+    settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, keep=("ranks",))
+    stylizer = Stylizer(
+        scene, cameras(1, 320, 240), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+    )
+    return stylizer.gradient(0, range(stylizer.scale_count(0)))[0]
+
+
+@pytest.fixture
+def exact_convolutions() -> Any:
+    """TensorFloat-32 rounds to ten bits: no comparison at 1e-5."""
+    before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+    yield
+    torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32 = before
+
+
+def run_rank(rank: int, size: int, address: str, name: str, folder: str) -> None:
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+    with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
+        torch.save(gradient(collectives, name), Path(folder) / f"{rank}.pt")
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
+@pytest.mark.parametrize("name", ["wall", "ball"])
+def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_convolutions: None) -> None:
+    expected = gradient(ALONE, name)
+    size = min(torch.cuda.device_count(), 4)
+    address = f"127.0.0.1:{free_port()}"
+    multiprocessing.spawn(run_rank, (size, address, name, str(tmp_path)), nprocs=size)
+    found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(size)]
+    for own in found:
+        assert torch.equal(own, found[0])
+    assert relative_error(found[0], expected) < 1e-5
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
+@pytest.mark.parametrize("name", ["wall", "ball"])
+def test_one_gpu_gives_the_gradient_of_the_cpu(
+    name: str, exact_convolutions: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another device sums in another order, so that near-ties of max pooling may fall the other way."""
+    on_gpu = gradient(ALONE, name)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    on_cpu = gradient(ALONE, name)
+    assert relative_error(on_gpu, on_cpu) < 1e-3

@@ -1,0 +1,188 @@
+"""The scene on every rank, read once on each machine.
+
+The lowest rank of a machine reads the PLY and lays the arrays into memory that has no name: a memory file, which the
+machine's other ranks open through the reader's process and map. Nobody can leave it behind, because the system frees it
+with the last process that uses it. Pages are mapped copy-on-write, so that ranks share them, and no rank can change
+what another one sees.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import socket
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import torch
+from numpy.typing import NDArray
+
+from sgsst_core.errors import SceneTooLargeError, SgsstError
+from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.files.ply_header import read_header
+from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.planning.planner import OPTIMISER_BYTES
+from sgsst_core.scene.gaussians import Scene
+from worker.processes import home
+
+#: Bytes that a rank needs for each Gaussian beside the scene and the optimiser: its place in a view (centre, conic,
+#: depth, extent, sorting keys), its colour there, and both colours' gradients.
+VIEW_BYTES = 96
+#: Array starts are multiples of this, so that every type finds its alignment.
+_ALIGNMENT = 64
+
+_Layout = dict[str, tuple[int, tuple[int, ...], str]]  # by name: offset, shape, numpy type
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """Where the other ranks of a machine find the scene: a memory file of a process, and what lies where in it."""
+
+    process: int
+    descriptor: int
+    size: int
+    layout: _Layout
+    file: SceneFile  # without its arrays
+
+
+def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: bool = False) -> tuple[SceneFile, bool]:
+    """Read a scene once on each machine. Every rank calls this.
+
+    Returns:
+        The scene, and whether this rank has read it itself: on every machine one does.
+
+    Raises:
+        SceneError: see `read_scene`; the same on every rank.
+        SceneTooLargeError: the memory of a rank's machine or GPU cannot hold it.
+    """
+    homes = collectives.gather(home())
+    reader = homes.index(home())
+    sharing = homes.count(home())
+    _check_room(path, collectives, sharing)
+    own: SceneFile | None = None
+    error: SgsstError | None = None
+    shared: _Shared | None = None
+    if collectives.rank == reader:
+        try:
+            own = read_scene(path, drop_invalid=drop_invalid)
+            if sharing > 1:
+                own, shared = _share(own)
+        except SgsstError as raised:
+            error = raised
+    try:
+        offers = collectives.gather((shared, error))
+        for _, problem in offers:
+            if problem is not None:
+                raise problem
+        if own is None:
+            offer = offers[reader][0]
+            assert offer is not None
+            try:
+                own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
+            except OSError:  # systems that hide even a user's own processes
+                own = read_scene(path, drop_invalid=drop_invalid)
+        collectives.gather(None)  # the reader may close its memory file when everybody has opened it
+    finally:
+        if shared is not None:
+            os.close(shared.descriptor)
+    return own, collectives.rank == reader
+
+
+def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
+    """Lay a scene into a memory file; returns the scene as it lies there, and where that is."""
+    arrays: dict[str, NDArray] = {name.name: getattr(file.scene, name.name).numpy() for name in fields(Scene)}
+    if file.kept is not None:
+        arrays["kept"] = file.kept
+    layout: _Layout = {}
+    size = 0
+    for name, array in arrays.items():
+        layout[name] = (size, array.shape, array.dtype.str)
+        size += -(-array.nbytes // _ALIGNMENT) * _ALIGNMENT
+    descriptor = os.memfd_create("sgsst-scene", os.MFD_CLOEXEC)
+    os.ftruncate(descriptor, size)
+    with mmap.mmap(descriptor, size) as memory:
+        for name, (offset, _, _) in layout.items():
+            data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
+            memory[offset : offset + data.nbytes] = data.data
+    empty = Scene(*(torch.empty(0) for _ in fields(Scene)))
+    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, kept=None))
+    return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
+
+
+def _mapped(shared: _Shared, path: str) -> SceneFile:
+    """The scene in a memory file, mapped."""
+    with open(path, "rb") as file:
+        memory = mmap.mmap(file.fileno(), shared.size, access=mmap.ACCESS_COPY)
+    arrays = {}
+    for name, (offset, shape, kind) in shared.layout.items():
+        count = int(np.prod(shape))
+        arrays[name] = np.frombuffer(memory, kind, count, offset).reshape(shape) if count else np.empty(shape, kind)
+    kept = arrays.pop("kept", None)
+    scene = Scene(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+    return replace(shared.file, scene=scene, kept=kept)
+
+
+def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
+    """Compare what the scene needs, by its header, with what each rank's machine and GPU have.
+
+    Args:
+        sharing: ranks on this machine.
+    """
+    problem: SgsstError | None = None
+    try:
+        count, scene_bytes = _size_by_header(path)
+        problem = _lack(collectives.rank, sharing, count, scene_bytes)
+    except SgsstError as error:
+        problem = error
+    for found in collectives.gather(problem):
+        if found is not None:
+            raise found
+
+
+def _size_by_header(path: Path) -> tuple[int, int]:
+    """Gaussians that a file declares, and their bytes in memory; (0, 0) for what `read_scene` will refuse."""
+    header = read_header(path)
+    if "vertex" not in header.names:
+        return 0, 0
+    # A header may declare anything: no more than what the file can hold is believed.
+    count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))
+    rest = sum(prop.name.startswith("f_rest_") for prop in header.vertex.properties)
+    return count, count * 4 * (14 + rest)
+
+
+def _lack(rank: int, sharing: int, count: int, scene_bytes: int) -> SceneTooLargeError | None:
+    """What is missing on this rank; None where there is room."""
+    each = scene_bytes + count * (OPTIMISER_BYTES + VIEW_BYTES)  # every rank has what the views show once for itself
+    where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
+    advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."
+    needed, free = scene_bytes + sharing * each, available_memory()
+    if needed > free:
+        ranks = f"{sharing} ranks share it" if sharing > 1 else "there is one rank"
+        return SceneTooLargeError(
+            f"{where} {needed / 1e9:.2f} GB of memory ({ranks}), but {free / 1e9:.2f} GB are free. {advice}"
+        )
+    if torch.cuda.is_available():
+        free, total = torch.cuda.mem_get_info()
+        if each > free:
+            return SceneTooLargeError(
+                f"{where} {each / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
+                f"{free / 1e9:.2f} GB are free. {advice}"
+            )
+    return None
+
+
+def available_memory() -> int:
+    """Bytes of memory that this process may still take: of the machine, or of its control group where that has less."""
+    free = psutil.virtual_memory().available
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            used = int((group / "memory.current").read_text())
+            cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+            free = min(free, int(limit) - used + int(cached.get("inactive_file", 0)))
+    except OSError:  # no control groups of version 2, or none around this process
+        pass
+    return free

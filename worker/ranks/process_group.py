@@ -1,0 +1,219 @@
+"""The exchanges of `sgsst_core.parallel.collectives` over torch.distributed: NCCL between GPUs, gloo between CPUs.
+
+Sums are made in an order that depends on the number of ranks alone, so that a run can be repeated bit for bit, and
+every rank receives the same bits.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.distributed.distributed_c10d import _set_pg_timeout
+
+from sgsst_core.errors import SgsstError
+from sgsst_core.features.statistics import LayerStatistics
+from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
+from sgsst_core.rasterizer import Rows
+
+T = TypeVar("T")
+
+#: After which a rank that waits for another one gives up, at the earliest.
+DEFAULT_TIMEOUT = timedelta(seconds=120)
+#: The same while a job is prepared: one rank may read or plan for long, with nothing for the others to do.
+PREPARING = timedelta(minutes=30)
+#: The same, in iterations, where one takes long: ranks are never so uneven.
+ITERATIONS = 5
+
+
+@contextmanager
+def process_group(
+    rank: int,
+    size: int,
+    address: str,
+    *,
+    device: torch.device | str = "cpu",
+    timeout: timedelta = DEFAULT_TIMEOUT,
+) -> Iterator[Collectives]:
+    """Join the process group of a job, and leave it at the end of the block.
+
+    Args:
+        rank: of this process, 0 to size - 1.
+        size: ranks in all; with 1 there is no group.
+        address: "host:port" at which rank 0 listens.
+        device: that this rank computes on; tensors of all exchanges lie there.
+        timeout: of each exchange, once `Collectives.expect` was called.
+    """
+    if size == 1:
+        yield ALONE
+        return
+    device = torch.device(device)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    # Values that are not tensors (plans, decisions) travel between CPUs in any case.
+    backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
+    dist.init_process_group(
+        backend, init_method=f"tcp://{address}", rank=rank, world_size=size, timeout=max(timeout, PREPARING)
+    )
+    collectives = ProcessGroupCollectives(dist.group.WORLD, device, timeout)
+    try:
+        yield collectives
+    finally:
+        collectives.close()
+        dist.destroy_process_group()
+
+
+class ProcessGroupCollectives:
+    """`Collectives` of a torch.distributed group.
+
+    Args:
+        group: whose exchanges these are.
+        device: of the tensors.
+        timeout: see `process_group`.
+    """
+
+    def __init__(self, group: Any, device: torch.device, timeout: timedelta) -> None:
+        self.rank = dist.get_rank(group)
+        self.size = dist.get_world_size(group)
+        self._group = group
+        self._device = device
+        self._timeout = timeout
+        self._others: list[ProcessGroupCollectives] = []
+        # One thread: exchanges meet by their order, which must be the same on every rank.
+        self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
+        self.local_size = self.gather(_machine()).count(_machine())
+
+    def close(self) -> None:
+        """Let exchanges under way come to their end, and start no more."""
+        for other in self._others:
+            other.close()
+        self._background.shutdown(cancel_futures=True)
+
+    def gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+        """See `Collectives`."""
+        largest = max(stop - start for start, stop in bands)
+        # All ranks send equally many rows: that is all that the back ends can do.
+        padded = band.new_zeros((largest, *band.shape[1:]))
+        padded[: len(band)] = band
+        gathered = [torch.empty_like(padded) for _ in bands]
+        dist.all_gather(gathered, padded, group=self._group)
+        return torch.cat([part[: stop - start] for part, (start, stop) in zip(gathered, bands, strict=True)])
+
+    def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+        """See `Collectives`."""
+        own = bands[self.rank][1] - bands[self.rank][0]
+        received = image.new_empty((self.size * own, *image.shape[1:]))
+        rows = [stop - start for start, stop in bands]
+        dist.all_to_all_single(received, image.contiguous(), [own] * self.size, rows, group=self._group)
+        return received.view(self.size, own, *image.shape[1:]).sum(dim=0)
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        """See `Collectives`."""
+        tensor = tensor.contiguous()
+        dist.all_reduce(tensor, group=self._group)
+        return tensor
+
+    def merge_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+        """See `Collectives`."""
+        return self._background.submit(self._merge, list(parts), number).result
+
+    def _merge(self, parts: list[LayerStatistics], number: float) -> tuple[list[LayerStatistics], float]:
+        """Mean first, then second moments about it: sums of squares only, in which nothing can cancel.
+
+        C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T, the pairwise update of
+        Chan et al. (1979) for many parts at once.
+        """
+        if self._device.type == "cuda":
+            torch.cuda.set_device(self._device)  # the current device belongs to a thread
+        sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
+        extra = torch.tensor([number], dtype=torch.float64, device=sums[0].device)
+        flat = self.sum(torch.cat([*sums, extra]))
+        totals = flat[:-1].split([len(part) for part in sums])
+        means = [total[1:] / total[0].clamp_min(torch.finfo(total.dtype).tiny) for total in totals]
+        moments = []
+        for part, mean in zip(parts, means, strict=True):
+            away = part.mean - mean
+            moment = part.centred + torch.outer(away, away) * part.count
+            moments.append(moment[_upper(len(mean), moment.device).unbind()])  # symmetric: one half travels
+        halves = self.sum(torch.cat(moments)).split([len(moment) for moment in moments])
+        merged = [
+            LayerStatistics(total[0], mean, _symmetric(half, len(mean)))
+            for total, mean, half in zip(totals, means, halves, strict=True)
+        ]
+        return merged, float(flat[-1])
+
+    def gather(self, value: T) -> list[T]:
+        """See `Collectives`."""
+        values: list[Any] = [None] * self.size
+        dist.all_gather_object(values, value, group=self._group)
+        return values
+
+    def from_first(self, make: Callable[[], T]) -> T:
+        """See `Collectives`."""
+        message: list[Any] = [None]
+        if self.rank == 0:
+            try:
+                message = [(make(), None)]
+            except SgsstError as error:
+                message = [(None, error)]
+        dist.broadcast_object_list(message, group=self._group, group_src=0, device=torch.device("cpu"))
+        value, problem = message[0]
+        if problem is not None:
+            raise problem
+        return value
+
+    def expect(self, seconds: float) -> None:
+        """See `Collectives`."""
+        _set_pg_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * seconds)), self._group)
+
+    def first(self, count: int) -> Collectives | None:
+        """See `Collectives`."""
+        return self if count == self.size else self._subgroup([list(range(count))])
+
+    def split(self, groups: int) -> Collectives:
+        """See `Collectives`."""
+        if groups == 1:
+            return self
+        each = self.size // groups
+        own = self._subgroup([list(range(start, start + each)) for start in range(0, self.size, each)])
+        assert own is not None
+        return own
+
+    def _subgroup(self, all_ranks: list[list[int]]) -> Collectives | None:
+        """The one of these groups of ranks that this rank is in; every rank makes all of them, as the library asks."""
+        own: Collectives | None = None
+        for ranks in all_ranks:
+            members = [dist.get_global_rank(self._group, rank) for rank in ranks]
+            group = dist.new_group(members, timeout=max(self._timeout, PREPARING))
+            if self.rank in ranks:
+                own = ALONE if len(ranks) == 1 else ProcessGroupCollectives(group, self._device, self._timeout)
+        if isinstance(own, ProcessGroupCollectives):
+            self._others.append(own)
+        return own
+
+
+def _machine() -> tuple[str, str]:
+    """What tells machines apart: containers on one machine have names of their own, and memory limits too."""
+    return socket.gethostname(), os.environ.get("HOSTNAME", "")
+
+
+def _upper(channels: int, device: torch.device) -> Tensor:
+    """Places [2, n] of one half of a symmetric matrix with its diagonal."""
+    return torch.triu_indices(channels, channels, device=device)
+
+
+def _symmetric(half: Tensor, channels: int) -> Tensor:
+    """The matrix [channels, channels] of one half."""
+    matrix = half.new_empty((channels, channels))
+    rows, columns = _upper(channels, half.device).unbind()
+    matrix[rows, columns] = half
+    matrix[columns, rows] = half
+    return matrix

@@ -1,0 +1,262 @@
+"""One rank: the process that Ray starts, its job in a thread of its own, and what it tells the driver meanwhile.
+
+PyTorch is imported in that thread, after the process knows its threads and its GPU.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import socket
+import threading
+import time
+import traceback
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from worker.processes import ProcessId, die_with_parent, interface_towards
+
+if TYPE_CHECKING:
+    from sgsst_core.parallel.collectives import Collectives
+    from sgsst_core.stylizing.loop import Progress
+    from worker.job import Prepared, Result, Resume, StylizeRequest
+
+#: Seconds by which an exchange waits longer than the driver: so the driver, which knows which rank gives no answer, is
+#: the first to notice.
+_PATIENCE = 15.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a rank's process is.
+
+    Attributes:
+        node: Ray's name of the node.
+        address: of the node, as others reach it.
+        host: the machine's name.
+        process: to end it.
+        gpus: that it was given, as CUDA_VISIBLE_DEVICES names them.
+    """
+
+    node: str
+    address: str
+    host: str
+    process: ProcessId
+    gpus: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a rank has to do.
+
+    Attributes:
+        request: the job.
+        rank, size: in the group.
+        address: "host:port" at which rank 0 listens.
+        threads: for computing.
+        timeout: seconds after which a rank that gives no answer counts as lost.
+        folder: from which relative paths are meant.
+        resume: whether to go on from a checkpoint.
+        run: identifies the run of the program.
+        checkpoint_seconds: between checkpoints.
+        preview_folder, preview_seconds: see `attempts.WorkerOptions`.
+        workers: for the report: what has happened so far.
+        seconds_lost, seconds_since_loss: of the last attempt (see `attempts.Attempt`), until this task was made.
+    """
+
+    request: StylizeRequest
+    rank: int
+    size: int
+    address: str
+    threads: int
+    timeout: float
+    folder: Path
+    resume: Resume
+    run: str
+    checkpoint_seconds: float
+    preview_folder: Path | None
+    preview_seconds: float
+    workers: dict[str, Any]
+    seconds_lost: float
+    seconds_since_loss: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a rank ended.
+
+    Attributes:
+        kind: "done", "left-out" (the plan does without this rank) or "failed".
+        result: where it is done.
+        error: where it failed.
+        trace: the traceback's text.
+        echo: the error came out of an exchange, as it does when another rank is lost.
+    """
+
+    kind: Literal["done", "left-out", "failed"]
+    result: Result | None = None
+    error: Exception | None = None
+    trace: str = ""
+    echo: bool = False
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a rank answers when it is asked.
+
+    Attributes:
+        prepared: once the inputs have been read; rank 0 alone.
+        progress: of the last step; rank 0 alone.
+        saved: step of the last checkpoint that this rank has written.
+        warnings: all so far.
+        previews: paths of all pictures so far.
+        outcome: once it has ended.
+    """
+
+    prepared: Prepared | None = None
+    progress: Progress | None = None
+    saved: int | None = None
+    warnings: tuple[str, ...] = ()
+    previews: tuple[Path, ...] = ()
+    outcome: Outcome | None = None
+
+
+class RankProcess:
+    """The Ray actor of a rank. Every method returns at once."""
+
+    def __init__(self) -> None:
+        self._status = Status()
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        die_with_parent()  # of Ray's daemon: a stopped process would not notice that it is gone
+
+    def place(self) -> Place:
+        """Where this is."""
+        import ray
+
+        node = ray.get_runtime_context().get_node_id()
+        gpus = tuple(str(name) for name in ray.get_gpu_ids())
+        return Place(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this(), gpus)
+
+    def free_port(self) -> int:
+        """A port on which nobody listens."""
+        with socket.socket() as trial:
+            trial.bind(("", 0))
+            return int(trial.getsockname()[1])
+
+    def start(self, task: Task) -> None:
+        """Begin."""
+        threading.Thread(target=self._run, args=(task,), daemon=True, name="job").start()
+
+    def poll(self) -> Status:
+        """The present state: the answer itself is the sign of life."""
+        with self._lock:
+            return self._status
+
+    def stop(self) -> None:
+        """Ask the job to end after the step in hand; on rank 0."""
+        self._stop.set()
+
+    def _tell(self, **changes: Any) -> None:
+        with self._lock:
+            self._status = replace(self._status, **changes)
+
+    def _run(self, task: Task) -> None:
+        try:
+            _set_up(task)
+            self._work(task)
+        except BaseException as error:
+            self._tell(outcome=_failure(error))
+
+    def _work(self, task: Task) -> None:
+        import torch
+
+        from sgsst_core.parallel.collectives import RankLeftOut
+        from worker.ranks.process_group import process_group
+
+        torch.set_num_threads(task.threads)
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        timeout = timedelta(seconds=task.timeout + _PATIENCE)
+        with process_group(task.rank, task.size, task.address, device=device, timeout=timeout) as collectives:
+            # The outcome is told inside the block: leaving the group may have to wait for ranks that are lost.
+            try:
+                self._tell(outcome=Outcome("done", self._job(task, collectives)))
+            except RankLeftOut:
+                self._tell(outcome=Outcome("left-out"))
+            except BaseException as error:
+                self._tell(outcome=_failure(error))
+
+    def _job(self, task: Task, collectives: Collectives) -> Result:
+        from worker.job import describe, execute, prepare
+        from worker.previews import Previews
+
+        started = time.monotonic()
+        job = prepare(task.request, collectives=collectives, resume=task.resume, warn=self._warn)
+        job.workers |= task.workers
+        if task.rank == 0:
+            self._tell(prepared=describe(job))
+
+        def progress(current: Progress) -> None:
+            if self._status.progress is None and job.workers["attempts"]:
+                since = time.monotonic() - started
+                lost = job.workers["attempts"][-1]
+                lost["seconds_lost"] = round(task.seconds_lost + since, 3)
+                lost["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
+            self._tell(progress=current)
+
+        return execute(
+            job,
+            progress=progress,
+            stop=self._stop.is_set,
+            warn=self._warn,
+            preview=Previews(task.preview_folder, task.preview_seconds, self._show, self._warn)
+            if task.preview_folder
+            else None,
+            saved=lambda step: self._tell(saved=step),
+            checkpoint_seconds=task.checkpoint_seconds,
+            run_id=task.run,
+        )
+
+    def _show(self, path: Path) -> None:
+        self._tell(previews=(*self._status.previews, path))
+
+    def _warn(self, line: str) -> None:
+        self._tell(warnings=(*self._status.warnings, line))
+
+
+def _set_up(task: Task) -> None:
+    """Threads, GPU, network and folder, before anything is imported that looks at them."""
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[name] = str(task.threads)
+    import ray
+
+    # A process that was given no GPU would see all of them.
+    os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
+    interface = interface_towards(task.address.rpartition(":")[0].strip("[]"))
+    if interface:
+        for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+            os.environ.setdefault(name, interface)
+    if task.folder.is_dir():
+        os.chdir(task.folder)
+
+
+def _failure(error: BaseException) -> Outcome:
+    trace = "".join(traceback.format_exception(error))
+    told = error if isinstance(error, Exception) else RuntimeError(repr(error))
+    try:
+        pickle.loads(pickle.dumps(told))
+    except Exception:  # whatever it holds, its text can travel
+        told = RuntimeError(f"{type(error).__name__}: {error}")
+    return Outcome("failed", error=told, trace=trace, echo=_from_exchange(error))
+
+
+def _from_exchange(error: BaseException) -> bool:
+    """Whether an error was raised inside torch.distributed."""
+    step = error.__traceback__
+    while step is not None:
+        if str(step.tb_frame.f_globals.get("__name__", "")).startswith("torch.distributed"):
+            return True
+        step = step.tb_next
+    return False
