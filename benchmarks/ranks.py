@@ -111,16 +111,16 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
     steps: dict[str, list[dict[str, float]]] = {"together": [], "alone": []}
     for turn in range(rounds + 1):
         for name, stylizer in (("together", together), ("alone", alone)):
-            collectives.gather(None)  # nobody else computes while one rank is alone
+            collectives.all_gather(None)  # nobody else computes while one rank is alone
             if stylizer is not None:
                 before, used = stylizer.seconds, resource.getrusage(resource.RUSAGE_SELF)
                 record = stylizer.run_step()
                 if turn:
                     seconds = {"total": stylizer.seconds - before, **processor_seconds(used)}
                     steps[name].append({**record.parts, **seconds})
-    waiting = collectives.gather([step["communication"] / step["total"] for step in steps["together"]])
-    kernel = collectives.gather([step["processor_system"] for step in steps["together"]])
-    peak = collectives.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
+    waiting = collectives.all_gather([step["communication"] / step["total"] for step in steps["together"]])
+    kernel = collectives.all_gather([step["processor_system"] for step in steps["together"]])
+    peak = collectives.all_gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
     if alone is None:
         return {}
     loss = alone.loss

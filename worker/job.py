@@ -243,7 +243,7 @@ def prepare(
         InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
         RankLeftOut: the job goes on without this rank.
     """
-    outputs = collectives.from_first(lambda: check_request(request))
+    outputs = collectives.broadcast(lambda: check_request(request))
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_image(request.style))
     source = request.source
@@ -252,11 +252,11 @@ def prepare(
     cameras = together(collectives, lambda: fit_cameras(read_cameras_of(request.source, scene_file.scene), settings))
     images = request.images
     photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
-    stamps = collectives.from_first(lambda: repr([_stamp(path) for path in photos]) if photos else "")
+    stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
     own_id = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps) if reader else None
     job_id = _same_inputs(own_id, collectives)
     resume = resume or Resume(request.resume)
-    resumed = collectives.from_first(lambda: _resumed(outputs, job_id, settings, resume, warn))
+    resumed = collectives.broadcast(lambda: _resumed(outputs, job_id, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
     # A plan made for fewer ranks cannot say what more of them are good for.
@@ -290,7 +290,7 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
         value = make()
     except SgsstError as own:
         error = own
-    for found in collectives.gather(error):
+    for found in collectives.all_gather(error):
         if found is not None:
             raise found
     return value  # type: ignore[return-value]
@@ -298,7 +298,7 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
 
 def _same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
     """The feature network's weights: those that the first rank finds, on every rank."""
-    name = collectives.from_first(lambda: load_weights(backbone).name)
+    name = collectives.broadcast(lambda: load_weights(backbone).name)
     return together(collectives, lambda: load_weights(name))
 
 
@@ -308,7 +308,7 @@ def _same_inputs(own: str | None, collectives: Collectives) -> str:
     Args:
         own: this rank's; None where another rank of the same machine has read the scene for it.
     """
-    found = collectives.gather((own, socket.gethostname()))
+    found = collectives.all_gather((own, socket.gethostname()))
     for other, host in found:
         if other is not None and other != found[0][0]:
             raise SettingsError(
@@ -326,7 +326,7 @@ def _workers_used(stylizer: Stylizer) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
     }
-    ranks = stylizer.collectives.gather(own)
+    ranks = stylizer.collectives.all_gather(own)
     return {"used": len(ranks), "ranks": ranks}
 
 
@@ -374,7 +374,7 @@ def execute(
             unsaved.append(error)
             warn(f"No checkpoint could be written: {error}")
 
-    collectives.from_first(lambda: write_json(outputs.plan, plan_json(stylizer.plan)))
+    collectives.broadcast(lambda: write_json(outputs.plan, plan_json(stylizer.plan)))
     callbacks = Callbacks(measure=measure, moments=measure.moments, checkpoint_seconds=checkpoint_seconds)
     if first:
         callbacks.progress, callbacks.stop = progress, stop
@@ -385,7 +385,7 @@ def execute(
         if unsaved:
             raise unsaved[0]
         return Result(stopped, stylizer.step, stylizer.total, before, {})
-    collectives.from_first(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
+    collectives.broadcast(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     if stylizer.measured[-1]["step"] != stylizer.step:

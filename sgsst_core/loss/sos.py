@@ -388,7 +388,7 @@ class SosLoss:
                     content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
                 if keep_this:
                     kept[-1][tile] = activations
-            merged.append(self.collectives.merge_statistics(statistics, content))
+            merged.append(self.collectives.all_reduce_statistics(statistics, content))
         return merged, kept
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:

@@ -33,19 +33,19 @@ class Collectives(Protocol):
     size: int
     local_size: int
 
-    def gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
         """The image [H, ...] of every rank's band of rows [h, ...]; `bands` says which rows each has, in order."""
         ...
 
-    def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
-        """This rank's band [h, ...] of the sum over all ranks' images [H, ...]: the adjoint of `gather_rows`."""
+    def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+        """This rank's band [h, ...] of the sum over all ranks' images [H, ...]: the adjoint of `all_gather_rows`."""
         ...
 
-    def sum(self, tensor: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor) -> Tensor:
         """The sum over all ranks, the same on every rank. The argument may be overwritten."""
         ...
 
-    def merge_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
         """Start merging the statistics of disjoint positions, layer by layer, and adding up a number.
 
         Returns at once; what it returns waits for the result, the same on every rank. No other exchange may be started
@@ -53,11 +53,11 @@ class Collectives(Protocol):
         """
         ...
 
-    def gather(self, value: T) -> list[T]:
+    def all_gather(self, value: T) -> list[T]:
         """Every rank's value, by rank: the same on every rank. Values must be picklable and small."""
         ...
 
-    def from_first(self, make: Callable[[], T]) -> T:
+    def broadcast(self, make: Callable[[], T]) -> T:
         """What `make` returns on rank 0, the only one that calls it; an `SgsstError` of it is raised on every rank."""
         ...
 
@@ -86,22 +86,22 @@ class _Alone:
 
     rank, size, local_size = 0, 1, 1
 
-    def gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
         return band
 
-    def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
         return image
 
-    def sum(self, tensor: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor) -> Tensor:
         return tensor
 
-    def merge_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
         return lambda: (list(parts), number)
 
-    def gather(self, value: T) -> list[T]:
+    def all_gather(self, value: T) -> list[T]:
         return [value]
 
-    def from_first(self, make: Callable[[], T]) -> T:
+    def broadcast(self, make: Callable[[], T]) -> T:
         return make()
 
     def expect(self, seconds: float) -> None:
@@ -119,4 +119,4 @@ ALONE: Collectives = _Alone()
 
 def same_on_all(collectives: Collectives, value: Any) -> bool:
     """Whether every rank has an equal value; the same answer on every rank."""
-    return all(other == value for other in collectives.gather(value))
+    return all(other == value for other in collectives.all_gather(value))

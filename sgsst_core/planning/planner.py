@@ -151,7 +151,7 @@ def make_plan(
     looked = survey(scene, cameras, rasterizer, collectives)
     link = probe_link(collectives, rasterizer.device)
     # Timings differ from rank to rank: one decides for all.
-    return collectives.from_first(
+    return collectives.broadcast(
         lambda: _decide(scene, cameras, settings, loss, rasterizer, memory, looked, link, collectives.size, sharing)
     )
 
@@ -287,7 +287,7 @@ def choose_network(
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if settings.precision == "float32":
         return FeatureNetwork(weights, layers, torch.float32, device), []
-    ratio = collectives.from_first(
+    ratio = collectives.broadcast(
         lambda: _convolution_seconds(torch.float32, device) / _convolution_seconds(torch.bfloat16, device)
     )
     if ratio > 1:

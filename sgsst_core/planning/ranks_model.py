@@ -40,13 +40,13 @@ class Link:
     bandwidth: float
     latency: float
 
-    def gather(self, size: int, ranks: int) -> float:
+    def all_gather(self, size: int, ranks: int) -> float:
         """Seconds to bring `size` bytes in all from everybody to everybody; as many to scatter and add them."""
         return (ranks - 1) * (self.latency + size / ranks / self.bandwidth)
 
-    def sum(self, size: int, ranks: int) -> float:
+    def all_reduce(self, size: int, ranks: int) -> float:
         """Seconds to add up `size` bytes of every rank."""
-        return 2 * self.gather(size, ranks)
+        return 2 * self.all_gather(size, ranks)
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class IterationWork:
         if ranks == 1:
             return 0.0
         height, width = max(piece.size for piece in self.pieces)
-        image = 2 * link.gather(height * width * 12, ranks) if self.whole_image else 0.0
-        statistics = link.sum(_FIRST_BYTES, ranks) + link.sum(_SECOND_BYTES, ranks)
-        return image + statistics + link.sum(self.gaussians * 12, ranks)
+        image = 2 * link.all_gather(height * width * 12, ranks) if self.whole_image else 0.0
+        statistics = link.all_reduce(_FIRST_BYTES, ranks) + link.all_reduce(_SECOND_BYTES, ranks)
+        return image + statistics + link.all_reduce(self.gaussians * 12, ranks)
 
     def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
         """Of one iteration of one view, on each of so many groups of ranks."""
@@ -121,12 +121,12 @@ def probe_link(collectives: Collectives, device: torch.device) -> Link:
     for size in (8, _PROBE_BYTES):
         tensor = torch.zeros(size // 4, device=device)
         for _ in range(3):  # the first one makes the connections
-            collectives.gather(None)
+            collectives.all_gather(None)
             started = time.perf_counter()
-            float(collectives.sum(tensor)[0])
+            float(collectives.all_reduce(tensor)[0])
             last = time.perf_counter() - started
         seconds.append(last)
-    short, long = (max(each) for each in zip(*collectives.gather(seconds), strict=True))
+    short, long = (max(each) for each in zip(*collectives.all_gather(seconds), strict=True))
     steps = 2 * (collectives.size - 1)
     moved = steps * _PROBE_BYTES / collectives.size
     return Link(moved / max(long - short, 1e-9), short / steps)
@@ -184,6 +184,6 @@ def _schedule_seconds(
     total = 0.0
     for steps, works in phases:
         mean = sum(work.seconds(each, link, groups) for work in works) / len(works)
-        across = link.sum(works[0].gaussians * 12, ranks) if groups > 1 else 0.0
+        across = link.all_reduce(works[0].gaussians * 12, ranks) if groups > 1 else 0.0
         total += steps * (mean * views_per_step / groups + across)
     return total

@@ -68,7 +68,7 @@ def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, coll
             ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
             weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
     looks: dict[int, _Look] = {}
-    for part in collectives.gather(own):
+    for part in collectives.all_gather(own):
         looks |= part
     covered = [index for index in range(len(cameras)) if looks[index].covered]
     if not covered:
@@ -76,7 +76,7 @@ def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, coll
             f"None of the {len(cameras)} cameras sees a Gaussian. Check that cameras and scene belong "
             "together (same training run, same world), or let --orbit make cameras."
         )
-    weights = collectives.sum(weights.to(rasterizer.device)).cpu()
+    weights = collectives.all_reduce(weights.to(rasterizer.device)).cpu()
     uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
     regions = [looks[index].region for index in range(len(cameras))]
     return Survey(weights, covered, regions, uncovered_share)

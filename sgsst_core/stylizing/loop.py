@@ -68,7 +68,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     last_checkpoint = last_preview = started
     _measure(stylizer, callbacks)
     while stylizer.step < stylizer.total:
-        reason = stylizer.collectives.from_first(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
+        reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
             return _end_early(stylizer, callbacks, reason)
         stylizer.run_step()

@@ -171,7 +171,7 @@ class Stylizer:
         self.network, precision = choose_network(self.weights, settings, collectives)
         limit = settings.memory_limit or default_memory_limit(self.network.device)
         #: The partition follows from it, and so does rounding: it must be the same on all ranks.
-        self.memory_limit = min(collectives.gather(limit))
+        self.memory_limit = min(collectives.all_gather(limit))
         sharing = self._sharing(collectives)
         self.memory = self.memory_limit // sharing
         cameras = fit_cameras(cameras, settings)
@@ -215,7 +215,7 @@ class Stylizer:
 
     def _sharing(self, collectives: Collectives) -> int:
         """Most ranks that have to share the memory of a machine; each GPU has its own."""
-        return max(collectives.gather(1 if self.network.device.type == "cuda" else collectives.local_size))
+        return max(collectives.all_gather(1 if self.network.device.type == "cuda" else collectives.local_size))
 
     def _join(self, collectives: Collectives) -> None:
         """Take part in what the plan needs, in the group whose views are this rank's."""
@@ -366,10 +366,10 @@ class Stylizer:
         assert gradient is not None
         if len(views) > 1:
             with self.timer("communication"):
-                every = self.collectives.gather(evaluations)[:: self.group.size]
+                every = self.collectives.all_gather(evaluations)[:: self.group.size]
                 evaluations = [terms for part in every for terms in part]
                 if self.groups > 1:  # all ranks of a group have the same gradient: count it once
-                    gradient = self.collectives.sum(gradient / self.group.size)
+                    gradient = self.collectives.all_reduce(gradient / self.group.size)
             gradient = gradient / len(views)
         return gradient, mean_evaluation(evaluations)
 
@@ -396,7 +396,7 @@ class Stylizer:
         # Medians: one step in which the machine did something else says nothing.
         rates = sorted(cost / seconds for cost, seconds in self._pace[1:] if cost)
         self._pace = None
-        speeds = self.group.gather(rates[len(rates) // 2] if rates else 0.0)
+        speeds = self.group.all_gather(rates[len(rates) // 2] if rates else 0.0)
         known = [speed for speed in speeds if speed > 0]
         if max(known) > LEAST_IMBALANCE * min(known):
             self.loss.speeds = tuple(speed or sum(known) / len(known) for speed in speeds)

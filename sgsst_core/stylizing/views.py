@@ -96,12 +96,12 @@ class Views:
         some = band[0] < band[1]
         rows = self.rasterizer.render(colours, camera, band) if some else self._nothing(0, camera.width, 3)
         with self.loss.timer("communication"):
-            return self.collectives.gather_rows(rows, self._bands[index])
+            return self.collectives.all_gather_rows(rows, self._bands[index])
 
     def gradient(self, index: int, image_gradient: Tensor, colours: Tensor) -> Tensor:
         """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [H, W, 3] and the colours that were rendered."""
         with self.loss.timer("communication"):
-            rows = self.collectives.scatter_rows(image_gradient, self._bands[index])
+            rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
         if len(rows):
             gradient = self.rasterizer.colour_gradient(rows, self.cameras[index], self._own_band(index))
         else:
@@ -111,7 +111,7 @@ class Views:
     def add_up(self, gradient: Tensor, colours: Tensor) -> Tensor:
         """dL/dsh_dc [N, 3] from this rank's part of dL/dcolours [N, 3] and the colours that were rendered."""
         with self.loss.timer("communication"):
-            gradient = self.collectives.sum(gradient)
+            gradient = self.collectives.all_reduce(gradient)
         # After the sum: which colours are let through depends on the sign of their whole gradient.
         return view_colours_gradient(gradient, colours, revive=self.revive)
 
@@ -154,7 +154,7 @@ class Views:
         band, camera = self._own_band(index), self.cameras[index]
         some = band[0] < band[1]
         rows = self.rasterizer.coverage(camera, band) if some else self._nothing(0, camera.width)
-        return self.loss.position_weights(self.collectives.gather_rows(rows, self._bands[index]))
+        return self.loss.position_weights(self.collectives.all_gather_rows(rows, self._bands[index]))
 
     def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
         return self.loss.content_features(image(), scale, tiles)

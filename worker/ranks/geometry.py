@@ -57,7 +57,7 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
         SceneError: see `read_scene`; the same on every rank.
         SceneTooLargeError: the memory of a rank's machine or GPU cannot hold it.
     """
-    homes = collectives.gather(home())
+    homes = collectives.all_gather(home())
     reader = homes.index(home())
     sharing = homes.count(home())
     _check_room(path, collectives, sharing)
@@ -72,7 +72,7 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
         except SgsstError as raised:
             error = raised
     try:
-        offers = collectives.gather((shared, error))
+        offers = collectives.all_gather((shared, error))
         for _, problem in offers:
             if problem is not None:
                 raise problem
@@ -83,7 +83,7 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
                 own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
             except OSError:  # systems that hide even a user's own processes
                 own = read_scene(path, drop_invalid=drop_invalid)
-        collectives.gather(None)  # the reader may close its memory file when everybody has opened it
+        collectives.all_gather(None)  # the reader may close its memory file when everybody has opened it
     finally:
         if shared is not None:
             os.close(shared.descriptor)
@@ -136,7 +136,7 @@ def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
         problem = _lack(collectives.rank, sharing, count, scene_bytes)
     except SgsstError as error:
         problem = error
-    for found in collectives.gather(problem):
+    for found in collectives.all_gather(problem):
         if found is not None:
             raise found
 

@@ -89,7 +89,7 @@ class ProcessGroupCollectives:
         self._others: list[ProcessGroupCollectives] = []
         # One thread: exchanges meet by their order, which must be the same on every rank.
         self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
-        self.local_size = self.gather(_machine()).count(_machine())
+        self.local_size = self.all_gather(_machine()).count(_machine())
 
     def close(self) -> None:
         """Let exchanges under way come to their end, and start no more."""
@@ -97,7 +97,7 @@ class ProcessGroupCollectives:
             other.close()
         self._background.shutdown(cancel_futures=True)
 
-    def gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
         """See `Collectives`."""
         largest = max(stop - start for start, stop in bands)
         # All ranks send equally many rows: that is all that the back ends can do.
@@ -107,7 +107,7 @@ class ProcessGroupCollectives:
         dist.all_gather(gathered, padded, group=self._group)
         return torch.cat([part[: stop - start] for part, (start, stop) in zip(gathered, bands, strict=True)])
 
-    def scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
         """See `Collectives`."""
         own = bands[self.rank][1] - bands[self.rank][0]
         received = image.new_empty((self.size * own, *image.shape[1:]))
@@ -115,13 +115,13 @@ class ProcessGroupCollectives:
         dist.all_to_all_single(received, image.contiguous(), [own] * self.size, rows, group=self._group)
         return received.view(self.size, own, *image.shape[1:]).sum(dim=0)
 
-    def sum(self, tensor: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor) -> Tensor:
         """See `Collectives`."""
         tensor = tensor.contiguous()
         dist.all_reduce(tensor, group=self._group)
         return tensor
 
-    def merge_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
         """See `Collectives`."""
         return self._background.submit(self._merge, list(parts), number).result
 
@@ -135,7 +135,7 @@ class ProcessGroupCollectives:
             torch.cuda.set_device(self._device)  # the current device belongs to a thread
         sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
         extra = torch.tensor([number], dtype=torch.float64, device=sums[0].device)
-        flat = self.sum(torch.cat([*sums, extra]))
+        flat = self.all_reduce(torch.cat([*sums, extra]))
         totals = flat[:-1].split([len(part) for part in sums])
         means = [total[1:] / total[0].clamp_min(torch.finfo(total.dtype).tiny) for total in totals]
         moments = []
@@ -143,20 +143,20 @@ class ProcessGroupCollectives:
             away = part.mean - mean
             moment = part.centred + torch.outer(away, away) * part.count
             moments.append(moment[_upper(len(mean), moment.device).unbind()])  # symmetric: one half travels
-        halves = self.sum(torch.cat(moments)).split([len(moment) for moment in moments])
+        halves = self.all_reduce(torch.cat(moments)).split([len(moment) for moment in moments])
         merged = [
             LayerStatistics(total[0], mean, _symmetric(half, len(mean)))
             for total, mean, half in zip(totals, means, halves, strict=True)
         ]
         return merged, float(flat[-1])
 
-    def gather(self, value: T) -> list[T]:
+    def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""
         values: list[Any] = [None] * self.size
         dist.all_gather_object(values, value, group=self._group)
         return values
 
-    def from_first(self, make: Callable[[], T]) -> T:
+    def broadcast(self, make: Callable[[], T]) -> T:
         """See `Collectives`."""
         message: list[Any] = [None]
         if self.rank == 0:

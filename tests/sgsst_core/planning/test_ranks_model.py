@@ -27,14 +27,14 @@ def test_one_rank_tells_nobody_anything() -> None:
 
 def test_links_are_counted_as_rings_move_bytes() -> None:
     link = Link(bandwidth=1e9, latency=1e-4)
-    assert link.gather(4_000_000, 4) == pytest.approx(3 * (1e-4 + 1e-3))
-    assert link.sum(4_000_000, 4) == pytest.approx(2 * link.gather(4_000_000, 4))
+    assert link.all_gather(4_000_000, 4) == pytest.approx(3 * (1e-4 + 1e-3))
+    assert link.all_reduce(4_000_000, 4) == pytest.approx(2 * link.all_gather(4_000_000, 4))
 
 
 def test_kept_coarse_weights_need_no_image() -> None:
     whole, coarse = work(), replace(work(), whole_image=False)
     difference = whole.communication(4, SLOW) - coarse.communication(4, SLOW)
-    assert difference == pytest.approx(2 * SLOW.gather(720 * 1280 * 12, 4))
+    assert difference == pytest.approx(2 * SLOW.all_gather(720 * 1280 * 12, 4))
 
 
 def test_a_free_link_makes_every_rank_worth_it_and_a_slow_one_none() -> None:

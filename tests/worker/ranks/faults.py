@@ -22,7 +22,7 @@ from worker.job import SceneRequest, StylizeRequest
 from worker.ranks.rank import RankProcess, Task
 
 Place = Literal[
-    "render", "loss", "optimiser", "gather_rows", "scatter_rows", "sum", "merge_statistics", "gather", "checkpoint"
+    "render", "loss", "optimiser", "all_gather_rows", "reduce_scatter_rows", "all_reduce", "all_reduce_statistics", "all_gather", "checkpoint"
 ]
 
 
@@ -141,7 +141,7 @@ def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.stylizing.views import Views
     from worker.ranks.process_group import ProcessGroupCollectives
 
-    exchanges = ("gather_rows", "scatter_rows", "sum", "merge_statistics", "gather")
+    exchanges = ("all_gather_rows", "reduce_scatter_rows", "all_reduce", "all_reduce_statistics", "all_gather")
     return {
         "render": (Views, "render"),
         "loss": (SosLoss, "evaluate"),

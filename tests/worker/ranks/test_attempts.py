@@ -121,7 +121,7 @@ def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
-        (Fault(1, "gather_rows", 30, "SIGKILL", 0.001), "was killed"),
+        (Fault(1, "all_gather_rows", 30, "SIGKILL", 0.001), "was killed"),
         (Fault(0, "checkpoint", 4, "SIGKILL"), "was killed"),
         (Fault(1, "render", 25, "SIGSTOP"), "not answered"),
     ],

@@ -32,7 +32,7 @@ def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool,
     file, reader = read_shared_scene(path, collectives, drop_invalid=drop)
     maps = Path("/proc/self/maps").read_text().count("memfd:sgsst-scene")
     file.scene.sh_dc[0] += 1.0  # a rank's own business
-    collectives.gather(None)
+    collectives.all_gather(None)
     again = read_scene(path, drop_invalid=drop).scene.sh_dc
     assert float((file.scene.sh_dc - again).abs().sum()) == pytest.approx(3.0)
     file.scene.sh_dc[0] = again[0]

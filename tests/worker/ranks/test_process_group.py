@@ -30,8 +30,8 @@ def image(rank: int, rows: int = HEIGHT) -> Tensor:
 def exchange_rows(collectives: Collectives, covered: tuple[int, int]) -> tuple[Tensor, Tensor]:
     bands = divide_rows(HEIGHT, collectives.size, covered)
     start, stop = bands[collectives.rank]
-    gathered = collectives.gather_rows(image(7)[start:stop], bands)
-    return gathered, collectives.scatter_rows(image(collectives.rank), bands)
+    gathered = collectives.all_gather_rows(image(7)[start:stop], bands)
+    return gathered, collectives.reduce_scatter_rows(image(collectives.rank), bands)
 
 
 @pytest.mark.parametrize(("ranks", "covered"), [(2, (0, HEIGHT)), (3, (20, 41)), (4, (60, 64))])
@@ -54,7 +54,7 @@ def features(rank: int) -> Tensor:
 
 def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatistics, float]]:
     parts = [LayerStatistics.zero(5)] if collectives.rank == empty else [layer_statistics(features(collectives.rank))]
-    waiting = [collectives.merge_statistics(parts, 0.5 * (turn + 1)) for turn in range(3)]
+    waiting = [collectives.all_reduce_statistics(parts, 0.5 * (turn + 1)) for turn in range(3)]
     merged = [wait() for wait in waiting]
     return [(statistics[0], number) for statistics, number in merged]
 
@@ -81,20 +81,20 @@ def test_nothing_at_all_stays_nothing() -> None:
 
 
 def merge_nothing(collectives: Collectives) -> LayerStatistics:
-    return collectives.merge_statistics([LayerStatistics.zero(4)], 0.0)()[0][0]
+    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], 0.0)()[0][0]
 
 
 def values(collectives: Collectives) -> dict[str, Any]:
     own = collectives.split(2)
     part = collectives.first(2)
     return {
-        "gathered": collectives.gather(collectives.rank),
-        "from_first": collectives.from_first(lambda: f"made by {collectives.rank}"),
+        "all_gather": collectives.all_gather(collectives.rank),
+        "broadcast": collectives.broadcast(lambda: f"made by {collectives.rank}"),
         "same": same_on_all(collectives, 5),
         "different": same_on_all(collectives, collectives.rank),
-        "split": (own.rank, own.size, own.gather(collectives.rank)),
-        "first": None if part is None else (part.rank, part.size, part.gather(collectives.rank)),
-        "sum": float(collectives.sum(torch.tensor([float(collectives.rank)]))),
+        "split": (own.rank, own.size, own.all_gather(collectives.rank)),
+        "first": None if part is None else (part.rank, part.size, part.all_gather(collectives.rank)),
+        "all_reduce": float(collectives.all_reduce(torch.tensor([float(collectives.rank)]))),
         "local": collectives.local_size,
     }
 
@@ -102,13 +102,13 @@ def values(collectives: Collectives) -> dict[str, Any]:
 def test_values_and_groups() -> None:
     results = on_ranks(4, values)
     for rank, found in enumerate(results):
-        assert found["gathered"] == [0, 1, 2, 3]
-        assert found["from_first"] == "made by 0"
+        assert found["all_gather"] == [0, 1, 2, 3]
+        assert found["broadcast"] == "made by 0"
         assert found["same"]
         assert not found["different"]
         assert found["split"] == (rank % 2, 2, [0, 1] if rank < 2 else [2, 3])
         assert found["first"] == ((rank, 2, [0, 1]) if rank < 2 else None)
-        assert found["sum"] == 6.0
+        assert found["all_reduce"] == 6.0
         assert found["local"] == 4
 
 
@@ -117,7 +117,7 @@ def fail_on_first(collectives: Collectives) -> str:
         raise SceneError("scene.ply: is empty.")
 
     try:
-        return collectives.from_first(make)
+        return collectives.broadcast(make)
     except SceneError as error:
         return str(error)
 
@@ -169,21 +169,21 @@ def test_ranks_that_would_only_add_communication_are_left_out(vgg16_weights: Bac
 
 def test_one_rank_has_nobody_to_tell() -> None:
     band = image(0)
-    assert ALONE.gather_rows(band, [(0, HEIGHT)]) is band
-    assert ALONE.scatter_rows(band, [(0, HEIGHT)]) is band
-    assert ALONE.sum(band) is band
-    assert ALONE.gather("a") == ["a"]
+    assert ALONE.all_gather_rows(band, [(0, HEIGHT)]) is band
+    assert ALONE.reduce_scatter_rows(band, [(0, HEIGHT)]) is band
+    assert ALONE.all_reduce(band) is band
+    assert ALONE.all_gather("a") == ["a"]
 
 
 def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
     """Whether rank 1 waits for rank 0, which comes three seconds late, where one second is the time-out."""
-    collectives.gather(None)
+    collectives.all_gather(None)
     if expected is not None:
         collectives.expect(expected)
     if collectives.rank == 0:
         time.sleep(3)
     try:
-        collectives.gather(None)
+        collectives.all_gather(None)
     except RuntimeError:
         return False
     return True
