@@ -30,9 +30,9 @@ from benchmarks.machine import write_result
 from sgsst_core.stylizing.loop import Progress
 from sgsst_core.stylizing.stylizer import mean_loss
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
-from worker.job import StylizeRequest
 from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.request import StylizeRequest
 
 STEPS = 250
 #: Faults of one job: an attempt makes some dozen steps before its fault.

@@ -7,7 +7,7 @@ from pathlib import Path
 from service.files.names import RESULT
 from service.files.staging import Staged
 from service.parameters import JobParameters
-from worker.job import SceneRequest, StylizeRequest
+from worker.request import SceneRequest, StylizeRequest
 
 
 def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:

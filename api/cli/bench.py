@@ -18,7 +18,8 @@ from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene, write_stylized
 from sgsst_core.report.document import machine, write_json
-from worker.job import SceneRequest, check_choice, check_folder, read_cameras_of
+from worker.job import read_cameras_of
+from worker.request import SceneRequest, check_choice, check_folder
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from worker.job import SceneRequest, check_choice, check_folder, read_cameras_of
+from worker.job import read_cameras_of
+from worker.request import SceneRequest, check_choice, check_folder
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 

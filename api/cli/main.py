@@ -32,8 +32,9 @@ from sgsst_core.settings import EVERYTHING, KeptWeights, PositionWeights, Precis
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from sgsst_core.stylizing.loop import Progress
-    from worker.job import Outputs, Prepared, Result, StylizeRequest
+    from worker.job import Prepared, Result
     from worker.ranks.attempts import RanksResult, WorkerOptions
+    from worker.request import Outputs, StylizeRequest
 
 #: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
 BAD_INPUT, FAILURE = 2, 1
@@ -215,8 +216,8 @@ def stylize(
         rebalance=rebalance,
         keep=EVERYTHING if keep_everything else None,
     )
-    from worker.job import SceneRequest, StylizeRequest
     from worker.ranks.attempts import WorkerOptions
+    from worker.request import SceneRequest, StylizeRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     request = StylizeRequest(source, style, images, out, backbone, resume, settings)
@@ -230,8 +231,8 @@ def _stylize(
     options: WorkerOptions | None = None,
 ) -> None:
     """Prepare, run, and tell what was decided and what came out; `arguments` are for the command to go on with."""
-    from worker.job import check_request
     from worker.ranks.attempts import WorkerOptions
+    from worker.request import check_request
 
     outputs = check_request(request)
     command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
@@ -377,7 +378,7 @@ def plan(
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
     from api.cli.jobs import make_plan
-    from worker.job import SceneRequest
+    from worker.request import SceneRequest
 
     settings = make_settings(
         preset,
@@ -418,7 +419,7 @@ def check(
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
     from api.cli.jobs import check_inputs
-    from worker.job import SceneRequest
+    from worker.request import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
     with _status("Looking at the scene and every view"):
@@ -447,7 +448,7 @@ def render(
 ) -> None:
     """Render the views of a scene."""
     from api.cli.jobs import render_views
-    from worker.job import SceneRequest
+    from worker.request import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -464,7 +465,7 @@ def demo(
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_weights
-    from worker.job import SceneRequest, StylizeRequest, check_folder
+    from worker.request import SceneRequest, StylizeRequest, check_folder
 
     check_folder(out)
     try:
@@ -505,7 +506,7 @@ def bench_error_time(
 ) -> None:
     """Run variants of a job for the same time each, and plot the error that is left against seconds."""
     from api.cli.bench import ErrorTimeRequest, error_time_table, point_line, run_error_time
-    from worker.job import SceneRequest
+    from worker.request import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     settings = {"coarsest_side": coarsest_side, "background": background, "near": near, "memory_limit": memory_limit}

@@ -25,7 +25,8 @@ from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
     from sgsst_core.stylizing.loop import Progress
-    from worker.job import Prepared, Result, StylizeRequest
+    from worker.job import Prepared, Result
+    from worker.request import StylizeRequest
 
 #: A job takes every core for as long as it runs. Where that is the service's machine, requests go first; alone on its
 #: cores, a job loses nothing by it.
@@ -117,8 +118,9 @@ class Attempt:
         return replace(stylize_request(self._task.staged, self._task.parameters), resume=self._task.resume)
 
     def _alone(self) -> Result:
-        from worker.job import Resume, describe, execute, prepare
+        from worker.job import describe, execute, prepare
         from worker.previews import Previews
+        from worker.request import Resume
 
         job = prepare(self._request(), resume=Resume(self._task.resume, required=False), warn=log)
         self._prepared(describe(job))
@@ -135,8 +137,8 @@ class Attempt:
     def _on_ranks(self) -> Result | None:
         from dataclasses import replace
 
-        from worker.job import Outputs
         from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+        from worker.request import Outputs
 
         request = self._request()
         # a checkpoint that is not there is no error here, as it would be for a user who asks for it

@@ -23,7 +23,8 @@ from worker.ranks.rank import Outcome, Place, RankProcess, Status, Task
 
 if TYPE_CHECKING:
     from sgsst_core.stylizing.loop import Progress
-    from worker.job import Prepared, Result, Resume, StylizeRequest
+    from worker.job import Prepared, Result
+    from worker.request import Resume, StylizeRequest
 
 #: Seconds between two questions to a rank.
 POLL_SECONDS = 0.25
@@ -316,7 +317,7 @@ class _Job:
 
     def _resume(self) -> Resume:
         """The first attempt does what the user asked for; later ones go on from what this job has saved."""
-        from worker.job import Resume
+        from worker.request import Resume
 
         if not self._attempts:
             return Resume(self._request.resume)

@@ -21,7 +21,8 @@ from worker.processes import ProcessId, die_with_parent, interface_towards
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
     from sgsst_core.stylizing.loop import Progress
-    from worker.job import Prepared, Result, Resume, StylizeRequest
+    from worker.job import Prepared, Result
+    from worker.request import Resume, StylizeRequest
 
 #: Seconds by which an exchange waits longer than the driver: so the driver, which knows which rank gives no answer, is
 #: the first to notice.

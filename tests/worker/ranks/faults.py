@@ -18,11 +18,19 @@ import psutil
 
 from sgsst_core.settings import make_settings
 from tests.small_scenes import wall, write_files
-from worker.job import SceneRequest, StylizeRequest
 from worker.ranks.rank import RankProcess, Task
+from worker.request import SceneRequest, StylizeRequest
 
 Place = Literal[
-    "render", "loss", "optimiser", "all_gather_rows", "reduce_scatter_rows", "all_reduce", "all_reduce_statistics", "all_gather", "checkpoint"
+    "render",
+    "loss",
+    "optimiser",
+    "all_gather_rows",
+    "reduce_scatter_rows",
+    "all_reduce",
+    "all_reduce_statistics",
+    "all_gather",
+    "checkpoint",
 ]
 
 

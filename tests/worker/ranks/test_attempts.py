@@ -21,9 +21,10 @@ from sgsst_core.errors import SceneError
 from sgsst_core.stylizing.loop import Progress
 from sgsst_core.stylizing.stylizer import mean_loss
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, shared_memory, small_request
-from worker.job import Prepared, StylizeRequest, execute, prepare
+from worker.job import Prepared, execute, prepare
 from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.request import StylizeRequest
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "vgg16_weights"),

@@ -1,0 +1,178 @@
+"""What a job is asked for and which files it writes, checked before anything is read."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sgsst_core.errors import CameraError, OutputError, SettingsError
+from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.checkpoint import Checkpoints
+
+Up = Literal["x", "-x", "y", "-y", "z", "-z"]
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """A scene and the cameras to see it with, as the user names them.
+
+    Attributes:
+        scene: 3DGS PLY.
+        cameras: camera file or folder; None for an orbit.
+        orbit: number of views of a ring around the scene; None for `cameras`.
+        up: world axis that points up, for the orbit.
+        views: how many of the cameras to take, spread evenly; None for all.
+        resolution: pixels of every view's longer side; None for the cameras' own.
+        near: near plane, world units.
+        drop_invalid: leave Gaussians with non-finite values out.
+    """
+
+    scene: Path
+    cameras: Path | None
+    orbit: int | None
+    up: Up
+    views: int | None
+    resolution: int | None
+    near: float
+    drop_invalid: bool
+
+
+@dataclass(frozen=True)
+class StylizeRequest:
+    """What `sgsst stylize` was asked for.
+
+    Attributes:
+        source: scene and cameras.
+        style: style image.
+        images: folder of photos for the content term; None for unstylized renders.
+        out: PLY to write.
+        backbone: "auto", "vgg19" or "vgg16".
+        resume: go on from the checkpoint beside `out`.
+        settings: everything else.
+    """
+
+    source: SceneRequest
+    style: Path
+    images: Path | None
+    out: Path
+    backbone: str
+    resume: bool
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The files of a job, named after its PLY so that jobs can share a folder."""
+
+    ply: Path
+
+    def _beside(self, suffix: str) -> Path:
+        return self.ply.with_name(self.ply.stem + suffix)
+
+    @property
+    def report(self) -> Path:
+        """The report."""
+        return self._beside(".report.json")
+
+    @property
+    def page(self) -> Path:
+        """The report for people."""
+        return self._beside(".report.html")
+
+    @property
+    def plan(self) -> Path:
+        """The plan."""
+        return self._beside(".plan.json")
+
+    @property
+    def sheet(self) -> Path:
+        """The contact sheet."""
+        return self._beside(".before_after.jpg")
+
+    @property
+    def curves(self) -> Path:
+        """The loss curves."""
+        return self._beside(".loss.png")
+
+    @property
+    def checkpoint(self) -> Path:
+        """The newest of the `checkpoints`."""
+        return self._beside(".checkpoint.safetensors")
+
+    @property
+    def all(self) -> list[Path]:
+        """Every file, but for the older checkpoint, which is never written itself."""
+        return [self.ply, self.report, self.page, self.plan, self.sheet, self.curves, self.checkpoint]
+
+    @property
+    def checkpoints(self) -> Checkpoints:
+        """Where an unfinished job can go on from."""
+        return Checkpoints(self.checkpoint)
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Whether a job goes on from a checkpoint.
+
+    Attributes:
+        wanted: False starts from the beginning.
+        required: a checkpoint that is missing or cannot be used is an error; otherwise the job starts from the
+            beginning.
+        run: take only what this run of the program has written; None takes any of the same job.
+    """
+
+    wanted: bool
+    required: bool = True
+    run: str | None = None
+
+
+def check_choice(source: SceneRequest, images: Path | None = None) -> None:
+    """Prove that there is one source of cameras, and photos only of known ones.
+
+    Raises:
+        CameraError: otherwise.
+    """
+    if source.cameras is None and source.orbit is None:
+        raise CameraError(
+            "There are no cameras. Give a camera file with --cameras, or --orbit N for N views around the scene."
+        )
+    if source.cameras is not None and source.orbit is not None:
+        raise CameraError("Both --cameras and --orbit are given. Give one of them.")
+    if images is not None and source.orbit is not None:
+        raise CameraError(
+            "--images are photos of known cameras, which an --orbit has not. Give --cameras, or no --images."
+        )
+
+
+def check_request(request: StylizeRequest) -> Outputs:
+    """The output's file names, after a look at what can be checked without reading the inputs; creates nothing.
+
+    Raises:
+        InvalidInputError: no steps, no cameras, or outputs that cannot be written.
+    """
+    if not request.settings.steps_coarse + request.settings.steps_sos:
+        raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")
+    check_choice(request.source, request.images)
+    out = request.out
+    if out.is_dir():
+        raise OutputError(f"{out}: is a folder. Name the PLY file to write, such as {out / 'stylized.ply'}.")
+    if out.suffix.lower() != ".ply":
+        raise OutputError(f"{out}: does not end in .ply. Name the PLY file to write.")
+    if out.exists() and request.source.scene.exists() and os.path.samefile(out, request.source.scene):
+        raise OutputError(f"{out}: is the scene itself, which would be lost. Name another file.")
+    check_folder(out.parent)
+    return Outputs(out)
+
+
+def check_folder(folder: Path) -> None:
+    """Prove that a folder can be written to, or created, without creating it.
+
+    Raises:
+        OutputError: it cannot.
+    """
+    while not (folder.exists() or folder.is_symlink()) and folder != folder.parent:
+        folder = folder.parent
+    ensure_writable_folder(folder)
