@@ -30,8 +30,9 @@ from benchmarks.machine import write_result
 from sgsst_core.stylizing.loop import Progress
 from sgsst_core.stylizing.stylizer import mean_loss
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
-from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
+from worker.ranks.attempts import RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.listener import Listener
 from worker.request import StylizeRequest
 
 STEPS = 250
@@ -59,7 +60,7 @@ def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
         what = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
         rank = 0 if place == "checkpoint" else chance.randint(0, 1)
         # Checkpoints are written twice a second, and values are gathered only while a job is prepared.
-        call = chance.randint(*{"checkpoint": (2, 5), "gather": (2, 8)}.get(place, (20, 60)))
+        call = chance.randint(*{"checkpoint": (2, 5), "all_gather": (2, 8)}.get(place, (20, 60)))
         # Half of them at once, half in the middle of what takes some milliseconds.
         yield Fault(rank, place, call, what, chance.choice([0.0, chance.uniform(0, 0.005)]))
 

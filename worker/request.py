@@ -147,14 +147,23 @@ def check_choice(source: SceneRequest, images: Path | None = None) -> None:
         )
 
 
+def check_steps(settings: Settings) -> None:
+    """Prove that there is something to do.
+
+    Raises:
+        SettingsError: otherwise.
+    """
+    if not settings.steps_coarse + settings.steps_sos:
+        raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")
+
+
 def check_request(request: StylizeRequest) -> Outputs:
     """The output's file names, after a look at what can be checked without reading the inputs; creates nothing.
 
     Raises:
         InvalidInputError: no steps, no cameras, or outputs that cannot be written.
     """
-    if not request.settings.steps_coarse + request.settings.steps_sos:
-        raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")
+    check_steps(request.settings)
     check_choice(request.source, request.images)
     out = request.out
     if out.is_dir():

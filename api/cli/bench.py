@@ -16,9 +16,9 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene, write_stylized
+from sgsst_core.files.ply import write_stylized
 from sgsst_core.report.document import machine, write_json
-from worker.job import read_cameras_of
+from worker.inputs import read_scene_and_cameras
 from worker.request import SceneRequest, check_choice, check_folder
 
 
@@ -59,8 +59,7 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
     check_folder(request.out)
     weights = load_weights(request.backbone)
     style = load_image(request.style)
-    file = read_scene(request.source.scene, drop_invalid=request.source.drop_invalid)
-    cameras = read_cameras_of(request.source, file.scene)
+    file, cameras = read_scene_and_cameras(request.source)
     ensure_writable_folder(request.out)
     options = {name: value for name, value in request.settings.items() if value is not None}
     arguments = (file.scene, cameras, style, variants, request.seconds)

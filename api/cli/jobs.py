@@ -1,6 +1,6 @@
 """What `plan`, `check` and `render` do: read and check every input, work, write every output. Prints nothing.
 
-`stylize` is `worker.job`, on one rank or several.
+`stylize` is `worker.prepare` and `worker.execute`, on one rank or several.
 """
 
 from __future__ import annotations
@@ -8,15 +8,15 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from sgsst_core.errors import CameraError, OutputError
+from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
-from sgsst_core.files.ply import read_scene
 from sgsst_core.planning.planner import Plan
-from sgsst_core.planning.survey import SEEN_COVERAGE
+from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
 from sgsst_core.quality.measure import with_measuring
 from sgsst_core.rasterizer import make_rasterizer
@@ -25,14 +25,24 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from worker.job import read_cameras_of
+from worker.inputs import check_something_seen, read_scene_and_cameras
 from worker.request import SceneRequest, check_choice, check_folder
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
-def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settings, out: Path) -> Plan:
+def make_plan(
+    source: SceneRequest,
+    style: Path,
+    backbone: str,
+    settings: Settings,
+    out: Path,
+    show_planning: ShowPlanning | None = None,
+) -> Plan:
     """Plan a job as `sgsst stylize` would, and write the plan as JSON; no step is made.
+
+    Args:
+        show_planning: shows how far the survey of the views has come.
 
     Raises:
         InvalidInputError: in one of its forms, for the first input that cannot be used.
@@ -43,9 +53,8 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     if source.cameras and out.exists() and source.cameras.exists() and os.path.samefile(out, source.cameras):
         raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
     check_folder(out.parent)
-    scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
-    weights = load_weights(backbone)
-    stylizer = Stylizer(scene, read_cameras_of(source, scene), load_image(style), settings, weights=weights)
+    file, cameras = read_scene_and_cameras(source)
+    stylizer = Stylizer(file.scene, cameras, load_image(style), settings, weights=load_weights(backbone))
     out.parent.mkdir(parents=True, exist_ok=True)
     plan = with_measuring(stylizer.plan)
     write_json(out, plan_json(plan))
@@ -63,8 +72,7 @@ def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
     """
     check_choice(source)
     image = load_image(style) if style else None
-    file = read_scene(source.scene, drop_invalid=True)
-    cameras = read_cameras_of(source, file.scene)
+    file, cameras = read_scene_and_cameras(replace(source, drop_invalid=True))
     rasterizer = make_rasterizer("cpu", file.scene, near=source.near)
     found = [*check_scene(file), *check_views(file, cameras, rasterizer, near=source.near)]
     return found if image is None else [*found, *check_style(image, cameras)]
@@ -86,13 +94,10 @@ def render_views(
     """
     check_choice(source)
     check_folder(out)
-    scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
-    cameras = read_cameras_of(source, scene)
+    file, cameras = read_scene_and_cameras(source)
+    scene = file.scene
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
-    if not any(float(rasterizer.coverage(camera).amax()) > SEEN_COVERAGE for camera in cameras):
-        raise CameraError(
-            f"None of the {len(cameras)} cameras sees a Gaussian. Check that cameras and scene belong together."
-        )
+    check_something_seen(cameras, rasterizer)
     ensure_writable_folder(out)
     paths = [out / name for name in view_file_names(cameras)]
     for index, (camera, path) in enumerate(zip(cameras, paths, strict=True)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,27 +11,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    MofNCompleteColumn,
-    ProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.progress import Progress as Bar
+from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
 from api.cli import service_commands
 from api.cli.interrupt import stop_on_signal
+from api.cli.progress_bars import clock, job_bar, live_bar
 from api.cli.values import parse_background, parse_bytes
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
 from sgsst_core.settings import EVERYTHING, KeptWeights, PositionWeights, Precision, PresetName, make_settings
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
-    from sgsst_core.stylizing.loop import Progress
-    from worker.job import Prepared, Result
+    from worker.description import Prepared
+    from worker.execute import Result
     from worker.ranks.attempts import RanksResult, WorkerOptions
     from worker.request import Outputs, StylizeRequest
 
@@ -40,8 +32,6 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command impo
 BAD_INPUT, FAILURE = 2, 1
 #: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
 MAX_RESOLUTION = 16384
-#: Where the progress bar cannot be drawn (a log file), a line is printed instead, this often.
-LOG_SECONDS = 60.0
 #: Characters of tables that would be cut in a narrower terminal.
 TABLE_WIDTH = 180
 #: The demo's resolution and steps, and seconds after which it stops on a slow machine: less than five minutes with all
@@ -245,14 +235,16 @@ def _stylize(
 
 def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
     """One rank, in this process."""
-    from worker.job import describe, execute, prepare
+    from worker.description import describe
+    from worker.execute import execute
+    from worker.prepare import prepare
 
-    with _status("Reading the scene and preparing its views"):
-        job = prepare(request, warn=error_console.print)
+    with job_bar(error_console) as bar:
+        job = prepare(request, warn=error_console.print, show_planning=bar.show_planning)
     with stop_on_signal(_announce_stop) as stop:
         prepared = describe(job)
         _announce(prepared)
-        with _training_bar() as bar:
+        with job_bar(error_console) as bar:
             bar.start(prepared)
             result = execute(
                 job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
@@ -267,15 +259,19 @@ def _stylize_on_ranks(
     request: StylizeRequest, outputs: Outputs, command: str, workers: int, options: WorkerOptions
 ) -> None:
     """Several ranks, in processes of their own."""
-    from worker.ranks.attempts import Listener, stylize_on_ranks
+    from worker.ranks.attempts import stylize_on_ranks
+    from worker.ranks.listener import Listener
 
-    with stop_on_signal(_announce_stop) as stop, _training_bar() as bar:
+    with stop_on_signal(_announce_stop) as stop, job_bar(error_console) as bar:
 
         def prepared(found: Prepared) -> None:
             _announce(found)
             bar.start(found)
 
-        listener = Listener(prepared, bar.show, error_console.print, error_console.print, stop)
+        tell = error_console.print
+        listener = Listener(
+            planning=bar.show_planning, prepared=prepared, progress=bar.show, happened=tell, warn=tell, stop=stop
+        )
         ended = stylize_on_ranks(request, workers, listener, options=options)
     if ended.interrupted:
         _tell_interrupted(outputs, ended.step, ended.total, ended.saved, command)
@@ -348,7 +344,7 @@ def _time_bought(result: Result) -> list[str]:
     if found is None:
         return []
     lines = [
-        f"{entry['relative']:.0%} of the loss on all scales was left after {_clock(entry['seconds'])}"
+        f"{entry['relative']:.0%} of the loss on all scales was left after {clock(entry['seconds'])}"
         for entry in found["reached"]
     ]
     last = found["last_tenth"]
@@ -390,8 +386,8 @@ def plan(
         memory_limit=memory_limit,
     )
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
-    with _status("Looking at every view"):
-        made = make_plan(source, style, backbone, settings, out)
+    with job_bar(error_console) as bar:
+        made = make_plan(source, style, backbone, settings, out, bar.show_planning)
     table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
         saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
@@ -452,7 +448,7 @@ def render(
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with _bar(*columns) as bar:
+    with live_bar(error_console, *columns) as bar:
         task = bar.add_task("", total=None)
         paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
     out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
@@ -556,7 +552,7 @@ def fetch(
     from sgsst_core.features.network_weights import fetch_weights
 
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with _bar(*columns) as bar:
+    with live_bar(error_console, *columns) as bar:
         task = bar.add_task(name, total=None)
         path = fetch_weights(
             name, source=from_, progress=lambda done, total: bar.update(task, completed=done, total=total or None)
@@ -582,52 +578,6 @@ def _status(text: str) -> Iterator[None]:
 @contextmanager
 def _nothing() -> Iterator[None]:
     yield
-
-
-def _bar(*columns: ProgressColumn) -> Bar:
-    """A live progress bar on a terminal; nothing elsewhere, where it could not be drawn over."""
-    return Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal)
-
-
-class _TrainingBar:
-    """A live bar, or a line a minute where there is no terminal."""
-
-    def __init__(self, bar: Bar) -> None:
-        self._bar = bar
-        self._task = bar.add_task("starting", total=None, loss="-", left="-")
-        self._last_line = time.monotonic()
-
-    def start(self, prepared: Prepared) -> None:
-        """Show where the job starts."""
-        self._bar.update(self._task, total=prepared.total, completed=prepared.step)
-
-    def show(self, progress: Progress) -> None:
-        """Show a step."""
-        stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
-        loss, left = f"{progress.loss:.3g}", _clock(progress.seconds_left)
-        self._bar.update(self._task, description=stage, completed=progress.step, loss=loss, left=left)
-        if self._bar.disable and time.monotonic() - self._last_line >= LOG_SECONDS:
-            self._last_line = time.monotonic()
-            error_console.print(f"{stage}: step {progress.step} of {progress.total}, loss {loss}, {left} left")
-
-
-@contextmanager
-def _training_bar() -> Iterator[_TrainingBar]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]}"),
-        TextColumn("{task.fields[left]} left"),
-    )
-    with _bar(*columns) as bar:
-        yield _TrainingBar(bar)
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

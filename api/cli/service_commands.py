@@ -16,6 +16,7 @@ from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingCo
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from api.cli.progress_bars import clock
 from api.cli.values import parse_background, parse_bytes
 from sgsst_core.settings import PresetName
 
@@ -337,11 +338,12 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
 def _step_text(progress: Any) -> str:
     if not progress.get("total"):
         return str(progress["stage"])
-    text = f"{progress['stage']}: step {progress['step']} of {progress['total']}"
+    unit = "view" if progress["stage"] == "planning" else "step"
+    text = f"{progress['stage']}: {unit} {progress['step']} of {progress['total']}"
     if progress.get("loss") is not None:
         text += f", loss {progress['loss']:.3g}"
     if progress.get("eta_s") is not None:
-        text += f", {_clock(progress['eta_s'])} left"
+        text += f", {clock(progress['eta_s'])} left"
     return text
 
 
@@ -368,11 +370,5 @@ def _plan_text(plan: Any) -> str:
     lines = [f"{plan['gaussians']:,} Gaussians, {plan['views']} views, {plan['pixels']:,} pixels"]
     lines += [f"{item['item']}: {item['decision']}: {item['reason']}" for item in plan["plan"]["decisions"]]
     if plan["estimated_seconds"]:
-        lines.append(f"expected: {_clock(plan['estimated_seconds'])} for all steps")
+        lines.append(f"expected: {clock(plan['estimated_seconds'])} for all steps")
     return "\n".join(lines)
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

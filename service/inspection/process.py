@@ -14,12 +14,13 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import psutil
 import torch
+from torch import Tensor
 
 from service.files.staging import Staged
 from service.parameters import JobParameters
@@ -34,7 +35,8 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.stylizer import Stylizer, fit_cameras
-from worker.job import read_cameras_of
+from worker.inputs import check_something_in_view, read_cameras_of
+from worker.request import check_steps
 
 
 class RefusedError(Exception):
@@ -54,11 +56,18 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
     Raises:
         RefusedError, InvalidInputError: an input that cannot be used, with `part`, the role that it has.
     """
+    return _read_inputs(staged, parameters, limits)[0]
+
+
+def _read_inputs(
+    staged: Staged, parameters: JobParameters, limits: dict[str, Any]
+) -> tuple[dict[str, Any], Scene, list[Camera], Tensor]:
+    """What `check` finds, and what it has read: the scene, the cameras, and the style [H, W, 3]."""
     settings = parameters.settings()
-    if not settings.steps_coarse + settings.steps_sos:
-        raise RefusedError("invalid-settings", "Both numbers of steps are 0, so that nothing would change. Give some.")
+    check_steps(settings)
     _check_weights(parameters.backbone)
     found: dict[str, Any] = {}
+    source = scene_request(staged, parameters)
     with _Part("scene"):
         header = read_header(staged.scene)
         element_offsets(staged.scene, header)
@@ -67,14 +76,13 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
             raise RefusedError(
                 "too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be."
             )
-        file = read_scene(staged.scene, drop_invalid=parameters.drop_invalid)
+        file = read_scene(source.scene, drop_invalid=source.drop_invalid)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _Part("style"):
         _check_pixels(staged.style, limits)
         image = load_image(staged.style)
         found["style"] = [image.shape[1], image.shape[0]]
     with _Part("cameras"):
-        source = scene_request(staged, parameters)
         if source.cameras is not None:
             _check_sizes(source.cameras)
         cameras = fit_cameras(read_cameras_of(source, file.scene), settings)
@@ -83,7 +91,7 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
         pixels = sum(camera.width * camera.height for camera in cameras)
         if pixels > limits["pixels"]:
             raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
-        _check_something_seen(file.scene, cameras, parameters.near)
+        check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
     with _Part("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
@@ -91,17 +99,15 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
             _check_pixels(path, limits)
             load_image(path)
         found["photos"] = len(paths)
-    return found
+    return found, file.scene, cameras, image
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
     """What a job would do: what `check` finds, and the plan of `sgsst plan`."""
-    found = check(staged, parameters, limits)
+    found, scene, cameras, style = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
-    scene = read_scene(staged.scene, drop_invalid=parameters.drop_invalid).scene
-    cameras = fit_cameras(read_cameras_of(request.source, scene), request.settings)
     weights = load_weights(request.backbone)
-    stylizer = Stylizer(scene, cameras, load_image(staged.style), request.settings, weights=weights)
+    stylizer = Stylizer(scene, cameras, style, request.settings, weights=weights)
     made = with_measuring(stylizer.plan)
     seconds = memory = None
     if made.prediction:
@@ -157,26 +163,6 @@ def _check_sizes(path: Path) -> None:
                 raise CameraError(f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'.")
 
 
-def _check_something_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
-    """Prove that a Gaussian's centre lies in a view, or where none does, let the views themselves tell."""
-    means = scene.means.double()
-    for camera in cameras:
-        x, y, z = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
-        across = camera.fx * x / z + camera.cx
-        down = camera.fy * y / z + camera.cy
-        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-        if bool(inside.any()):
-            return
-    from sgsst_core.planning.survey import SEEN_COVERAGE
-    from sgsst_core.rasterizer import make_rasterizer
-
-    rasterizer = make_rasterizer("cpu", scene, near=near)
-    if not any(float(rasterizer.coverage(camera).amax()) > SEEN_COVERAGE for camera in cameras):
-        raise CameraError(
-            f"None of the {len(cameras)} cameras sees a Gaussian. Check that cameras and scene belong together."
-        )
-
-
 # --- one request in a child ----------------------------------------------------------------------------------------
 
 
@@ -226,7 +212,7 @@ def _in_child(request: dict[str, Any]) -> bytes:
         finally:
             os._exit(0)
     os.close(writing)
-    said = _read(reading, time.monotonic() + 2 * request["seconds"])
+    said = _read_to_end(reading, time.monotonic() + 2 * request["seconds"])
     os.close(reading)
     if said is None:
         os.kill(child, signal.SIGKILL)
@@ -239,7 +225,7 @@ def _in_child(request: dict[str, Any]) -> bytes:
     return said or b""
 
 
-def _read(descriptor: int, deadline: float) -> bytes | None:
+def _read_to_end(descriptor: int, deadline: float) -> bytes | None:
     """All that comes until the other end closes; None where it is still open at the deadline."""
     parts: list[bytes] = []
     while (left := deadline - time.monotonic()) > 0:

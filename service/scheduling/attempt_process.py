@@ -24,8 +24,10 @@ from service.parameters import JobParameters
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
+    from sgsst_core.planning.progress import PlanningProgress
     from sgsst_core.stylizing.loop import Progress
-    from worker.job import Prepared, Result
+    from worker.description import Prepared
+    from worker.execute import Result
     from worker.request import StylizeRequest
 
 #: A job takes every core for as long as it runs. Where that is the service's machine, requests go first; alone on its
@@ -44,7 +46,7 @@ class Message(TypedDict, total=False):
     total: int
     loss: float
     seconds: float
-    seconds_left: float
+    seconds_left: float | None
     path: str
     gpus: list[str]
     result: dict[str, Any]
@@ -88,8 +90,8 @@ class Task:
         return Task(staged, JobParameters(**values.pop("parameters")), **values)
 
 
-class Attempt:
-    """The attempt, and what it tells."""
+class AttemptProcess:
+    """An attempt, in the process that makes it."""
 
     def __init__(self, task: Task) -> None:
         self._task = task
@@ -100,7 +102,7 @@ class Attempt:
         signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
         tell({"kind": "stage", "stage": "reading"})
         try:
-            result = self._on_ranks() if self._task.workers > 1 or self._task.cluster else self._alone()
+            result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
         except Exception as error:
             tell(failure(error))
             traceback.print_exc()
@@ -117,34 +119,45 @@ class Attempt:
 
         return replace(stylize_request(self._task.staged, self._task.parameters), resume=self._task.resume)
 
-    def _alone(self) -> Result:
-        from worker.job import describe, execute, prepare
+    def _run_alone(self) -> Result:
+        from worker.description import describe
+        from worker.execute import execute
+        from worker.prepare import prepare
         from worker.previews import Previews
         from worker.request import Resume
 
-        job = prepare(self._request(), resume=Resume(self._task.resume, required=False), warn=log)
-        self._prepared(describe(job))
+        resume = Resume(self._task.resume, required=False)
+        job = prepare(self._request(), resume=resume, warn=log, show_planning=tell_planning)
+        tell_prepared(describe(job))
 
         return execute(
             job,
-            progress=self._progress,
+            progress=tell_progress,
             stop=self._stopping.is_set,
             warn=log,
-            preview=Previews(_PREVIEWS, self._task.preview_seconds, self._preview, log),
+            preview=Previews(_PREVIEWS, self._task.preview_seconds, tell_preview, log),
             checkpoint_seconds=self._task.checkpoint_seconds,
         )
 
-    def _on_ranks(self) -> Result | None:
+    def _run_on_ranks(self) -> Result | None:
         from dataclasses import replace
 
-        from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+        from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
+        from worker.ranks.listener import Listener
         from worker.request import Outputs
 
         request = self._request()
         # a checkpoint that is not there is no error here, as it would be for a user who asks for it
         request = replace(request, resume=request.resume and Outputs(request.out).checkpoints.exist)
         listener = Listener(
-            self._prepared, self._progress, log, log, self._stopping.is_set, self._preview, self._left_out
+            planning=tell_planning,
+            prepared=tell_prepared,
+            progress=tell_progress,
+            happened=log,
+            warn=log,
+            stop=self._stopping.is_set,
+            preview=tell_preview,
+            left_out=tell_left_out,
         )
         options = WorkerOptions(
             checkpoint_seconds=self._task.checkpoint_seconds,
@@ -153,29 +166,50 @@ class Attempt:
         )
         return stylize_on_ranks(request, self._task.workers, listener, options=options).result
 
-    def _prepared(self, prepared: Prepared) -> None:
-        for heading, line in prepared.lines:
-            log(f"{heading}: {line}")
-        tell({"kind": "prepared", "step": prepared.step, "total": prepared.total})
 
-    def _progress(self, now: Progress) -> None:
-        tell(
-            {
-                "kind": "progress",
-                "stage": now.stage,
-                "step": now.step,
-                "total": now.total,
-                "loss": now.loss,
-                "seconds": now.seconds,
-                "seconds_left": now.seconds_left,
-            }
-        )
+def tell_planning(now: PlanningProgress) -> None:
+    """How far the survey of the views has come; its steps are views."""
+    tell(
+        {
+            "kind": "stage",
+            "stage": "planning",
+            "step": now.done,
+            "total": now.total,
+            "seconds_left": now.seconds_left,
+        }
+    )
 
-    def _left_out(self, gpus: Sequence[str]) -> None:
-        tell({"kind": "left-out", "gpus": list(gpus)})
 
-    def _preview(self, path: Path) -> None:
-        tell({"kind": "preview", "path": str(path)})
+def tell_prepared(prepared: Prepared) -> None:
+    """What was decided, for the log, and where the steps begin."""
+    for heading, line in prepared.lines:
+        log(f"{heading}: {line}")
+    tell({"kind": "prepared", "step": prepared.step, "total": prepared.total})
+
+
+def tell_progress(now: Progress) -> None:
+    """A step."""
+    tell(
+        {
+            "kind": "progress",
+            "stage": now.stage,
+            "step": now.step,
+            "total": now.total,
+            "loss": now.loss,
+            "seconds": now.seconds,
+            "seconds_left": now.seconds_left,
+        }
+    )
+
+
+def tell_left_out(gpus: Sequence[str]) -> None:
+    """GPUs that the plan does without."""
+    tell({"kind": "left-out", "gpus": list(gpus)})
+
+
+def tell_preview(path: Path) -> None:
+    """A picture of the running job."""
+    tell({"kind": "preview", "path": str(path)})
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -196,13 +230,15 @@ def failure(error: Exception) -> Message:
     """An error as it is told: whether the same would happen again decides whether the job is tried again."""
     from sgsst_core.errors import DivergedError, InvalidInputError, OutputError, SgsstError
 
-    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if _memory(error) else "internal"
-    message = str(error) if isinstance(error, SgsstError) or _memory(error) else f"{type(error).__name__}: {error}"
+    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if _out_of_memory(error) else "internal"
+    message = (
+        str(error) if isinstance(error, SgsstError) or _out_of_memory(error) else f"{type(error).__name__}: {error}"
+    )
     permanent = isinstance(error, InvalidInputError | DivergedError) and not isinstance(error, OutputError)
     return {"kind": "failed", "error": {"code": code, "message": message}, "permanent": permanent}
 
 
-def _memory(error: Exception) -> bool:
+def _out_of_memory(error: Exception) -> bool:
     text = str(error)
     return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
 
@@ -231,7 +267,7 @@ def main() -> None:
     _channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     os.chdir(sys.argv[1])
-    Attempt(Task.load(Path())).run()
+    AttemptProcess(Task.load(Path())).run()
 
 
 if __name__ == "__main__":

@@ -193,7 +193,7 @@ class RunningAttempt:
                     if message["kind"] in ("done", "failed", "interrupted"):
                         last = message
                     else:
-                        self._hear(message)
+                        self._take_in(message)
                     message = self._messages.get_nowait()
                 ended = True
             if self._wish == "abandon":
@@ -201,29 +201,20 @@ class RunningAttempt:
                 return None
             self._write_progress()
             self._publish(self._unfinished_files() | self._grown_log())
-            self._see_to_wish()
+            self._stop_as_asked()
         assert self._process is not None
         self._process.wait()
         self._write_progress(now=True)
         return last
 
-    def _hear(self, message: Message) -> None:
+    def _take_in(self, message: Message) -> None:
+        """Act on what the process tells, but for its last word."""
         if message["kind"] == "left-out":
             self._give_back(message["gpus"])
         if message["kind"] == "prepared":
             self._store.jobs.running(self.lease)
         if message["kind"] in ("stage", "prepared", "progress"):
-            step, total = message.get("step", 0), message.get("total", 0)
-            self._pending = {
-                "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),
-                "step": step,
-                "total": total,
-                "fraction": step / total if total else 0.0,
-                "eta_s": message.get("seconds_left"),
-                "loss": message.get("loss"),
-                "seconds": message.get("seconds"),
-                "attempt": self.lease.job.attempt,
-            }
+            self._pending = progress_record(message, self.lease.job.attempt)
 
     def _give_back(self, gpus: list[str]) -> None:
         """Leave GPUs that the plan does without to other jobs."""
@@ -237,7 +228,7 @@ class RunningAttempt:
             self._store.jobs.progress(self.lease, self._pending)
             self._pending, self._progress_at = None, moment
 
-    def _see_to_wish(self) -> None:
+    def _stop_as_asked(self) -> None:
         """Ask the process to stop, once, and end it where it takes too long."""
         process = self._process
         assert process is not None
@@ -292,13 +283,13 @@ class RunningAttempt:
                 stamp = (status.st_size, status.st_mtime_ns)
                 if self._published.get(name) != stamp:
                     fresh[name] = (path, stamp)
-        put = [done for name, (path, _) in fresh.items() if (done := self._put(name, path)) is not None]
+        put = [done for name, (path, _) in fresh.items() if (done := self._store_file(name, path)) is not None]
         if put:
             for location in self._store.jobs.publish(self.lease, put):
                 self._artifacts.remove(location)
             self._published |= {name: stamp for name, (_, stamp) in fresh.items()}
 
-    def _put(self, name: str, path: Path) -> Published | None:
+    def _store_file(self, name: str, path: Path) -> Published | None:
         """Copy a file to the results; None where it has just been replaced or removed."""
         try:
             step = _saved_step(path) if name == CHECKPOINT else None
@@ -353,6 +344,21 @@ class RunningAttempt:
     @property
     def _extra(self) -> dict[str, Any]:
         return {"job": self.lease.job_id, "attempt": self.lease.job.attempt}
+
+
+def progress_record(message: Message, attempt: int) -> dict[str, Any]:
+    """The progress of a job as its record has it, by what its process tells; steps of `planning` are views."""
+    step, total = message.get("step", 0), message.get("total", 0)
+    return {
+        "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),
+        "step": step,
+        "total": total,
+        "fraction": step / total if total else 0.0,
+        "eta_s": message.get("seconds_left"),
+        "loss": message.get("loss"),
+        "seconds": message.get("seconds"),
+        "attempt": attempt,
+    }
 
 
 def sweep(jobs: Jobs, artifacts: Artifacts, job_id: str, epoch: int) -> None:

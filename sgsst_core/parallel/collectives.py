@@ -61,18 +61,18 @@ class Collectives(Protocol):
         """What `make` returns on rank 0, the only one that calls it; an `SgsstError` of it is raised on every rank."""
         ...
 
-    def expect(self, seconds: float) -> None:
-        """From now on ranks meet about so often: one that keeps the others waiting for much longer is given up.
+    def set_timeout_for(self, iteration_seconds: float) -> None:
+        """From now on ranks meet in every iteration: one that keeps the others waiting for much longer is given up.
 
         Until this is called, they wait for as long as it may take to prepare a job.
         """
         ...
 
-    def first(self, count: int) -> Collectives | None:
+    def leading_group(self, count: int) -> Collectives | None:
         """The group of the first `count` ranks; None on the others."""
         ...
 
-    def split(self, groups: int) -> Collectives:
+    def split_group(self, groups: int) -> Collectives:
         """The group of this rank when neighbouring ranks form so many groups of equal size."""
         ...
 
@@ -104,13 +104,13 @@ class _Alone:
     def broadcast(self, make: Callable[[], T]) -> T:
         return make()
 
-    def expect(self, seconds: float) -> None:
+    def set_timeout_for(self, iteration_seconds: float) -> None:
         return None
 
-    def first(self, count: int) -> Collectives | None:
+    def leading_group(self, count: int) -> Collectives | None:
         return self
 
-    def split(self, groups: int) -> Collectives:
+    def split_group(self, groups: int) -> Collectives:
         return self
 
 

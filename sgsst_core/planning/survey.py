@@ -23,6 +23,19 @@ from sgsst_core.scene.gaussians import Scene
 SEEN_COVERAGE = 1 / 255
 
 
+def sees_something(coverage: Tensor) -> bool:
+    """Whether anything can be seen of a view's coverage [H, W]."""
+    return float(coverage.amax()) > SEEN_COVERAGE
+
+
+def nothing_seen(cameras: int) -> CameraError:
+    """The error of so many cameras, none of which sees a Gaussian."""
+    return CameraError(
+        f"None of the {cameras} cameras sees a Gaussian. Check that cameras and scene belong together (same training "
+        "run, same world), or let an orbit make the cameras."
+    )
+
+
 @dataclass(frozen=True)
 class Survey:
     """What the views show.
@@ -61,7 +74,7 @@ def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, coll
     for index in range(collectives.rank, len(cameras), collectives.size):
         camera = cameras[index]
         coverage = rasterizer.coverage(camera)
-        seen = float(coverage.amax()) > SEEN_COVERAGE
+        seen = sees_something(coverage)
         uncovered = float((1 - coverage).sum(dtype=torch.float64))
         own[index] = _Look(covered_region(coverage), uncovered, coverage.numel(), seen)
         if seen:
@@ -72,10 +85,7 @@ def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, coll
         looks |= part
     covered = [index for index in range(len(cameras)) if looks[index].covered]
     if not covered:
-        raise CameraError(
-            f"None of the {len(cameras)} cameras sees a Gaussian. Check that cameras and scene belong "
-            "together (same training run, same world), or let --orbit make cameras."
-        )
+        raise nothing_seen(len(cameras))
     weights = collectives.all_reduce(weights.to(rasterizer.device)).cpu()
     uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
     regions = [looks[index].region for index in range(len(cameras))]

@@ -18,7 +18,7 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.ply import SceneFile
-from sgsst_core.planning.survey import SEEN_COVERAGE
+from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -292,7 +292,7 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
             refused.append(str(error))
             uncovered.append(0.0)
             continue
-        seen = bool((coverage > SEEN_COVERAGE).any())
+        seen = sees_something(coverage)
         uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
         ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
         weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()

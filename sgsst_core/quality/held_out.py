@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sgsst_core.budget import Shelf
 from sgsst_core.loss.sos import ScaleTarget, SosLoss
-from sgsst_core.planning.survey import SEEN_COVERAGE
+from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.consistency import (
     LONG_RANGE,
     SHORT_RANGE,
@@ -224,7 +224,7 @@ class HeldOut:
         """Mean coverage of a view, 0 if nothing can be seen, and median depth where it is known."""
         small = resized(camera, min(_OUTLOOK_SIDE, max(camera.width, camera.height)))
         coverage = self.rasterizer.coverage(small)
-        seen = float(coverage.amax()) > SEEN_COVERAGE
+        seen = sees_something(coverage)
         depth = expected_depth(self.scene, small, self.rasterizer)
         known = depth.depth[depth.known]
         return float(coverage.mean()) if seen else 0.0, float(known.median()) if len(known) else None

@@ -219,16 +219,16 @@ class Stylizer:
 
     def _join(self, collectives: Collectives) -> None:
         """Take part in what the plan needs, in the group whose views are this rank's."""
-        taking_part = collectives.first(min(self.plan.ranks, collectives.size))
+        taking_part = collectives.leading_group(min(self.plan.ranks, collectives.size))
         if taking_part is None:
             raise RankLeftOut
         self.collectives = taking_part
         self.memory = self.memory_limit // self._sharing(taking_part)
         self.groups = math.gcd(self.settings.views_per_step, taking_part.size)
-        self.group = taking_part.split(self.groups)
+        self.group = taking_part.split_group(self.groups)
         expected = self.plan.prediction
         for ranks in (self.collectives, self.group):
-            ranks.expect(expected.seconds if expected else 0.0)
+            ranks.set_timeout_for(expected.seconds if expected else 0.0)
         #: Pixels and seconds of this rank's share of the network in each step, until ranks have been compared.
         self._pace: list[tuple[int, float]] | None = [] if self.settings.rebalance and self.group.size > 1 else None
         self._cost = 0

@@ -21,6 +21,7 @@ import psutil
 
 from sgsst_core.errors import RanksFailedError
 from worker.ranks import sweeper
+from worker.ranks.failure_policy import first_line
 
 #: Of Ray's object store: tensors travel through torch.distributed and scenes through files, so that next to nothing
 #: lies there. Ray would take 30 % of all memory.
@@ -85,12 +86,12 @@ class Cluster:
     def _join(self) -> None:
         import ray
 
-        _quiet()
+        _silence_ray()
         try:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray has many for this, some of them plain ones
             raise RanksFailedError(
-                f"The Ray cluster at {self.address} cannot be joined: {_first_line(error)}. Check RAY_ADDRESS, or "
+                f"The Ray cluster at {self.address} cannot be joined: {first_line(error)}. Check RAY_ADDRESS, or "
                 "leave it out for workers on this machine."
             ) from error
 
@@ -101,7 +102,7 @@ class Cluster:
         os.environ.setdefault("RAY_worker_niceness", "0")  # ranks are the work itself, not something beside it
         import ray
 
-        _quiet()
+        _silence_ray()
         parent = tempfile.gettempdir()
         self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir=parent if len(parent) < 24 else "/tmp"))
         assert len(str(self._folder)) <= _LONGEST_FOLDER
@@ -129,7 +130,7 @@ class Cluster:
             if not isinstance(error, Exception):
                 raise
             raise RanksFailedError(
-                f"Ray could not be started on this machine: {_first_line(error)}. Run without --workers, or set "
+                f"Ray could not be started on this machine: {first_line(error)}. Run without --workers, or set "
                 "RAY_ADDRESS to a cluster."
             ) from error
         started = [process for process in psutil.Process().children() if process not in earlier]
@@ -153,7 +154,7 @@ class Cluster:
             self._sweeper = None
 
 
-def _quiet() -> None:
+def _silence_ray() -> None:
     """Keep Ray from printing what becomes of its processes: what matters is told in this program's words.
 
     `log_to_driver=False` silences the workers, but not Ray's own errors, which go to standard output by way of this
@@ -162,7 +163,3 @@ def _quiet() -> None:
     import ray._private.worker as worker
 
     worker.print_to_stdstream = lambda *arguments, **options: None
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__).rstrip(".")

@@ -50,7 +50,7 @@ def process_group(
         size: ranks in all; with 1 there is no group.
         address: "host:port" at which rank 0 listens.
         device: that this rank computes on; tensors of all exchanges lie there.
-        timeout: of each exchange, once `Collectives.expect` was called.
+        timeout: of each exchange, once `Collectives.set_timeout_for` was called.
     """
     if size == 1:
         yield ALONE
@@ -86,15 +86,15 @@ class ProcessGroupCollectives:
         self._group = group
         self._device = device
         self._timeout = timeout
-        self._others: list[ProcessGroupCollectives] = []
+        self._subgroups: list[ProcessGroupCollectives] = []
         # One thread: exchanges meet by their order, which must be the same on every rank.
         self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
         self.local_size = self.all_gather(_machine()).count(_machine())
 
     def close(self) -> None:
         """Let exchanges under way come to their end, and start no more."""
-        for other in self._others:
-            other.close()
+        for subgroup in self._subgroups:
+            subgroup.close()
         self._background.shutdown(cancel_futures=True)
 
     def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
@@ -170,24 +170,24 @@ class ProcessGroupCollectives:
             raise problem
         return value
 
-    def expect(self, seconds: float) -> None:
+    def set_timeout_for(self, iteration_seconds: float) -> None:
         """See `Collectives`."""
-        _set_pg_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * seconds)), self._group)
+        _set_pg_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * iteration_seconds)), self._group)
 
-    def first(self, count: int) -> Collectives | None:
+    def leading_group(self, count: int) -> Collectives | None:
         """See `Collectives`."""
-        return self if count == self.size else self._subgroup([list(range(count))])
+        return self if count == self.size else self._own_group([list(range(count))])
 
-    def split(self, groups: int) -> Collectives:
+    def split_group(self, groups: int) -> Collectives:
         """See `Collectives`."""
         if groups == 1:
             return self
         each = self.size // groups
-        own = self._subgroup([list(range(start, start + each)) for start in range(0, self.size, each)])
+        own = self._own_group([list(range(start, start + each)) for start in range(0, self.size, each)])
         assert own is not None
         return own
 
-    def _subgroup(self, all_ranks: list[list[int]]) -> Collectives | None:
+    def _own_group(self, all_ranks: list[list[int]]) -> Collectives | None:
         """The one of these groups of ranks that this rank is in; every rank makes all of them, as the library asks."""
         own: Collectives | None = None
         for ranks in all_ranks:
@@ -196,7 +196,7 @@ class ProcessGroupCollectives:
             if self.rank in ranks:
                 own = ALONE if len(ranks) == 1 else ProcessGroupCollectives(group, self._device, self._timeout)
         if isinstance(own, ProcessGroupCollectives):
-            self._others.append(own)
+            self._subgroups.append(own)
         return own
 
 

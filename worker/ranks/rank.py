@@ -20,8 +20,10 @@ from worker.processes import ProcessId, die_with_parent, interface_towards
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
+    from sgsst_core.planning.progress import PlanningProgress
     from sgsst_core.stylizing.loop import Progress
-    from worker.job import Prepared, Result
+    from worker.description import Prepared
+    from worker.execute import Result
     from worker.request import Resume, StylizeRequest
 
 #: Seconds by which an exchange waits longer than the driver: so the driver, which knows which rank gives no answer, is
@@ -30,7 +32,7 @@ _PATIENCE = 15.0
 
 
 @dataclass(frozen=True)
-class Place:
+class RankPlace:
     """Where a rank's process is.
 
     Attributes:
@@ -49,7 +51,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Task:
+class RankTask:
     """What a rank has to do.
 
     Attributes:
@@ -60,11 +62,11 @@ class Task:
         timeout: seconds after which a rank that gives no answer counts as lost.
         folder: from which relative paths are meant.
         resume: whether to go on from a checkpoint.
-        run: identifies the run of the program.
+        run_id: identifies the run of the program.
         checkpoint_seconds: between checkpoints.
         preview_folder, preview_seconds: see `attempts.WorkerOptions`.
         workers: for the report: what has happened so far.
-        seconds_lost, seconds_since_loss: of the last attempt (see `attempts.Attempt`), until this task was made.
+        seconds_lost, seconds_since_loss: of the last attempt (see `attempts.LostAttempt`), until this task was made.
     """
 
     request: StylizeRequest
@@ -75,7 +77,7 @@ class Task:
     timeout: float
     folder: Path
     resume: Resume
-    run: str
+    run_id: str
     checkpoint_seconds: float
     preview_folder: Path | None
     preview_seconds: float
@@ -104,10 +106,11 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Status:
+class RankStatus:
     """What a rank answers when it is asked.
 
     Attributes:
+        planning: how far the survey of the views has come; None where there was none.
         prepared: once the inputs have been read; rank 0 alone.
         progress: of the last step; rank 0 alone.
         saved: step of the last checkpoint that this rank has written.
@@ -116,6 +119,7 @@ class Status:
         outcome: once it has ended.
     """
 
+    planning: PlanningProgress | None = None
     prepared: Prepared | None = None
     progress: Progress | None = None
     saved: int | None = None
@@ -128,18 +132,18 @@ class RankProcess:
     """The Ray actor of a rank. Every method returns at once."""
 
     def __init__(self) -> None:
-        self._status = Status()
+        self._status = RankStatus()
         self._stop = threading.Event()
         self._lock = threading.Lock()
         die_with_parent()  # of Ray's daemon: a stopped process would not notice that it is gone
 
-    def place(self) -> Place:
+    def place(self) -> RankPlace:
         """Where this is."""
         import ray
 
         node = ray.get_runtime_context().get_node_id()
         gpus = tuple(str(name) for name in ray.get_gpu_ids())
-        return Place(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this(), gpus)
+        return RankPlace(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this(), gpus)
 
     def free_port(self) -> int:
         """A port on which nobody listens."""
@@ -147,11 +151,11 @@ class RankProcess:
             trial.bind(("", 0))
             return int(trial.getsockname()[1])
 
-    def start(self, task: Task) -> None:
+    def start(self, task: RankTask) -> None:
         """Begin."""
         threading.Thread(target=self._run, args=(task,), daemon=True, name="job").start()
 
-    def poll(self) -> Status:
+    def poll(self) -> RankStatus:
         """The present state: the answer itself is the sign of life."""
         with self._lock:
             return self._status
@@ -160,18 +164,18 @@ class RankProcess:
         """Ask the job to end after the step in hand; on rank 0."""
         self._stop.set()
 
-    def _tell(self, **changes: Any) -> None:
+    def _update(self, **changes: Any) -> None:
         with self._lock:
             self._status = replace(self._status, **changes)
 
-    def _run(self, task: Task) -> None:
+    def _run(self, task: RankTask) -> None:
         try:
-            _set_up(task)
+            _set_environment(task)
             self._work(task)
         except BaseException as error:
-            self._tell(outcome=_failure(error))
+            self._update(outcome=_failure(error))
 
-    def _work(self, task: Task) -> None:
+    def _work(self, task: RankTask) -> None:
         import torch
 
         from sgsst_core.parallel.collectives import RankLeftOut
@@ -183,21 +187,29 @@ class RankProcess:
         with process_group(task.rank, task.size, task.address, device=device, timeout=timeout) as collectives:
             # The outcome is told inside the block: leaving the group may have to wait for ranks that are lost.
             try:
-                self._tell(outcome=Outcome("done", self._job(task, collectives)))
+                self._update(outcome=Outcome("done", self._job(task, collectives)))
             except RankLeftOut:
-                self._tell(outcome=Outcome("left-out"))
+                self._update(outcome=Outcome("left-out"))
             except BaseException as error:
-                self._tell(outcome=_failure(error))
+                self._update(outcome=_failure(error))
 
-    def _job(self, task: Task, collectives: Collectives) -> Result:
-        from worker.job import describe, execute, prepare
+    def _job(self, task: RankTask, collectives: Collectives) -> Result:
+        from worker.description import describe
+        from worker.execute import execute
+        from worker.prepare import prepare
         from worker.previews import Previews
 
         started = time.monotonic()
-        job = prepare(task.request, collectives=collectives, resume=task.resume, warn=self._warn)
+        job = prepare(
+            task.request,
+            collectives=collectives,
+            resume=task.resume,
+            warn=self._add_warning,
+            show_planning=lambda planning: self._update(planning=planning),
+        )
         job.workers |= task.workers
         if task.rank == 0:
-            self._tell(prepared=describe(job))
+            self._update(prepared=describe(job))
 
         def progress(current: Progress) -> None:
             if self._status.progress is None and job.workers["attempts"]:
@@ -205,29 +217,29 @@ class RankProcess:
                 lost = job.workers["attempts"][-1]
                 lost["seconds_lost"] = round(task.seconds_lost + since, 3)
                 lost["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
-            self._tell(progress=current)
+            self._update(progress=current)
 
         return execute(
             job,
             progress=progress,
             stop=self._stop.is_set,
-            warn=self._warn,
-            preview=Previews(task.preview_folder, task.preview_seconds, self._show, self._warn)
+            warn=self._add_warning,
+            preview=Previews(task.preview_folder, task.preview_seconds, self._add_preview, self._add_warning)
             if task.preview_folder
             else None,
-            saved=lambda step: self._tell(saved=step),
+            saved=lambda step: self._update(saved=step),
             checkpoint_seconds=task.checkpoint_seconds,
-            run_id=task.run,
+            run_id=task.run_id,
         )
 
-    def _show(self, path: Path) -> None:
-        self._tell(previews=(*self._status.previews, path))
+    def _add_preview(self, path: Path) -> None:
+        self._update(previews=(*self._status.previews, path))
 
-    def _warn(self, line: str) -> None:
-        self._tell(warnings=(*self._status.warnings, line))
+    def _add_warning(self, line: str) -> None:
+        self._update(warnings=(*self._status.warnings, line))
 
 
-def _set_up(task: Task) -> None:
+def _set_environment(task: RankTask) -> None:
     """Threads, GPU, network and folder, before anything is imported that looks at them."""
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ[name] = str(task.threads)
@@ -250,10 +262,10 @@ def _failure(error: BaseException) -> Outcome:
         pickle.loads(pickle.dumps(told))
     except Exception:  # whatever it holds, its text can travel
         told = RuntimeError(f"{type(error).__name__}: {error}")
-    return Outcome("failed", error=told, trace=trace, echo=_from_exchange(error))
+    return Outcome("failed", error=told, trace=trace, echo=_raised_in_exchange(error))
 
 
-def _from_exchange(error: BaseException) -> bool:
+def _raised_in_exchange(error: BaseException) -> bool:
     """Whether an error was raised inside torch.distributed."""
     step = error.__traceback__
     while step is not None:

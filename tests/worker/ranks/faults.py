@@ -18,7 +18,7 @@ import psutil
 
 from sgsst_core.settings import make_settings
 from tests.small_scenes import wall, write_files
-from worker.ranks.rank import RankProcess, Task
+from worker.ranks.rank import RankProcess, RankTask
 from worker.request import SceneRequest, StylizeRequest
 
 Place = Literal[
@@ -87,7 +87,7 @@ class Fault:
 class FaultyRank(RankProcess):
     """A rank to which the fault that lies beside its output happens."""
 
-    def _work(self, task: Task) -> None:
+    def _work(self, task: RankTask) -> None:
         if _file(task.request).exists():
             fault = Fault(**json.loads(_file(task.request).read_text()))
             if fault.rank == task.rank:

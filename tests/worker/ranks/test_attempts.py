@@ -21,9 +21,12 @@ from sgsst_core.errors import SceneError
 from sgsst_core.stylizing.loop import Progress
 from sgsst_core.stylizing.stylizer import mean_loss
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, shared_memory, small_request
-from worker.job import Prepared, execute, prepare
-from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
+from worker.description import Prepared
+from worker.execute import execute
+from worker.prepare import prepare
+from worker.ranks.attempts import RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.listener import Listener
 from worker.request import StylizeRequest
 
 pytestmark = [

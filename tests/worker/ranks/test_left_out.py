@@ -14,7 +14,8 @@ import pytest
 from sgsst_core.stylizing.loop import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, small_request
 from worker.ranks import cluster
-from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
+from worker.ranks.listener import Listener
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "vgg16_weights"),

@@ -85,8 +85,8 @@ def merge_nothing(collectives: Collectives) -> LayerStatistics:
 
 
 def values(collectives: Collectives) -> dict[str, Any]:
-    own = collectives.split(2)
-    part = collectives.first(2)
+    own = collectives.split_group(2)
+    part = collectives.leading_group(2)
     return {
         "all_gather": collectives.all_gather(collectives.rank),
         "broadcast": collectives.broadcast(lambda: f"made by {collectives.rank}"),
@@ -179,7 +179,7 @@ def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
     """Whether rank 1 waits for rank 0, which comes three seconds late, where one second is the time-out."""
     collectives.all_gather(None)
     if expected is not None:
-        collectives.expect(expected)
+        collectives.set_timeout_for(expected)
     if collectives.rank == 0:
         time.sleep(3)
     try:

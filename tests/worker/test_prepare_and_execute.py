@@ -10,7 +10,8 @@ import pytest
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import read_scene
 from tests.worker.ranks.faults import Fault, small_request
-from worker.job import Job, Result, execute, prepare
+from worker.execute import Result, execute
+from worker.prepare import Job, prepare
 from worker.request import Resume, StylizeRequest
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")

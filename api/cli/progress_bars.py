@@ -1,0 +1,78 @@
+"""How far a job is, on a terminal: live bars, or a line a minute where they cannot be drawn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
+
+if TYPE_CHECKING:
+    from sgsst_core.planning.progress import PlanningProgress
+    from sgsst_core.stylizing.loop import Progress as StepProgress
+    from worker.description import Prepared
+
+#: Where no bar can be drawn (a log file), a line is printed instead, this often.
+LOG_SECONDS = 60.0
+
+
+def live_bar(console: Console, *columns: ProgressColumn) -> Progress:
+    """A live progress bar on a terminal; nothing elsewhere, where it could not be drawn over."""
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+class JobBar:
+    """The progress of a job, from its reading to its last step; see `job_bar`."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task = bar.add_task("reading", total=None, note="")
+        self._last_line = time.monotonic()
+
+    def show_planning(self, planning: PlanningProgress) -> None:
+        """Show how many views have been looked at."""
+        left = "" if planning.seconds_left is None else f"{clock(planning.seconds_left)} left"
+        self._show("Looking at the views", planning.done, planning.total, left)
+        self._print_now_and_then(f"Looking at the views: {planning.done} of {planning.total}", left)
+
+    def start(self, prepared: Prepared) -> None:
+        """Show where the steps begin."""
+        self._show("starting", prepared.step, prepared.total, "")
+
+    def show(self, progress: StepProgress) -> None:
+        """Show a step."""
+        stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
+        loss, left = f"loss {progress.loss:.3g}", f"{clock(progress.seconds_left)} left"
+        self._show(stage, progress.step, progress.total, f"{loss} {left}")
+        self._print_now_and_then(f"{stage}: step {progress.step} of {progress.total}", loss, left)
+
+    def _show(self, description: str, done: int, total: int, note: str) -> None:
+        self._bar.update(self._task, description=description, completed=done, total=total, note=note)
+
+    def _print_now_and_then(self, *parts: str) -> None:
+        if self._bar.disable and time.monotonic() - self._last_line >= LOG_SECONDS:
+            self._last_line = time.monotonic()
+            self._bar.console.print(", ".join(part for part in parts if part))
+
+
+@contextmanager
+def job_bar(console: Console) -> Iterator[JobBar]:
+    """A live bar, or a line a minute where there is no terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with live_bar(console, *columns) as bar:
+        yield JobBar(bar)
+
+
+def clock(seconds: float) -> str:
+    """A duration as minutes and seconds, or hours, minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

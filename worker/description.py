@@ -1,0 +1,66 @@
+"""What a job tells before its first step: what was read, what was decided, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from worker.prepare import Job
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What there is to tell before the first step.
+
+    Attributes:
+        lines: pairs of a heading and a line, see `describe`.
+        step: at which the job starts; more than 0 after a resume.
+        total: of all steps.
+    """
+
+    lines: list[tuple[str, str]]
+    step: int
+    total: int
+
+
+def describe(job: Job) -> Prepared:
+    """What was decided, for the user to read before the work starts."""
+    stylizer, settings = job.stylizer, job.stylizer.settings
+    lines = [("scene", _describe_scene(job)), ("views", _describe_views(job)), ("network", _describe_network(job))]
+    lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.plan.decisions]
+    rate = f"learning rate {settings.learning_rate:g}"
+    if settings.learning_rate_end != settings.learning_rate:
+        rate += f" to {settings.learning_rate_end:g}"
+    steps = f"{stylizer.plan.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
+    if not stylizer.plan.steps_coarse:
+        steps = f"{settings.steps_sos} steps"
+    lines.append(("schedule", f"{steps}; {rate} (preset {settings.preset})"))
+    if job.resumed:
+        lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.total}"))
+    elif job.outputs.checkpoints.exist:
+        note = f"{job.outputs.checkpoint} of an earlier run is there. This run starts anew and will replace it; "
+        lines.append(("note", note + "--resume would go on from it."))
+    return Prepared(lines, job.resumed.state.step if job.resumed else 0, stylizer.total)
+
+
+def _describe_scene(job: Job) -> str:
+    scene = job.scene_file.scene
+    dropped = f", {job.scene_file.dropped:,} invalid ones left out" if job.scene_file.dropped else ""
+    return f"{len(scene):,} Gaussians{dropped}, SH degree {scene.sh_degree}"
+
+
+def _describe_views(job: Job) -> str:
+    views = job.stylizer.views
+    sizes = sorted({(camera.width, camera.height) for camera in views.cameras})
+    text = f"{len(views)} of {sizes[0][0]}x{sizes[0][1]}"
+    if len(sizes) > 1:
+        text = f"{len(views)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
+    scales = max(job.stylizer.loss.scale_count(height, width) for width, height in sizes)
+    text += f", {scales} scale{'s' if scales > 1 else ''}"
+    return text + f"; content from {'the photos' if job.request.images else 'unstylized renders'}"
+
+
+def _describe_network(job: Job) -> str:
+    name = job.sources.backbone.name.upper()
+    if job.request.backbone == "auto" and name == "VGG16":
+        return f"{name}, because VGG19 (the paper's) is not installed: `sgsst weights fetch vgg19` gets it"
+    return name

@@ -1,0 +1,169 @@
+"""A prepared job from its first step to its files."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sgsst_core.errors import OutputError
+from sgsst_core.files.atomic import remove_leftovers
+from sgsst_core.files.ply import write_stylized
+from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
+from sgsst_core.quality.measure import Measurements
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.document import (
+    bought,
+    build_report,
+    plan_json,
+    write_contact_sheet,
+    write_json,
+    write_loss_curves,
+)
+from sgsst_core.report.page import write_page
+from sgsst_core.stylizing.checkpoint import Checkpoint, versions
+from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
+from sgsst_core.stylizing.stylizer import Evaluation, Stylizer
+from worker.prepare import Job, Warn
+from worker.request import Outputs
+
+#: Seconds between checkpoints, unless told otherwise: what a lost rank costs at most.
+CHECKPOINT_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a job ended.
+
+    Attributes:
+        stopped: see `run`; where it is "interrupted", only the checkpoint was written.
+        step, total: that were done, and planned.
+        before, after: loss on the evaluation views; `after` is empty where the job was interrupted.
+        bought: what error the time bought (`report.bought`).
+        report_error: why report, contact sheet or curves are missing; None if they are not.
+    """
+
+    stopped: Stopped
+    step: int
+    total: int
+    before: Evaluation
+    after: Evaluation
+    bought: dict[str, Any] | None = None
+    report_error: str | None = None
+
+
+def execute(
+    job: Job,
+    *,
+    progress: Callable[[Progress], None],
+    stop: Callable[[], bool],
+    warn: Warn,
+    preview: Callable[[Stylizer], None] | None = None,
+    saved: Callable[[int], None] = lambda step: None,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    run_id: str | None = None,
+) -> Result:
+    """Run a prepared job and write its outputs: the PLY first, so that no failing report can lose it.
+
+    Checkpoints are written every `checkpoint_seconds` and where the job ends early. One that cannot be written is a
+    warning as long as the job itself goes on. Every rank that takes part calls this; the callbacks are used on the
+    first one alone: `saved` is told the step of each checkpoint, `preview` is called after every step (see `Previews`).
+
+    Raises:
+        OutputError: the PLY, or the checkpoint of an interrupted job, cannot be written.
+    """
+    stylizer = job.stylizer
+    first = stylizer.collectives.rank == 0
+    measure = Measurements(stylizer)
+    before = job.resumed.before if job.resumed else measure.evaluate(unstylized=True)
+    if job.resumed:
+        stylizer.load_state(job.resumed.state)
+    if first:
+        _make_room(job.outputs)
+    stylizer.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.plan)))
+    checkpoint = _CheckpointWriter(job, before, run_id or secrets.token_hex(8), saved, warn)
+    callbacks = Callbacks(measure=measure, moments=measure.moments, checkpoint_seconds=checkpoint_seconds)
+    if first:
+        callbacks.progress, callbacks.stop = progress, stop
+        callbacks.checkpoint, callbacks.preview = checkpoint, preview
+        callbacks.preview_seconds = 0.0  # when it is time for one, it knows itself
+    stopped = run(stylizer, callbacks)
+    if stopped == "interrupted":
+        if checkpoint.error is not None:
+            raise checkpoint.error
+        return Result(stopped, stylizer.step, stylizer.total, before, {})
+    return _finish(job, stopped, before, measure)
+
+
+def _make_room(outputs: Outputs) -> None:
+    """The folder of the outputs, without what an attempt that was killed has left there."""
+    outputs.ply.parent.mkdir(parents=True, exist_ok=True)
+    for path in outputs.all:
+        remove_leftovers(path)
+
+
+class _CheckpointWriter:
+    """Saves a job's state; for `loop.Callbacks.checkpoint`.
+
+    Attributes:
+        error: why the last one could not be written; None where it was.
+    """
+
+    def __init__(self, job: Job, before: Evaluation, run_id: str, saved: Callable[[int], None], warn: Warn) -> None:
+        self._job, self._before, self._run_id = job, before, run_id
+        self._saved, self._warn = saved, warn
+        self.error: OutputError | None = None
+
+    def __call__(self, stylizer: Stylizer) -> None:
+        """Write one, or warn."""
+        job = self._job
+        self.error = None
+        checkpoint = Checkpoint(
+            stylizer.state(), stylizer.plan, job.planned_ranks, self._before, self._run_id, versions()
+        )
+        try:
+            job.outputs.checkpoints.save(checkpoint, job.fingerprint)
+            self._saved(stylizer.step)
+        except OutputError as error:
+            self.error = error
+            self._warn(f"No checkpoint could be written: {error}")
+
+
+def _finish(job: Job, stopped: Stopped, before: Evaluation, measure: Measurements) -> Result:
+    """Write the PLY, then everything beside it. Every rank calls this."""
+    stylizer, outputs = job.stylizer, job.outputs
+    first = stylizer.collectives.rank == 0
+    stylizer.collectives.broadcast(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
+    if first and stopped != "max-seconds":
+        outputs.checkpoints.remove()
+    if stylizer.measured[-1]["step"] != stylizer.step:
+        measure(stylizer)
+    after = measure.evaluate()
+    error = _write_reports(job, stopped, before, after) if first else None
+    found = bought(stylizer, before)
+    return Result(stopped, stylizer.step, stylizer.total, before, after, found, str(error) if error else None)
+
+
+def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evaluation) -> Exception | None:
+    """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
+    stylizer, outputs = job.stylizer, job.outputs
+    try:
+        report = build_report(stylizer, job.sources, stopped, before, after, _findings(job))
+        lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
+        report["workers"] = {**job.workers, "seconds_lost": round(lost, 3)}
+        write_json(outputs.report, report)
+        write_contact_sheet(outputs.sheet, stylizer)
+        write_loss_curves(outputs.curves, stylizer.history, stylizer.round_length)
+        write_page(outputs.page, report, outputs.sheet)
+    except Exception as error:  # whatever it is, it must not look as if the job itself had failed
+        return error
+    return None
+
+
+def _findings(job: Job) -> list[Finding]:
+    stylizer = job.stylizer
+    cameras, near = stylizer.views.cameras, stylizer.settings.near
+    rasterizer = make_rasterizer("cpu", stylizer.scene, near=near)
+    found = [*check_scene(job.scene_file), *check_views(job.scene_file, cameras, rasterizer, near=near)]
+    return [*found, *check_style(stylizer.style, cameras)]

@@ -1,0 +1,175 @@
+"""What jobs read: scene, cameras, style, photos and network, the same for everybody who reads them.
+
+The command line, the service's inspection and every rank of a job read through here.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError, SgsstError
+from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import check_photos, load_image, load_photo
+from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.survey import nothing_seen, sees_something
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.scene.camera import Camera, orbit, resized, spread
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.stylizing.checkpoint import fingerprint
+from sgsst_core.stylizing.stylizer import fit_cameras
+from worker.ranks.geometry import read_shared_scene
+from worker.request import SceneRequest, StylizeRequest
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything that a job reads.
+
+    Attributes:
+        weights: of the feature network.
+        style: [H, W, 3] in 0..1.
+        scene_file: the scene, and what was left out of its file.
+        cameras: at the sizes that they are stylized at.
+        photos: content image of each camera; None for unstylized renders.
+        fingerprint: of all of it, and of the settings: equal for the same job.
+    """
+
+    weights: BackboneWeights
+    style: Tensor
+    scene_file: SceneFile
+    cameras: list[Camera]
+    photos: list[Path] | None
+    fingerprint: str
+
+    @property
+    def load_photo(self) -> Callable[[int], Tensor] | None:
+        """Loads the photo of a camera by its index; None where there are no photos."""
+        photos, cameras = self.photos, self.cameras
+        return (lambda index: load_photo(photos[index], cameras[index])) if photos else None
+
+
+def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> Inputs:
+    """Read every input of a job. Every rank calls this.
+
+    Raises:
+        InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
+    """
+    source, settings, images = request.source, request.settings, request.images
+    weights = _same_weights(request.backbone, collectives)
+    style = together(collectives, lambda: load_image(request.style))
+    scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
+    cameras = together(collectives, lambda: fit_cameras(read_cameras_of(source, scene_file.scene), settings))
+    photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
+    stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
+    own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps) if reader else None
+    return Inputs(weights, style, scene_file, cameras, photos, _same_fingerprint(own, collectives))
+
+
+def read_scene_and_cameras(source: SceneRequest) -> tuple[SceneFile, list[Camera]]:
+    """Read a scene and the cameras that were asked for.
+
+    Raises:
+        SceneError, CameraError: they cannot be used.
+    """
+    file = read_scene(source.scene, drop_invalid=source.drop_invalid)
+    return file, read_cameras_of(source, file.scene)
+
+
+def read_cameras_of(source: SceneRequest, scene: Scene) -> list[Camera]:
+    """The cameras that were asked for, at their resolution.
+
+    Raises:
+        CameraError: they cannot be used.
+    """
+    if source.cameras is not None:
+        cameras = read_cameras(source.cameras)
+    else:
+        axis = [float(name == source.up[-1]) * (-1.0 if source.up.startswith("-") else 1.0) for name in "xyz"]
+        cameras = orbit(scene, source.orbit or 0, up=axis, near=source.near)
+    if source.views is not None:
+        cameras = spread(cameras, source.views)
+    if source.resolution is not None:
+        cameras = [resized(camera, source.resolution) for camera in cameras]
+    return cameras
+
+
+def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:
+    """Prove that a camera sees a Gaussian; rendering ends at the first one that does.
+
+    Raises:
+        CameraError: none does.
+    """
+    if not any(sees_something(rasterizer.coverage(camera)) for camera in cameras):
+        raise nothing_seen(len(cameras))
+
+
+def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
+    """Prove that a Gaussian's centre lies in a view, and only where none does, render.
+
+    Raises:
+        CameraError: no camera sees a Gaussian.
+    """
+    means = scene.means.double()
+    for camera in cameras:
+        x, y, z = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
+        across = camera.fx * x / z + camera.cx
+        down = camera.fy * y / z + camera.cy
+        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
+        if bool(inside.any()):
+            return
+    check_something_seen(cameras, make_rasterizer("cpu", scene, near=near))
+
+
+def together(collectives: Collectives, make: Callable[[], T]) -> T:
+    """What `make` returns on this rank, once it has succeeded on every rank.
+
+    Raises:
+        SgsstError: of the first rank on which it was raised, on every rank.
+    """
+    value, error = None, None
+    try:
+        value = make()
+    except SgsstError as own:
+        error = own
+    for found in collectives.all_gather(error):
+        if found is not None:
+            raise found
+    return value  # type: ignore[return-value]
+
+
+def _same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
+    """The feature network's weights: those that the first rank finds, on every rank."""
+    name = collectives.broadcast(lambda: load_weights(backbone).name)
+    return together(collectives, lambda: load_weights(name))
+
+
+def _same_fingerprint(own: str | None, collectives: Collectives) -> str:
+    """The job's fingerprint, once everybody who has read the scene has found the same.
+
+    Args:
+        own: this rank's; None where another rank of the same machine has read the scene for it.
+    """
+    found = collectives.all_gather((own, socket.gethostname()))
+    for other, host in found:
+        if other is not None and other != found[0][0]:
+            raise SettingsError(
+                f"The files of this job are not the same on {found[0][1]} and {host}: scene, cameras, style or weights "
+                "differ. Give paths on a file system that all machines share."
+            )
+    assert found[0][0] is not None  # the first rank reads for itself
+    return found[0][0]
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    status = path.stat()
+    return path.name, status.st_size, status.st_mtime_ns

@@ -1,0 +1,135 @@
+"""A job before its first step: every input read and checked, the checkpoint to go on from found, the work planned.
+
+Every rank goes through the same functions. Nothing is written and nothing is printed.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from sgsst_core.errors import CheckpointError
+from sgsst_core.files.ply import SceneFile
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.progress import ShowPlanning
+from sgsst_core.quality.measure import with_measuring
+from sgsst_core.report.document import Sources
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.checkpoint import Checkpoint
+from sgsst_core.stylizing.stylizer import Stylizer
+from worker.inputs import read_inputs
+from worker.request import Outputs, Resume, StylizeRequest, check_request
+
+Warn = Callable[[str], None]
+
+
+@dataclass
+class Job:
+    """A job whose inputs have all been read and checked.
+
+    Attributes:
+        resumed: checkpoint to go on from; None starts from the beginning.
+        planned_ranks: that there were when the plan was made.
+        workers: who takes part, and what happened to earlier attempts; for the report.
+    """
+
+    request: StylizeRequest
+    outputs: Outputs
+    scene_file: SceneFile
+    sources: Sources
+    stylizer: Stylizer
+    fingerprint: str
+    resumed: Checkpoint | None
+    planned_ranks: int
+    workers: dict[str, Any]
+
+
+def prepare(
+    request: StylizeRequest,
+    *,
+    collectives: Collectives = ALONE,
+    resume: Resume | None = None,
+    warn: Warn = lambda line: None,
+    show_planning: ShowPlanning | None = None,
+) -> Job:
+    """Read and check every input; nothing is written. Every rank calls this.
+
+    Args:
+        collectives: of all ranks.
+        resume: None for what the request says.
+        warn: told of checkpoints that cannot be used.
+        show_planning: shows how far the survey of the views has come; not called where a checkpoint brings its plan.
+
+    Raises:
+        InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
+        RankLeftOut: the job goes on without this rank.
+    """
+    outputs = collectives.broadcast(lambda: check_request(request))
+    inputs = read_inputs(request, collectives)
+    settings = request.settings
+    resume = resume or Resume(request.resume)
+    resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
+    if resumed and not settings.memory_limit:
+        settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
+    # A plan made for fewer ranks cannot say what more of them are good for.
+    plan = resumed.plan if resumed and collectives.size <= resumed.ranks else None
+    stylizer = Stylizer(
+        inputs.scene_file.scene,
+        inputs.cameras,
+        inputs.style,
+        settings,
+        weights=inputs.weights,
+        photos=inputs.load_photo,
+        collectives=collectives,
+        plan=plan,
+    )
+    planned_ranks = resumed.ranks if resumed and plan else collectives.size
+    if plan is None:
+        stylizer.plan = with_measuring(stylizer.plan)
+    source, scene_file, images = request.source, inputs.scene_file, request.images
+    sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, inputs.weights)
+    workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
+    return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
+
+
+def _workers_used(stylizer: Stylizer) -> dict[str, Any]:
+    device = stylizer.network.device
+    own = {
+        "host": socket.gethostname(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "threads": torch.get_num_threads(),
+    }
+    ranks = stylizer.collectives.all_gather(own)
+    return {"used": len(ranks), "ranks": ranks}
+
+
+def _find_checkpoint(
+    outputs: Outputs, job_id: str, settings: Settings, resume: Resume, warn: Warn
+) -> Checkpoint | None:
+    """The checkpoint to go on from; None to start from the beginning."""
+    if not resume.wanted:
+        return None
+    checkpoints = outputs.checkpoints
+    if resume.required and not checkpoints.exist and outputs.ply.exists():
+        raise CheckpointError(
+            f"{outputs.ply}: is there, and no checkpoint beside it, so this job is finished. To start again, leave "
+            "--resume out."
+        )
+    try:
+        found = checkpoints.load(job_id, warn, resume.run)
+    except CheckpointError:
+        if resume.required:
+            raise
+        return None
+    if resume.required and settings.max_seconds and found.state.seconds >= settings.max_seconds:
+        raise CheckpointError(
+            f"{outputs.checkpoint}: the job has run for {found.state.seconds:.0f} s already, and --max-seconds counts "
+            f"these too. Give more than {found.state.seconds:.0f}, or leave --max-seconds out."
+        )
+    if found.written_by["torch"] != torch.__version__:
+        warn(f"The checkpoint was written with PyTorch {found.written_by['torch']}: last digits may differ.")
+    return found

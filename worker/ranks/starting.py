@@ -1,0 +1,81 @@
+"""Starting the ranks of an attempt: reserve places, start an actor in each, number them, give each its task."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from worker.ranks.failure_policy import Failure
+from worker.ranks.placement import NoRoomError, reserve
+from worker.ranks.rank import RankPlace, RankProcess, RankTask
+from worker.ranks.rank_group import AttemptFailedError, RankGroup, RankHandle
+
+#: Seconds that a process of a rank may take to start.
+START_SECONDS = 60.0
+
+#: Makes the task of the rank of a number, in a started group, at rank 0's "host:port".
+MakeTask = Callable[[int, str], RankTask]
+
+
+def start_ranks(group: RankGroup, workers: int, actor: type[RankProcess], make_task: MakeTask) -> None:
+    """Start as many ranks as there is room for, and begin their work.
+
+    Args:
+        group: an empty one; it holds what has been started even where an error is raised.
+        workers: ranks at most.
+        actor: what runs a rank.
+
+    Raises:
+        AttemptFailedError: there is no room.
+        RayError: a process did not start in time.
+    """
+    import ray
+
+    try:
+        group.reservation = reserve(workers)
+    except NoRoomError as error:
+        raise AttemptFailedError(Failure("loss", str(error))) from error
+    kind = ray.remote(actor)
+    group.handles = [RankHandle(kind.options(**options).remote()) for options in group.reservation.actor_options()]
+    places = _from_all(group, "place")
+    for rank, place in zip(group.handles, places, strict=True):
+        rank.place = place
+    group.handles = _numbered(group.handles, ray.get_runtime_context().get_node_id())
+    address = _address(group.handles)
+    _from_all(group, "start", [(make_task(number, address),) for number in range(len(group.handles))])
+    for rank in group.handles:
+        rank.answered_at = time.monotonic()
+
+
+def _from_all(group: RankGroup, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
+    """What a method of each rank returns, called on all at once."""
+    import ray
+
+    given = arguments or [()] * len(group.handles)
+    calls = [getattr(rank.actor, method).remote(*own) for rank, own in zip(group.handles, given, strict=True)]
+    return ray.get(calls, timeout=START_SECONDS)
+
+
+def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
+    """Ranks by number: rank 0 writes the files, so it belongs where the driver is; neighbours share a machine."""
+
+    def order(rank: RankHandle) -> tuple[bool, str]:
+        place = _place(rank)
+        return place.node != here, place.node
+
+    return sorted(handles, key=order)
+
+
+def _address(handles: list[RankHandle]) -> str:
+    """The "host:port" at which rank 0 will listen."""
+    import ray
+
+    alone = len({_place(rank).node for rank in handles}) == 1
+    host = "127.0.0.1" if alone else _place(handles[0]).address
+    return f"{host}:{ray.get(handles[0].actor.free_port.remote(), timeout=START_SECONDS)}"
+
+
+def _place(rank: RankHandle) -> RankPlace:
+    assert rank.place is not None  # every rank has told it before it is numbered
+    return rank.place
