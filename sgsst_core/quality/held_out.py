@@ -59,18 +59,13 @@ def moments(total_steps: int) -> list[int]:
     return sorted({0, *(total_steps >> halvings for halvings in range(6))})
 
 
-def held_out_cameras(cameras: Sequence[Camera], covered: Sequence[int]) -> list[Camera]:
-    """One camera between each two neighbours among the cameras of some indices; neighbours in space follow each other.
+def neighbours(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
+    """The pairs that held-out cameras lie between: each two neighbours; neighbours in space follow each other.
 
     The list's order counts. Where the next camera is mostly no neighbour (see `JUMP` and `LARGEST_TURN`) the list is
     not in the order of a capture, and a walk from each camera to the nearest one takes its place. Fewer than two
     cameras have nothing between them, and neither have two of one pose.
     """
-    return [between(*pair) for pair in _neighbours([cameras[index] for index in covered])]
-
-
-def _neighbours(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
-    """The pairs that held-out cameras lie between."""
     if len(cameras) < 2:
         return []
     centres = torch.stack([camera.centre for camera in cameras])
@@ -195,7 +190,7 @@ class HeldOut:
         self._coverage: Shelf[int, Tensor] = Shelf(memory // 8, _tensor_bytes)
         self._warps: Shelf[tuple[int, int], Warp] = Shelf(memory // 2, lambda warp: warp.nbytes)
         self._picture_memory = memory // 4
-        parents = _neighbours([cameras[index] for index in covered])
+        parents = neighbours([cameras[index] for index in covered])
         self.cameras = [between(*pair) for pair in parents]
         self.views, self.pairs = self._choose(parents)
 

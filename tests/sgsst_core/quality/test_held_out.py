@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -22,7 +23,7 @@ from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.loss.sos_reference import box_average_reference, features_reference
 from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE
-from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, held_out_cameras, moments
+from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, moments, neighbours
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
@@ -47,6 +48,11 @@ def posed(turned: Tensor, centre: tuple[float, float, float] | Tensor, name: str
     pose[:3, :3] = turned
     pose[:3, 3] = -turned @ torch.as_tensor(centre, dtype=torch.float64)
     return Camera(name, width, 40, 55.0, 56.0, 31.0, 19.0, pose)
+
+
+def held_out_cameras(views: list[Camera], covered: Sequence[int]) -> list[Camera]:
+    """One camera between each two neighbours among the views of some indices."""
+    return [between(*pair) for pair in neighbours([views[index] for index in covered])]
 
 
 def angle_between(first: Camera, second: Camera) -> float:

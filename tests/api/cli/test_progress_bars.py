@@ -1,0 +1,52 @@
+"""The bar of a job: on a terminal it is drawn, in a log there is a line now and then."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from api.cli import progress_bars
+from api.cli.progress_bars import clock, job_bar
+from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.stylizing.loop import Progress
+from worker.description import Prepared
+
+
+def shown(*, terminal: bool) -> str:
+    """What is printed of a small job."""
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=120, color_system=None)
+    with job_bar(console) as bar:
+        for done, left in [(0, None), (3, 125.0), (8, 0.0)]:
+            bar.show_planning(PlanningProgress(done, 8, left))
+            bar._bar.refresh()  # now, rather than in the next tenth of a second
+        bar.start(Prepared([], 0, 50))
+        for step in (1, 2):
+            bar.show(Progress("coarse", step, 50, 123.4, 1.0, 61.0))
+            bar._bar.refresh()
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_a_terminal_shows_views_and_then_steps() -> None:
+    found = shown(terminal=True)
+    for text in ("Looking at the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
+        assert text in found
+
+
+def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shown(terminal=False).strip() == ""
+    monkeypatch.setattr(progress_bars, "LOG_SECONDS", 0.0)
+    assert shown(terminal=False).strip().splitlines() == [
+        "Looking at the views: 0 of 8",
+        "Looking at the views: 3 of 8, 2:05 left",
+        "Looking at the views: 8 of 8, 0:00 left",
+        "coarsest scale: step 1 of 50, loss 123, 1:01 left",
+        "coarsest scale: step 2 of 50, loss 123, 1:01 left",
+    ]
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00"), (59.6, "1:00"), (3599.0, "59:59"), (36610.0, "10:10:10")])
+def test_durations(seconds: float, text: str) -> None:
+    assert clock(seconds) == text

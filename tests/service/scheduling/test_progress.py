@@ -1,0 +1,48 @@
+"""What an attempt's process tells of its progress, and the record that the dispatcher makes of it."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import pytest
+
+from service.scheduling import attempt_process
+from service.scheduling.attempt_process import tell_planning, tell_prepared, tell_progress
+from service.scheduling.running import progress_record
+from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.stylizing.loop import Progress
+from worker.description import Prepared
+
+
+@pytest.fixture
+def channel(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """Where messages for the dispatcher go."""
+    written = io.StringIO()
+    monkeypatch.setattr(attempt_process, "_channel", written)
+    return written
+
+
+def records(channel: io.StringIO) -> list[dict[str, Any]]:
+    """The records of the messages, as the job's second attempt has them."""
+    return [progress_record(json.loads(line), 2) for line in channel.getvalue().splitlines()]
+
+
+def test_planning_is_a_stage_whose_steps_are_views(channel: io.StringIO) -> None:
+    tell_planning(PlanningProgress(0, 8))
+    tell_planning(PlanningProgress(2, 8, 31.5))
+    nothing = {"loss": None, "seconds": None, "attempt": 2}
+    assert records(channel) == [
+        {"stage": "planning", "step": 0, "total": 8, "fraction": 0.0, "eta_s": None, **nothing},
+        {"stage": "planning", "step": 2, "total": 8, "fraction": 0.25, "eta_s": 31.5, **nothing},
+    ]
+
+
+def test_steps_follow_where_the_job_goes_on(channel: io.StringIO, capsys: pytest.CaptureFixture[str]) -> None:
+    tell_prepared(Prepared([("scene", "616 Gaussians")], 3, 12))
+    tell_progress(Progress("sos", 6, 12, 0.5, 20.0, 10.0))
+    starting, step = records(channel)
+    assert (starting["stage"], starting["step"], starting["fraction"]) == ("starting", 3, 0.25)
+    assert (step["stage"], step["fraction"], step["loss"]) == ("sos", 0.5, 0.5)
+    assert "scene: 616 Gaussians" in capsys.readouterr().err
