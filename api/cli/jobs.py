@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -50,7 +49,7 @@ def make_plan(
     check_choice(source)
     if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
         raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
-    if source.cameras and out.exists() and source.cameras.exists() and os.path.samefile(out, source.cameras):
+    if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
         raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
     check_folder(out.parent)
     file, cameras = read_scene_and_cameras(source)
