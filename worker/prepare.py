@@ -86,6 +86,7 @@ def prepare(
         photos=inputs.load_photo,
         collectives=collectives,
         plan=plan,
+        show_planning=show_planning,
     )
     planned_ranks = resumed.ranks if resumed and plan else collectives.size
     if plan is None:

@@ -25,6 +25,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning.cost import RasterCost, Rate, Work, content_bytes, image_bytes, pieces_of, probe, raster_cost
+from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.pruning import distinct_views, pruned_image_error
 from sgsst_core.planning.ranks_model import IterationWork, Link, RanksChoice, choose_ranks, probe_link
 from sgsst_core.planning.survey import Survey, survey
@@ -133,6 +134,7 @@ def make_plan(
     memory: int,
     collectives: Collectives = ALONE,
     sharing: int = 1,
+    show: ShowPlanning | None = None,
 ) -> Plan:
     """Survey the views, time network, rasterizer and what connects the ranks, decide. Every rank gets the same plan.
 
@@ -143,12 +145,13 @@ def make_plan(
         memory: bytes that this rank may plan with.
         collectives: of all ranks that there are.
         sharing: among how many of them a machine's memory is divided: fewer ranks have more each.
+        show: told how far the survey has come.
 
     Raises:
         CameraError: no camera sees a Gaussian.
         SettingsError: pruning would leave no Gaussian.
     """
-    looked = survey(scene, cameras, rasterizer, collectives)
+    looked = survey(scene, cameras, rasterizer, collectives, show)
     link = probe_link(collectives, rasterizer.device)
     # Timings differ from rank to rank: one decides for all.
     return collectives.broadcast(

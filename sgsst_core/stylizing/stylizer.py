@@ -24,6 +24,7 @@ from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.loss.terms import LayerTarget, LossTerms
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
 from sgsst_core.planning.planner import Plan, choose_network, make_plan
+from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -130,6 +131,7 @@ class Stylizer:
         collectives: of the ranks that stylize the scene together. Every rank has a stylizer with the same arguments and
             calls the same methods in the same order; `state`, `stylized` and the like, which only read, need no other.
         plan: of an earlier run of the same job; None makes one.
+        show_planning: told how far the survey has come, where a plan is made.
 
     Attributes:
         collectives: of all ranks that take part.
@@ -154,6 +156,7 @@ class Stylizer:
         schedule: Sequence[Phase] | None = None,
         collectives: Collectives = ALONE,
         plan: Plan | None = None,
+        show_planning: ShowPlanning | None = None,
     ) -> None:
         if not cameras:
             raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
@@ -177,7 +180,9 @@ class Stylizer:
         cameras = fit_cameras(cameras, settings)
         if plan is None:
             whole = self._rasterizer(scene, "cpu" if rasterizer in ("auto", "cached") else rasterizer)
-            plan = make_plan(scene, cameras, settings, self._loss(ALONE), whole, self.memory, collectives, sharing)
+            plan = make_plan(
+                scene, cameras, settings, self._loss(ALONE), whole, self.memory, collectives, sharing, show_planning
+            )
             plan.decisions.extend(precision)
         self.plan = plan
         self._join(collectives)

@@ -9,6 +9,7 @@ import pytest
 
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import read_scene
+from sgsst_core.planning.progress import PlanningProgress
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
@@ -42,12 +43,20 @@ def request_(tmp_path: Path) -> StylizeRequest:
     return small_request(tmp_path, 8)
 
 
-def test_a_resumed_job_follows_the_plan_of_the_first(request_: StylizeRequest, tmp_path: Path) -> None:
+def test_planning_is_shown_and_a_resumed_job_follows_the_plan_of_the_first(
+    request_: StylizeRequest, tmp_path: Path
+) -> None:
     whole = small_request(tmp_path / "whole", 8)
     go_on(prepare(whole))
-    first = prepare(request_)
+    planned: list[PlanningProgress] = []
+    first = prepare(request_, show_planning=planned.append)
+    assert [(now.done, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert [now.seconds_left is None for now in planned] == [True, False, False, False]
+    assert planned[-1].fraction == 1.0
+    assert planned[-1].seconds_left == 0.0
     assert go_on(first, steps=3).stopped == "interrupted"
-    second = prepare(request_, resume=Resume(True))
+    second = prepare(request_, resume=Resume(True), show_planning=planned.append)
+    assert len(planned) == 4, "nothing is looked at again"
     assert second.resumed is not None
     assert second.resumed.state.step == 3
     assert second.stylizer.plan == second.resumed.plan

@@ -58,6 +58,7 @@ class Heard:
     """What a job told, and when it is asked to stop."""
 
     stop_at: int | None = None
+    planned: list[float] = field(default_factory=list)
     prepared: list[Prepared] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     happened: list[str] = field(default_factory=list)
@@ -72,7 +73,13 @@ class Heard:
             return self.stop_at is not None and bool(self.steps) and self.steps[-1] >= self.stop_at
 
         return Listener(
-            self.prepared.append, progress, self.happened.append, self.warnings.append, stop, self.previews.append
+            planning=lambda now: self.planned.append(now.fraction),
+            prepared=self.prepared.append,
+            progress=progress,
+            happened=self.happened.append,
+            warn=self.warnings.append,
+            stop=stop,
+            preview=self.previews.append,
         )
 
 
@@ -105,6 +112,8 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     heard = Heard()
     ended = run(request, cluster, heard)
     assert ended.attempts == []
+    assert heard.planned[-1] == 1.0
+    assert heard.planned == sorted(set(heard.planned))
     assert heard.steps[-1] == ended.total == STEPS
     report = json.loads(request.out.with_name("s.report.json").read_text())
     assert report["workers"]["used"] == 2
