@@ -15,7 +15,7 @@ def test_ray_prints_by_a_function_that_can_be_replaced() -> None:
 
     assert callable(getattr(worker, "print_to_stdstream", None)), (
         "Ray's driver prints the errors of its processes by another function now. Find what writes them to standard "
-        "output, and replace that one in worker/ranks/cluster.py (_quiet)."
+        "output, and replace that one in worker/ranks/cluster.py."
     )
 
 
@@ -24,7 +24,7 @@ def test_ray_starts_in_a_folder_and_on_an_address_of_our_own(option: str) -> Non
     import ray
 
     assert f'"{option}"' in inspect.getsource(ray.init), (
-        f"ray.init no longer knows {option}. Find what took its place, and change worker/ranks/cluster.py (_start): "
+        f"ray.init no longer knows {option}. Find what took its place, and change worker/ranks/cluster.py: "
         "without a folder of its own, what a killed Ray leaves behind cannot be swept away; without 127.0.0.1, Ray "
         "listens on the network."
     )
@@ -36,7 +36,7 @@ def test_a_process_group_can_be_told_how_long_to_wait() -> None:
     set_timeout = getattr(distributed_c10d, "_set_pg_timeout", None)
     parameters = list(inspect.signature(set_timeout).parameters) if set_timeout is not None else []
     assert parameters == ["timeout", "group"], (
-        "PyTorch sets the time-out of a process group in another way now: change `expect` in "
+        "PyTorch sets the time-out of a process group in another way now: change "
         "worker/ranks/process_group.py. Without it, ranks of a slow machine are taken for lost."
     )
 
