@@ -17,12 +17,15 @@ import httpx
 import psutil
 import pytest
 
+from api.cli.main import main
 from api.cli.serve import ServeError, serve
 from service.files.blobs import BlobFolder
+from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
+from service.store.jobs import NewJob
 from tests.api.service import Service, check_documented, wait_for
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import ball, wall, write_files
 
 MB = 1_000_000
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -195,6 +198,78 @@ def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> No
         (shown,) = [entry["name"] for entry in answer.json()["inputs"] if entry["role"] == "scene"]
         assert "/" not in shown
         assert not shown.startswith(".")
+
+
+def test_stored_jobs_are_shown_as_they_were_stored(
+    service: Service, client: httpx.Client, files: dict[str, bytes]
+) -> None:
+    """Whatever parameters are called today: of a job that this version would refuse, only a retry is refused."""
+    made = client.post("/v1/jobs", files=form(files)).json()
+    store = open_store(ServiceSettings(data=service.data))
+    told = {"preset": "preview", "sharpness": 3, "steps_sos": -5, "workers": "many"}
+    job, _ = store.jobs.create(NewJob("local", "old", 0, told, made["inputs"]), limit=1000)
+    (listed,) = [entry for entry in client.get("/v1/jobs").json()["jobs"] if entry["id"] == job.id]
+    answer = client.get(f"/v1/jobs/{job.id}")
+    assert answer.status_code == 200
+    assert listed["parameters"] == answer.json()["parameters"] == made["parameters"] | told
+    assert client.post(f"/v1/jobs/{job.id}/cancel").json()["status"] == "canceled"
+    problem = refused(client.post(f"/v1/jobs/{job.id}/retry"), 422, "invalid-settings")
+    assert "stored by a version" in problem["detail"]
+    assert client.get(f"/v1/jobs/{job.id}").json()["status"] == "canceled"
+    assert client.delete(f"/v1/jobs/{job.id}").status_code == 204
+    store.close()
+
+
+#: A value for every parameter, other than its default.
+EVERY_PARAMETER: dict[str, Any] = {
+    "name": "all",
+    "preset": "preview",
+    "orbit": 3,
+    "up": "z",
+    "views": 2,
+    "resolution": 64,
+    "steps_coarse": 1,
+    "steps_sos": 2,
+    "learning_rate": 0.1,
+    "content_weight": 0.5,
+    "position_weights": "on",
+    "background": [1.0, 1.0, 1.0],
+    "near": 0.1,
+    "drop_invalid": True,
+    "seed": 4,
+    "precision": "bfloat16",
+    "backbone": "vgg16",
+    "memory_limit": 2_000_000_000,
+    "max_seconds": 9.0,
+    "target_loss": 0.5,
+    "early_stop": True,
+    "warm_start": True,
+    "revive": True,
+    "coarsest_side": 40,
+    "prune_weight": 0.5,
+    "similar_views": 0.1,
+    "kept_weights": "half",
+    "unseen": "keep",
+    "views_per_step": 2,
+    "rebalance": True,
+    "keep_everything": True,
+    "workers": 2,
+}
+
+
+def test_the_command_line_sends_every_parameter(
+    service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert EVERY_PARAMETER.keys() == JobParameters.model_fields.keys()
+    ply, _, style = write_files(tmp_path, ball())
+    command = ["submit", str(ply), "--style", str(style), "--url", service.url, "--json"]
+    for name, value in EVERY_PARAMETER.items():
+        text = "white" if name == "background" else "2GB" if name == "memory_limit" else str(value)
+        command += [f"--{name.replace('_', '-')}", *([] if value is True else [text])]
+    assert main(command) == 0
+    shown = json.loads(capsys.readouterr().out)["parameters"]
+    assert shown == EVERY_PARAMETER
+    assert client.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]["parameters"] == EVERY_PARAMETER
 
 
 # --- bodies --------------------------------------------------------------------------------------------------------
