@@ -11,19 +11,22 @@ import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import httpx
 import psutil
 import pytest
+from annotated_types import Ge, Gt
 
 from api.cli.main import main
+from api.cli.options import kind_of
 from api.cli.serve import ServeError, serve
 from service.files.blobs import BlobFolder
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.jobs import NewJob
+from sgsst_core.options import Declared, declared
 from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import ball, wall, write_files
 
@@ -220,56 +223,34 @@ def test_stored_jobs_are_shown_as_they_were_stored(
     store.close()
 
 
-#: A value for every parameter, other than its default.
-EVERY_PARAMETER: dict[str, Any] = {
-    "name": "all",
-    "preset": "preview",
-    "orbit": 3,
-    "up": "z",
-    "views": 2,
-    "resolution": 64,
-    "steps_coarse": 1,
-    "steps_sos": 2,
-    "learning_rate": 0.1,
-    "content_weight": 0.5,
-    "position_weights": "on",
-    "background": [1.0, 1.0, 1.0],
-    "near": 0.1,
-    "drop_invalid": True,
-    "seed": 4,
-    "precision": "bfloat16",
-    "backbone": "vgg16",
-    "memory_limit": 2_000_000_000,
-    "max_seconds": 9.0,
-    "target_loss": 0.5,
-    "early_stop": True,
-    "warm_start": True,
-    "revive": True,
-    "coarsest_side": 40,
-    "prune_weight": 0.5,
-    "similar_views": 0.1,
-    "kept_weights": "half",
-    "unseen": "keep",
-    "views_per_step": 2,
-    "rebalance": True,
-    "keep_everything": True,
-    "workers": 2,
-}
+def value_of(option: Declared) -> object:
+    """One that an option may have."""
+    kind = kind_of(option)
+    if kind is bool:
+        return True
+    if get_origin(kind) is Literal:
+        return get_args(kind)[-1]
+    bounds = [
+        item.ge if isinstance(item, Ge) else item.gt for item in option.info.metadata if isinstance(item, Ge | Gt)
+    ]
+    return kind(bounds[0] + (1 if kind is int else 0.5))
 
 
 def test_the_command_line_sends_every_parameter(
     service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert EVERY_PARAMETER.keys() == JobParameters.model_fields.keys()
+    told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0]}
+    texts = {"background": "white"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--url", service.url, "--json"]
-    for name, value in EVERY_PARAMETER.items():
-        text = "white" if name == "background" else "2GB" if name == "memory_limit" else str(value)
-        command += [f"--{name.replace('_', '-')}", *([] if value is True else [text])]
+    for name, option in declared(JobParameters).items():
+        told[name] = told.get(name) or value_of(option)
+        command += [f"--{name.replace('_', '-')}"]
+        command += [] if told[name] is True else [texts.get(name, str(told[name]))]
     assert main(command) == 0
-    shown = json.loads(capsys.readouterr().out)["parameters"]
-    assert shown == EVERY_PARAMETER
-    assert client.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]["parameters"] == EVERY_PARAMETER
+    assert json.loads(capsys.readouterr().out)["parameters"] == told
+    assert client.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]["parameters"] == told
+    assert told.keys() == JobParameters.model_fields.keys()
 
 
 # --- bodies --------------------------------------------------------------------------------------------------------
