@@ -85,7 +85,7 @@ class StylizeOptions(_Chosen):
         description="Work on N GPUs, or parts of the processor: of this machine, or of RAY_ADDRESS's cluster.",
     )
 
-    def chosen(self) -> dict[str, Any]:
+    def given_settings(self) -> dict[str, Any]:
         """The settings that were given, by their names in `Settings`; without the preset."""
         known = declared(Settings)
         given = {known[name].field: getattr(self, name) for name in self.model_fields_set & known.keys() - {"preset"}}
@@ -98,7 +98,7 @@ class StylizeOptions(_Chosen):
         Raises:
             SettingsError: values that contradict each other.
         """
-        return make_settings(self.preset, **self.chosen())
+        return make_settings(self.preset, **self.given_settings())
 
 
 class RunOptions(BaseModel):

@@ -365,7 +365,7 @@ def bench_error_time(
     from worker.request import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
-    settings = {**chosen.chosen(), "near": options.near}
+    settings = {**chosen.given_settings(), "near": options.near}
     names = [name.strip() for name in variants.split(",") if name.strip()]
     request = ErrorTimeRequest(source, style, out, names, seconds, chosen.backbone, settings)
     curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))

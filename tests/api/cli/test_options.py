@@ -146,7 +146,7 @@ def test_options_become_settings() -> None:
     told = StylizeOptions.model_validate({"preset": "preview", "steps_sos": "7", "near": 0.5, "keep_everything": True})
     assert told.settings() == make_settings("preview", steps_sos=7, near=0.5, keep=EVERYTHING)
     assert StylizeOptions().settings() == make_settings()
-    assert StylizeOptions().chosen() == {}
+    assert StylizeOptions().given_settings() == {}
     assert StylizeOptions(resolution=80).settings().max_resolution == 80
     again = JobParameters.model_validate(json.loads(JobParameters().model_dump_json()))
     assert again.settings() == make_settings(), "null leaves a setting to the preset"
