@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from sgsst_core.errors import OutputError
@@ -72,7 +71,7 @@ def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
     """
     check_choice(source)
     image = load_image(style) if style else None
-    file, cameras = read_scene_and_cameras(replace(source, drop_invalid=True))
+    file, cameras = read_scene_and_cameras(source.model_copy(update={"drop_invalid": True}))
     rasterizer = make_rasterizer("cpu", file.scene, near=source.near)
     found = [*check_scene(file), *check_views(file, cameras, rasterizer, near=source.near)]
     return found if image is None else [*found, *check_style(image, cameras)]
