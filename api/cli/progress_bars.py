@@ -29,7 +29,7 @@ class JobBar:
 
     def __init__(self, bar: Progress) -> None:
         self._bar = bar
-        self._task = bar.add_task("reading", total=None, note="")
+        self._task = bar.add_task("Reading the scene", total=None, note="")
         self._last_line = time.monotonic()
 
     def show_planning(self, planning: PlanningProgress) -> None:
