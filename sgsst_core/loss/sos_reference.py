@@ -13,13 +13,13 @@ from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
 from sgsst_core.scene.pyramid import scale_count
 
 
-def features_reference(weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
+def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
     """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
-    x = rgb.double() * weights.input_scale.double() + weights.input_shift.double()
+    x = rgb.double() * network_weights.input_scale.double() + network_weights.input_shift.double()
     x = x.permute(2, 0, 1).unsqueeze(0)
     features: dict[str, Tensor] = {}
     block = 1
-    for name, (weight, bias) in weights.convolutions.items():
+    for name, (weight, bias) in network_weights.convolutions.items():
         if int(name[4]) > block:
             block += 1
             x = F.max_pool2d(x, 2)
@@ -35,9 +35,10 @@ def box_average_reference(image: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(image.permute(2, 0, 1).unsqueeze(0), side)[0].permute(1, 2, 0)
 
 
-def _moments(features: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _moments(features: Tensor, position_weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     flat = features.reshape(-1, features.shape[-1])
-    a = torch.ones(flat.shape[0], dtype=torch.float64) if weights is None else weights.reshape(-1).double()
+    equal = torch.ones(flat.shape[0], dtype=torch.float64)
+    a = equal if position_weights is None else position_weights.reshape(-1).double()
     mean = (a[:, None] * flat).sum(0) / a.sum()
     gram = (a[:, None] * flat).T @ flat / a.sum()
     variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
@@ -47,7 +48,7 @@ def _moments(features: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, 
 
 
 def sos_reference(
-    weights: BackboneWeights,
+    network_weights: BackboneWeights,
     image: Tensor,
     style: Tensor,
     content: Tensor | None = None,
@@ -69,8 +70,8 @@ def sos_reference(
     scales = scale_count(image.shape[0], image.shape[1], coarsest)
     for scale in range(scales):
         side = 1 << scale
-        features = features_reference(weights, box_average_reference(x, side))
-        wanted = features_reference(weights, box_average_reference(style.double(), side))
+        features = features_reference(network_weights, box_average_reference(x, side))
+        wanted = features_reference(network_weights, box_average_reference(style.double(), side))
         for layer in STYLE_LAYERS:
             position = _cells(coverage, side * layer_stride(layer))
             gram, mean, std = _moments(features[layer], position)
@@ -78,7 +79,7 @@ def sos_reference(
             loss = loss + GRAM_WEIGHT / mean.shape[0] ** 2 * (gram - gram_v).square().mean()
             loss = loss + MEAN_WEIGHT * (mean - mean_v).square().mean() + STD_WEIGHT * (std - std_v).square().mean()
         if content is not None and content_weight:
-            difference = features[CONTENT_LAYER] - _content_reference(weights, content, side)
+            difference = features[CONTENT_LAYER] - _content_reference(network_weights, content, side)
             position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
             a = torch.ones(difference.shape[:2], dtype=torch.float64) if position is None else position
             loss = loss + content_weight * (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
@@ -87,8 +88,8 @@ def sos_reference(
     return loss.item(), gradient
 
 
-def _content_reference(weights: BackboneWeights, content: Tensor, side: int) -> Tensor:
-    return features_reference(weights, box_average_reference(content.double(), side))[CONTENT_LAYER].detach()
+def _content_reference(network_weights: BackboneWeights, content: Tensor, side: int) -> Tensor:
+    return features_reference(network_weights, box_average_reference(content.double(), side))[CONTENT_LAYER].detach()
 
 
 def _cells(coverage: Tensor | None, side: int) -> Tensor | None:

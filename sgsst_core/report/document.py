@@ -233,13 +233,7 @@ def _evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _terms_json(terms: LossTerms) -> dict[str, float]:
-    return {
-        "gram": terms.gram,
-        "mean": terms.mean,
-        "std": terms.std,
-        "content": terms.content,
-        "total": terms.total,
-    }
+    return {**terms, "total": terms.total}
 
 
 def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
