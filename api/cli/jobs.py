@@ -14,13 +14,14 @@ from sgsst_core.errors import CameraError, OutputError
 from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
+from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import read_scene
 from sgsst_core.planning.planner import Plan
 from sgsst_core.planning.survey import SEEN_COVERAGE
 from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
 from sgsst_core.quality.measure import with_measuring
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.document import plan_json, write_json
+from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings

@@ -104,7 +104,7 @@ DropOption = Annotated[bool, typer.Option("--drop-invalid", help="Leave Gaussian
 def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
     if version:
-        from sgsst_core.report.document import program_version
+        from sgsst_core.report.machine import program_version
 
         out_console.print(f"sgsst {program_version()}")
         raise typer.Exit()
@@ -313,7 +313,7 @@ def _tell_losses(ended: RanksResult) -> None:
 
 
 def _conclude(outputs: Outputs, result: Result, command: str) -> None:
-    from sgsst_core.report.document import mean_loss
+    from sgsst_core.stylizing.stylizer import mean_loss
 
     before, after = mean_loss(result.before), mean_loss(result.after)
     out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
