@@ -177,4 +177,5 @@ def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
     sums = np.concatenate([[0.0], np.cumsum(logs)])
     places = np.arange(len(logs))
     reach = np.minimum(np.minimum(places, places[::-1]), window // 2)
-    return np.exp((sums[places + reach + 1] - sums[places - reach]) / (2 * reach + 1))
+    means: Floats = np.exp((sums[places + reach + 1] - sums[places - reach]) / (2 * reach + 1))
+    return means
