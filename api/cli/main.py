@@ -418,12 +418,12 @@ def check(
     near: NearOption = NEAR,
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
-    from api.cli.jobs import check_inputs
+    from api.cli.jobs import look_for_extremes
     from worker.request import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
     with _status("Looking at the scene and every view"):
-        found = check_inputs(source, style)
+        found = look_for_extremes(source, style)
     if not found:
         out_console.print("Nothing extreme was found.")
         return
