@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from sgsst_core.loss.terms import TERMS
+
 
 def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, Any]:
     """A report of version 2 with a value in every field, of so many steps."""
@@ -78,8 +80,8 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
 
 
 def _terms(total: float) -> dict[str, float]:
-    shares = {"gram": 0.7, "mean": 0.15, "std": 0.1, "content": 0.05}
-    return {**{term: share * total for term, share in shares.items()}, "total": total}
+    shares = {term: 2.0**-place for place, term in enumerate(TERMS)}
+    return {**{term: share / sum(shares.values()) * total for term, share in shares.items()}, "total": total}
 
 
 def _record(step: int, stage: str, scales: int) -> dict[str, Any]:

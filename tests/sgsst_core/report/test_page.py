@@ -212,7 +212,7 @@ def test_lines_are_named_and_phases_marked() -> None:
 def test_split_has_a_panel_for_each_scale() -> None:
     words = Page(draw_figures(sample_report(scales=3))[1].svg["seconds"]).text
     assert [words.count(f"scale {scale} (") for scale in range(4)] == [1, 1, 1, 0]
-    assert all(words.count(name) == 1 for name in TERMS.values())
+    assert all(name in words for name in TERMS.values())
 
 
 def test_both_axes_of_the_loss_are_logarithmic() -> None:
