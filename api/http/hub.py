@@ -13,7 +13,7 @@ from pydantic_core import to_jsonable_python
 
 from api.http.schemas import utc
 from service.store import Store
-from service.store.jobs import FINISHED
+from service.store.states import ENDED
 from service.store.tables import EventRow
 
 #: Seconds between two looks into the store; a watcher learns of an event after half of it on average.
@@ -22,7 +22,6 @@ _POLL_SECONDS = 0.3
 _HEARTBEAT_SECONDS = 15.0
 #: Events of a watched job that are kept for its watchers; who is farther behind reads the store.
 _KEPT = 300
-_ENDED = (*FINISHED, "expired")
 
 _log = logging.getLogger(__name__)
 
@@ -151,4 +150,4 @@ def _item(row: EventRow) -> Item:
     if row.kind == "progress":  # as the job's own view says it
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
     text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
-    return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in _ENDED)
+    return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in ENDED)

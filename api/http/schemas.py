@@ -9,11 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.files.artifacts import media_type
 from service.parameters import JobParameters
-from service.store.jobs import UNFINISHED
+from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
-
-StatusName = Literal["queued", "starting", "running", "canceling", "succeeded", "failed", "canceled", "expired"]
-
 
 #: Of the examples, which tell of one job.
 JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
@@ -93,7 +90,7 @@ class AttemptView(BaseModel):
     number: int
     started_at: datetime
     finished_at: datetime | None
-    outcome: Literal["succeeded", "failed", "canceled", "released", "lost"] | None = Field(
+    outcome: AttemptOutcome | None = Field(
         description="`lost`: its dispatcher was not heard of again; `released`: it shut down and put the job back."
     )
     error: ErrorView | None
@@ -141,7 +138,7 @@ class JobView(BaseModel):
 
     id: str
     name: str
-    status: StatusName
+    status: JobStatus
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -330,7 +327,7 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
             self=here,
             events=f"{here}/events",
             artifacts=f"{here}/artifacts",
-            result=f"{here}/artifacts/stylized.ply" if job.status == "succeeded" else None,
+            result=f"{here}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
         ),
     }
 

@@ -30,7 +30,9 @@ from service.scheduling.running import RunningAttempt, sweep
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.jobs import DAY, Lease
+from service.store.changes import DAY
+from service.store.leases import Lease
+from service.store.states import JobStatus
 from service.store.tables import JobRow
 from worker.processes import ProcessId, home
 
@@ -88,10 +90,10 @@ class Dispatcher:
     def _take_over_from_the_dead(self) -> None:
         """Of dispatchers that ran on this machine and are gone, nothing needs to be waited for."""
         known = {row.name for row in self._store.operations.dispatchers()}
-        for name in sorted(known.union(self._store.jobs.lease_owners())):
+        for name in sorted(known.union(self._store.leases.holders())):
             if is_dead(name):
                 _log.info("dispatcher %s is gone; its jobs are taken over", name)
-                self._store.jobs.end_leases(name)
+                self._store.leases.run_out(name)
                 self._store.operations.gone(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():
@@ -121,7 +123,7 @@ class Dispatcher:
         Args:
             held: what running jobs have.
         """
-        if not (waiting := self._store.jobs.waiting()):
+        if not (waiting := self._store.leases.waiting()):
             return None
         share = -(-waiting // max(1, len(self._store.operations.dispatchers())))  # others take their part of the queue
         grant: Grant | None = None
@@ -131,7 +133,7 @@ class Dispatcher:
             grant = self._room.grant(job, held, share)
             return grant is not None
 
-        lease = self._store.jobs.lease(self.name, fits)
+        lease = self._store.leases.take(self.name, fits)
         return (lease, grant) if lease is not None and grant is not None else None
 
     def _start(self, lease: Lease, grant: Grant) -> None:
@@ -157,15 +159,15 @@ class Dispatcher:
             return
         leases = [attempt.lease for attempt in self._running.values()]
         if time.monotonic() - self._renewed_at >= _RENEW_SHARE * self._settings.lease_seconds:
-            found = self._store.jobs.renew(leases)
+            found = self._store.leases.renew(leases)
             self._renewed_at = time.monotonic()
         else:
-            found = self._store.jobs.look(leases)
+            found = self._store.leases.statuses(leases)
         for job_id, status in found.items():
             attempt = self._running[job_id]
             if status is None and attempt.alive:
                 attempt.abandon()
-            elif status == "canceling":
+            elif status == JobStatus.CANCELING:
                 attempt.cancel()
 
     def _abandon_expired(self) -> None:
@@ -191,10 +193,10 @@ class Dispatcher:
 
     def _keep_house(self) -> None:
         try:
-            for job_id in self._store.jobs.expire(self._settings.retention_days * DAY):
+            for job_id in self._store.retention.expire(self._settings.retention_days * DAY):
                 self._artifacts.remove_job(job_id)
-            for job_id, epoch in self._store.jobs.unswept(_SWEEPS):
-                sweep(self._store.jobs, self._artifacts, job_id, epoch)
+            for job_id, epoch in self._store.retention.unswept(_SWEEPS):
+                sweep(self._store, self._artifacts, job_id, epoch)
             self._blobs.collect()
         except Exception:  # stores of files raise what they like; running jobs are not to suffer
             _log.exception("not everything that is no longer needed could be removed; this is tried again")

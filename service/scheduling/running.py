@@ -29,7 +29,8 @@ from service.scheduling.attempt_process import Message, Task
 from service.scheduling.packing import Grant
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.jobs import DAY, Jobs, Lease, Published
+from service.store.changes import DAY
+from service.store.leases import Lease, Published
 
 #: Progress is written this often at most: more would be writes that nobody sees.
 _PROGRESS_SECONDS = 1.0
@@ -126,11 +127,11 @@ class RunningAttempt:
         if last is not None and last["kind"] == "done":
             self._succeed(last["result"])
         elif self._wish == "cancel":
-            self._store.jobs.canceled(self.lease, self._retention)
+            self._store.leases.stop(self.lease, self._retention)
             self._sweep()
             _log.info("canceled", extra=self._extra)
         elif self._wish == "release":
-            self._store.jobs.release(self.lease)
+            self._store.leases.release(self.lease)
             _log.info("put back into the queue", extra=self._extra)
         elif last is not None and last["kind"] == "failed":
             self._fail(last["error"], permanent=last["permanent"])
@@ -211,7 +212,7 @@ class RunningAttempt:
         if message["kind"] == "left-out":
             self._give_back(message["gpus"])
         if message["kind"] == "prepared":
-            self._store.jobs.running(self.lease)
+            self._store.leases.begin(self.lease)
         if message["kind"] in ("stage", "prepared", "progress"):
             step, total = message.get("step", 0), message.get("total", 0)
             self._pending = {
@@ -234,7 +235,7 @@ class RunningAttempt:
     def _write_progress(self, *, now: bool = False) -> None:
         moment = time.monotonic()
         if self._pending is not None and (now or moment - self._progress_at >= _PROGRESS_SECONDS):
-            self._store.jobs.progress(self.lease, self._pending)
+            self._store.leases.report_progress(self.lease, self._pending)
             self._pending, self._progress_at = None, moment
 
     def _see_to_wish(self) -> None:
@@ -294,7 +295,7 @@ class RunningAttempt:
                     fresh[name] = (path, stamp)
         put = [done for name, (path, _) in fresh.items() if (done := self._put(name, path)) is not None]
         if put:
-            for location in self._store.jobs.publish(self.lease, put):
+            for location in self._store.leases.publish(self.lease, put):
                 self._artifacts.remove(location)
             self._published |= {name: stamp for name, (_, stamp) in fresh.items()}
 
@@ -320,18 +321,18 @@ class RunningAttempt:
             self._fail({"code": "internal", "message": "The job ended without a result."}, permanent=False)
             return
         put = [self._artifacts.put(self.lease.job_id, self.lease.epoch, name, path) for name, path in present.items()]
-        self._store.jobs.succeed(self.lease, put, result, self._retention)
+        self._store.leases.succeed(self.lease, put, result, self._retention)
         self._sweep()
         _log.info("succeeded", extra=self._extra)
 
     def _fail(self, error: dict[str, Any], *, permanent: bool) -> None:
-        again = self._store.jobs.fail(self.lease, error, permanent=permanent, retention=self._retention)
+        again = self._store.leases.fail(self.lease, error, permanent=permanent, retention=self._retention)
         _log.warning("%s: %s", "will be tried again" if again else "failed", error["message"], extra=self._extra)
         if not again:
             self._sweep()
 
     def _sweep(self) -> None:
-        sweep(self._store.jobs, self._artifacts, self.lease.job_id, self.lease.epoch)
+        sweep(self._store, self._artifacts, self.lease.job_id, self.lease.epoch)
 
     def _crash(self, code: int) -> dict[str, Any]:
         """What to say of a process that ended without a word."""
@@ -355,14 +356,14 @@ class RunningAttempt:
         return {"job": self.lease.job_id, "attempt": self.lease.job.attempt}
 
 
-def sweep(jobs: Jobs, artifacts: Artifacts, job_id: str, epoch: int) -> None:
+def sweep(store: Store, artifacts: Artifacts, job_id: str, epoch: int) -> None:
     """Remove what attempts at a job that has ended have left behind.
 
     Args:
         epoch: of the job's last lease.
     """
-    artifacts.sweep(job_id, epoch, {row.location for row in jobs.artifacts(job_id)})
-    jobs.swept(job_id, epoch)
+    artifacts.sweep(job_id, epoch, {row.location for row in store.jobs.artifacts(job_id)})
+    store.retention.mark_swept(job_id, epoch)
 
 
 def _saved_step(checkpoint: Path) -> int | None:

@@ -9,6 +9,9 @@ from service.store.database import Clock, Database
 from service.store.inputs import Inputs
 from service.store.jobs import Jobs
 from service.store.keys import Keys, Operations
+from service.store.leases import Leases
+from service.store.retention import Retention
+from service.store.retries import RetryPolicy
 
 
 class Store:
@@ -16,7 +19,10 @@ class Store:
 
     def __init__(self, settings: ServiceSettings, clock: Clock = time.time) -> None:
         self.database = Database(settings.database_url, clock)
-        self.jobs = Jobs(self.database, settings.lease_seconds, settings.max_attempts, settings.retry_seconds)
+        self.jobs = Jobs(self.database)
+        policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
+        self.leases = Leases(self.database, settings.lease_seconds, policy)
+        self.retention = Retention(self.database)
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)

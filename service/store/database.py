@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, text
+from sqlalchemy import Connection, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
@@ -185,8 +185,3 @@ def _counting(dialect: str) -> Any:
 def upsert(session: Session) -> Any:
     """The `insert` that knows ON CONFLICT, of the database that the session is on."""
     return sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
-
-
-def create_all(engine: Engine) -> None:
-    """All tables at once, for comparing with what the migrations make."""
-    Base.metadata.create_all(engine)

@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import bindparam, delete, exists, select, update
 
-from service.errors import ConflictError, NotFoundError
+from service.errors import NotFoundError
 from service.store.database import Database, new_id, remembered, upsert
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadRow
 
@@ -194,9 +194,3 @@ class Inputs:
             insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
             session.execute(insert.on_conflict_do_nothing())
             session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
-
-
-def ensure_unfinished(upload: UploadRow) -> None:
-    """Raise ConflictError for an upload that has all its bytes."""
-    if upload.sha256 is not None:
-        raise ConflictError(f"Upload {upload.id} is complete already.")

@@ -10,6 +10,7 @@ from sqlalchemy import bindparam, delete, func, select
 
 from service.errors import NotFoundError
 from service.store.database import Database, new_id, upsert
+from service.store.states import JobStatus
 from service.store.tables import Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, KeyRow, SecretRow
 
 #: What every key starts with, so that secret scanners can find one that got lost.
@@ -109,13 +110,13 @@ class Operations:
     def oldest_queued(self) -> float:
         """Seconds that the oldest queued job has waited; 0 where none waits."""
         with self._database.reading() as session:
-            oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == "queued"))
+            oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == JobStatus.QUEUED))
         return 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
 
     def steps_and_seconds(self) -> list[tuple[int, float]]:
         """Steps that each running job has made, and the seconds that they took."""
         with self._database.reading() as session:
-            found = session.scalars(select(JobRow.progress).where(JobRow.status == "running")).all()
+            found = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
         return [(progress["step"], progress["seconds"]) for progress in found if progress and progress.get("seconds")]
 
     def webhook_secret(self) -> str:

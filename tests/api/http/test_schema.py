@@ -134,11 +134,11 @@ class Uploaded:
 
     def finish_jobs(self) -> None:
         """Every job that waits ends with results, as a dispatcher leaves it (`test_service` has a real one)."""
-        while (lease := self._store.jobs.lease("test")) is not None:
+        while (lease := self._store.leases.take("test")) is not None:
             result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
-            self._store.jobs.running(lease)
-            self._store.jobs.publish(lease, [result])
-            self._store.jobs.succeed(lease, [result], {"steps": 1}, 10_000)
+            self._store.leases.begin(lease)
+            self._store.leases.publish(lease, [result])
+            self._store.leases.succeed(lease, [result], {"steps": 1}, 10_000)
 
     def delete_jobs(self) -> None:
         """So that every chain finds the same: none."""

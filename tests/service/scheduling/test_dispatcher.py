@@ -19,7 +19,8 @@ from service.scheduling.packing import Grant, Room
 from service.scheduling.running import RunningAttempt
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.jobs import Lease, NewJob
+from service.store.jobs import NewJob
+from service.store.leases import Lease
 from tests.api.service import wait_for
 
 SHA = "a" * 64
@@ -54,7 +55,7 @@ def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
 def leased(store: Store, dispatcher: str) -> Lease:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    found = store.jobs.lease(dispatcher)
+    found = store.leases.take(dispatcher)
     assert found is not None
     return found
 
@@ -105,11 +106,11 @@ def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings
     held = leased(store, "elsewhere")
     artifacts.put(held.job_id, held.epoch, "previews/cut_off.jpg", source)
     result = artifacts.put(held.job_id, held.epoch, "stylized.ply", source)
-    store.jobs.succeed(held, [result], {}, 1000.0)
+    store.leases.succeed(held, [result], {}, 1000.0)
     running = leased(store, "elsewhere")
     published_next = artifacts.put(running.job_id, running.epoch, "stylized.ply", source)
     with at_work(settings, store):
-        wait_for(lambda: store.jobs.unswept(10) == [], "the job to be swept")
+        wait_for(lambda: store.retention.unswept(10) == [], "the job to be swept")
     left = {path.name for path in (settings.folder / "artifacts" / held.job_id).rglob("*.*")}
     assert left == {"stylized.ply"}
     assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"
