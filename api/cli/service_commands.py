@@ -20,7 +20,8 @@ from api.cli.values import parse_background, parse_bytes
 from sgsst_core.settings import PresetName
 
 if TYPE_CHECKING:
-    from api.client.client import Client, Job
+    from api.client.answers import Job
+    from api.client.client import Client
 
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
