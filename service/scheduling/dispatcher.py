@@ -26,7 +26,8 @@ from service.files.blobs import BlobFolder
 from service.logs import set_up
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
-from service.scheduling.running import RunningAttempt, sweep
+from service.scheduling.publishing import sweep
+from service.scheduling.running import RunningAttempt
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
 from service.store import Store, open_store

@@ -76,7 +76,7 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     room = Room(Machine(grant.gpus, 2, 10**10), None)
     assert room.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
-        attempt._hear({"kind": "left-out", "gpus": [gpu]})
+        attempt._take_in({"kind": "left-out", "gpus": [gpu]})
     assert attempt.grant == Grant(1, ("6",))
     following = room.grant(held.job, [attempt.grant], 1)
     assert following == Grant(2, ("5", "7"))
