@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
-from api.cli import service_commands
+from api.cli import client_commands, operator_commands
 from api.cli.interrupt import stop_on_signal
 from api.cli.values import parse_background, parse_bytes
 from sgsst_core.constants import NEAR
@@ -59,7 +59,8 @@ weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_hel
 app.add_typer(weights_app, name="weights")
 bench_app = typer.Typer(help="Measurements to repeat on your own scene and machine.", no_args_is_help=True)
 app.add_typer(bench_app, name="bench")
-service_commands.add_to(app)
+operator_commands.add_to(app)
+client_commands.add_to(app)
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
@@ -377,7 +378,7 @@ def plan(
     memory_limit: MemoryOption = None,
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
-    from api.cli.jobs import make_plan
+    from api.cli.scene_tools import make_plan
     from worker.request import SceneRequest
 
     settings = make_settings(
@@ -418,7 +419,7 @@ def check(
     near: NearOption = NEAR,
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
-    from api.cli.jobs import check_inputs
+    from api.cli.scene_tools import check_inputs
     from worker.request import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
@@ -447,7 +448,7 @@ def render(
     drop_invalid: DropOption = False,
 ) -> None:
     """Render the views of a scene."""
-    from api.cli.jobs import render_views
+    from api.cli.scene_tools import render_views
     from worker.request import SceneRequest
 
     source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)

@@ -21,8 +21,8 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from api.cli.jobs import view_file_names
 from api.cli.main import main
+from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.ply import read_scene, write_scene
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files

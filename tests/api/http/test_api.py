@@ -17,7 +17,7 @@ import httpx
 import psutil
 import pytest
 
-from api.cli.serve import ServeError, serve
+from api.cli.supervisor import ServeError, serve
 from service.files.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
