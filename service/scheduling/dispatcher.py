@@ -64,7 +64,7 @@ class Dispatcher:
         self._stop = threading.Event()
         self.name = own_name()
         self._work = settings.folder / "work" / self.name
-        self._renewed_at = self._kept_at = self._beat_at = float("-inf")
+        self._renewed_at = self._housekeeping_at = self._announced_at = float("-inf")
         self._deliverer = Deliverer(settings, store)
 
     def stop(self) -> None:
@@ -80,7 +80,7 @@ class Dispatcher:
         _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
         while not self._stop.is_set():
             try:
-                self._round()
+                self._work_once()
             except (SQLAlchemyError, OSError):  # the database is away or locked; leases run out if it stays so
                 _log.exception("the store cannot be reached")
                 self._abandon_expired()
@@ -101,21 +101,21 @@ class Dispatcher:
                 if is_dead(path.name):
                     shutil.rmtree(path, ignore_errors=True)
 
-    def _round(self) -> None:
+    def _work_once(self) -> None:
         for job_id, attempt in list(self._running.items()):
             if not attempt.alive:
                 del self._running[job_id]
-        self._renew()
-        self._beat()
-        while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
-            self._start(*found)
-        if time.monotonic() - self._kept_at > _HOUSEKEEPING_SECONDS:
-            self._kept_at = time.monotonic()
+        self._renew_leases()
+        self._announce_alive()
+        while not self._stop.is_set() and (found := self.next_job(self._grants())) is not None:
+            self._start_attempt(*found)
+        if time.monotonic() - self._housekeeping_at > _HOUSEKEEPING_SECONDS:
+            self._housekeeping_at = time.monotonic()
             self._keep_house()
 
     # --- room ------------------------------------------------------------------------------------------------------
 
-    def _held(self) -> list[Grant]:
+    def _grants(self) -> list[Grant]:
         return [attempt.grant for attempt in self._running.values()]
 
     def next_job(self, held: list[Grant]) -> tuple[Lease, Grant] | None:
@@ -137,7 +137,7 @@ class Dispatcher:
         lease = self._store.leases.take(self.name, fits)
         return (lease, grant) if lease is not None and grant is not None else None
 
-    def _start(self, lease: Lease, grant: Grant) -> None:
+    def _start_attempt(self, lease: Lease, grant: Grant) -> None:
         folder = self._work / f"{lease.job_id}-{lease.epoch}"
         attempt = RunningAttempt(
             lease, grant, folder, self._store, self._blobs, self._artifacts, self._settings, self._machine.cluster
@@ -147,13 +147,13 @@ class Dispatcher:
 
     # --- leases ----------------------------------------------------------------------------------------------------
 
-    def _beat(self) -> None:
+    def _announce_alive(self) -> None:
         """Let everybody know that this dispatcher is alive."""
-        if time.monotonic() - self._beat_at >= _RENEW_SHARE * self._settings.lease_seconds:
-            self._store.operations.beat(self.name, self._room.size, self._room.free(self._held()))
-            self._beat_at = time.monotonic()
+        if time.monotonic() - self._announced_at >= _RENEW_SHARE * self._settings.lease_seconds:
+            self._store.operations.beat(self.name, self._room.size, self._room.free(self._grants()))
+            self._announced_at = time.monotonic()
 
-    def _renew(self) -> None:
+    def _renew_leases(self) -> None:
         """Hold the leases of all running attempts, and see which of their jobs are to be canceled or are lost."""
         if not self._running:
             self._renewed_at = time.monotonic()
@@ -185,7 +185,7 @@ class Dispatcher:
             self._store.operations.gone(self.name)
         while any(attempt.alive for attempt in self._running.values()):
             with contextlib.suppress(SQLAlchemyError, LeaseLostError):
-                self._renew()
+                self._renew_leases()
             time.sleep(0.2)
         self._deliverer.stop()
         shutil.rmtree(self._work, ignore_errors=True)
@@ -206,18 +206,18 @@ class Dispatcher:
 def own_name() -> str:
     """Names this process for good: where it runs, its number there, and when it started."""
     own = ProcessId.of_this()
-    return f"{socket.gethostname()[:40]}-{_home()}-{own.number}-{int(own.started)}"
+    return f"{socket.gethostname()[:40]}-{_home_digest()}-{own.number}-{int(own.started)}"
 
 
 def is_dead(name: str) -> bool:
     """Whether a dispatcher of that name ran where this process can see it, and is gone."""
     parts = name.rsplit("-", 3)
-    if len(parts) != 4 or parts[1] != _home() or not (parts[2] + parts[3]).isdigit():
+    if len(parts) != 4 or parts[1] != _home_digest() or not (parts[2] + parts[3]).isdigit():
         return False
     return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
 
 
-def _home() -> str:
+def _home_digest() -> str:
     return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]
 
 

@@ -94,20 +94,15 @@ class RunningAttempt:
         """Another dispatcher has the job: end everything, and write nothing more."""
         self._wish = Wish.ABANDON
 
-    def join(self, timeout: float | None = None) -> None:
-        """Wait for the end."""
-        self._thread.join(timeout)
-
     # --- in its thread ---------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        extra = {"job": self.lease.job_id, "attempt": self.lease.job.attempt}
         try:
             self._attempt()
         except LeaseLostError:
-            _log.warning("the lease was lost: another dispatcher has the job", extra=extra)
+            _log.warning("the lease was lost: another dispatcher has the job", extra=self._log_fields)
         except Exception as error:
-            _log.exception("the attempt broke", extra=extra)
+            _log.exception("the attempt broke", extra=self._log_fields)
             with contextlib.suppress(Exception):
                 self._fail({"code": "internal", "message": f"{type(error).__name__}: {error}"}, permanent=False)
         finally:
@@ -145,7 +140,7 @@ class RunningAttempt:
         else:
             self._fail(ending.error or {}, permanent=ending.permanent)
             return
-        _log.info(ending.outcome, extra=self._extra)
+        _log.info(ending.outcome, extra=self._log_fields)
 
     def _stage(self) -> None:
         job = self.lease.job
@@ -182,7 +177,7 @@ class RunningAttempt:
                 start_new_session=True,
             )
         threading.Thread(target=self._listen, name=f"{self.lease.job_id}-out", daemon=True).start()
-        _log.info("started", extra=self._extra)
+        _log.info("started", extra=self._log_fields)
 
     def _listen(self) -> None:
         assert self._process is not None
@@ -230,7 +225,7 @@ class RunningAttempt:
         """Leave GPUs that the plan does without to other jobs."""
         kept = tuple(gpu for gpu in self.grant.gpus if gpu not in gpus)
         self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
-        _log.info("needs %d GPUs and gives %d back", len(kept), len(gpus), extra=self._extra)
+        _log.info("needs %d GPUs and gives %d back", len(kept), len(gpus), extra=self._log_fields)
 
     def _write_progress(self, *, now: bool = False) -> None:
         moment = time.monotonic()
@@ -264,7 +259,7 @@ class RunningAttempt:
 
     def _fail(self, error: dict[str, Any], *, permanent: bool) -> None:
         again = self._store.leases.fail(self.lease, error, permanent=permanent, retention=self._retention)
-        _log.warning("%s: %s", "will be tried again" if again else "failed", error["message"], extra=self._extra)
+        _log.warning("%s: %s", "will be tried again" if again else "failed", error["message"], extra=self._log_fields)
         if not again:
             self._publisher.sweep()
 
@@ -273,7 +268,7 @@ class RunningAttempt:
         return self._settings.retention_days * DAY
 
     @property
-    def _extra(self) -> dict[str, Any]:
+    def _log_fields(self) -> dict[str, Any]:
         return {"job": self.lease.job_id, "attempt": self.lease.job.attempt}
 
 

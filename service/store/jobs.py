@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from service.errors import ConflictError, NotFoundError, QueueFullError
 from service.store.changes import add_status_event, end, forget, holder_name, move
-from service.store.database import Database, count, new_id, remembered
+from service.store.database import Database, count, idempotency_row, new_id
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
@@ -22,7 +22,7 @@ _ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")
 _UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"), _JOBS.c.status.in_(UNFINISHED))
 
 
-def _ahead() -> Select[int]:
+def _count_ahead() -> Select[int]:
     """How many queued jobs come before one: two ranges of the queue's index."""
     queued = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
     higher = queued.where(_JOBS.c.priority > bindparam("priority"))
@@ -31,7 +31,7 @@ def _ahead() -> Select[int]:
     return select(higher.scalar_subquery() + earlier.scalar_subquery())
 
 
-_AHEAD = _ahead()
+_AHEAD = _count_ahead()
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,11 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            memory = None
+            used_key = None
             if idempotency is not None:
-                memory = remembered(session, new.owner, idempotency.key, idempotency.fingerprint, now)
-            if memory is not None and memory.created_id:
-                known = session.get(JobRow, memory.created_id)
+                used_key = idempotency_row(session, new.owner, idempotency.key, idempotency.fingerprint, now)
+            if used_key is not None and used_key.created_id:
+                known = session.get(JobRow, used_key.created_id)
                 if known is not None:
                     return known, False
             if session.execute(_UNFINISHED_OF, {"owner": new.owner}).scalar_one() >= limit:
@@ -94,11 +94,11 @@ class Jobs:
                     f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.",
                     limit=limit,
                 )
-            values = _first_values(new, now)
+            values = _row_of_new_job(new, now)
             session.execute(insert(_JOBS), values)
             job = JobRow(**values)
-            if memory is not None:
-                memory.created_id = job.id
+            if used_key is not None:
+                used_key.created_id = job.id
             digests = sorted({entry["sha256"] for entry in new.inputs})
             uses = [{"holder": holder_name(job.id), "sha256": sha256} for sha256 in digests]
             session.execute(insert(_BLOB_USES), uses)
@@ -113,7 +113,7 @@ class Jobs:
             NotFoundError: there is none, or it is another's.
         """
         with self._database.reading() as session:
-            return _owned(session, job_id, owner)
+            return _job_of_owner(session, job_id, owner)
 
     def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow]]:
         """A job, its place in the queue and its attempts, as of one moment.
@@ -121,14 +121,14 @@ class Jobs:
         Raises:
             NotFoundError: as `get`.
         """
-        with self._database.looking() as connection:
+        with self._database.reading_rows() as connection:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
             if row is None or (owner is not None and row.owner != owner):
                 raise NotFoundError(f"There is no job {job_id}.")
             job = JobRow(**row._mapping)
             found = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
             attempts = [AttemptRow(**each._mapping) for each in found]
-            return job, _position(connection, job), attempts
+            return job, _queue_position(connection, job), attempts
 
     def page(
         self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
@@ -149,8 +149,8 @@ class Jobs:
 
         Turns between owners, which change with every lease, are left out.
         """
-        with self._database.looking() as connection:
-            return _position(connection, job)
+        with self._database.reading_rows() as connection:
+            return _queue_position(connection, job)
 
     def cancel(self, job_id: str, owner: str | None) -> JobRow:
         """Cancel a job: at once where it is queued, else as soon as its dispatcher sees it.
@@ -160,7 +160,7 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            job = _owned(session, job_id, owner, lock=True)
+            job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.CANCEL):
                 raise ConflictError(f"The job has {job.status} and cannot be canceled.", job_status=job.status)
             if job.status == JobStatus.QUEUED:
@@ -178,7 +178,7 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            job = _owned(session, job_id, owner, lock=True)
+            job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.RETRY):
                 raise ConflictError(
                     f"The job has status {job.status}; only one that failed or was canceled can be tried again.",
@@ -198,7 +198,7 @@ class Jobs:
             ConflictError: it has not ended.
         """
         with self._database.writing() as session:
-            job = _owned(session, job_id, owner, lock=True)
+            job = _job_of_owner(session, job_id, owner, lock=True)
             if job.status not in ENDED:
                 first = "It ends in some seconds" if job.status == JobStatus.CANCELING else "Cancel it first"
                 raise ConflictError(
@@ -230,7 +230,7 @@ class Jobs:
             return dict(session.execute(query.group_by(EventRow.job_id)).tuples().all())
 
 
-def _first_values(new: NewJob, now: float) -> dict[str, Any]:
+def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
     """The row of a job that has just been accepted."""
     return {
         "id": new_id("job", now),
@@ -250,14 +250,14 @@ def _first_values(new: NewJob, now: float) -> dict[str, Any]:
     }
 
 
-def _owned(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
+def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
     job = session.get(JobRow, job_id, with_for_update=lock)
     if job is None or (owner is not None and job.owner != owner):
         raise NotFoundError(f"There is no job {job_id}.")
     return job
 
 
-def _position(connection: Connection, job: JobRow) -> int | None:
+def _queue_position(connection: Connection, job: JobRow) -> int | None:
     if job.status != JobStatus.QUEUED:
         return None
     own = {"priority": job.priority, "queued_at": job.queued_at, "job_id": job.id}

@@ -62,7 +62,7 @@ class Keys:
 
     def find(self, text: str) -> KeyRow | None:
         """The key of this text, unless it is unknown or revoked."""
-        with self._database.looking() as connection:
+        with self._database.reading_rows() as connection:
             row = connection.execute(_KEY, {"sha256": digest(text)}).one_or_none()
         return KeyRow(**row._mapping) if row is not None and row.revoked_at is None else None
 

@@ -41,7 +41,7 @@ _MAX_OPEN = 1000
 #: Bytes after which an upload's state is saved, so that a crash costs no more than these.
 _SAVE_BYTES = 64 << 20
 #: Uploads that a request is writing to now: a second one has to wait for its turn.
-_busy: set[str] = set()
+_written_now: set[str] = set()
 
 
 class WrongVersionError(ServiceError):
@@ -92,7 +92,7 @@ def _wrong_version(version: str) -> WrongVersionError:
     return WrongVersionError(message, headers={"Tus-Version": VERSION})
 
 
-def _after(**parameters: str) -> dict[str, Any]:
+def _following_operations(**parameters: str) -> dict[str, Any]:
     """Where to go on with an upload."""
     found = links("get_upload", "head_upload", "delete_upload", **parameters)
     return found | links("append_upload", **parameters, **{"Upload-Offset": "0"})
@@ -133,7 +133,7 @@ def describe_uploads(context: ContextDep) -> Response:
         201: {
             "description": "Its bytes can be sent to the `Location`.",
             "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
-            "links": _after(upload_id="$response.body#/id"),
+            "links": _following_operations(upload_id="$response.body#/id"),
         },
         **problems(
             BadRequestError("The file is empty. Give its size as Upload-Length."),
@@ -183,7 +183,7 @@ def create_upload(
 @router.get("/{upload_id}", response_model=UploadView, responses=problems(_NOT_THERE), operation_id="get_upload")
 def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
     """How far an upload is, as JSON."""
-    return upload_view(_find(context, caller.owner, upload_id))
+    return upload_view(_find_upload(context, caller.owner, upload_id))
 
 
 @router.head(
@@ -207,7 +207,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
 )
 def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """How far an upload is: `Upload-Offset` says where to go on."""
-    row = _find(context, caller.owner, upload_id)
+    row = _find_upload(context, caller.owner, upload_id)
     sent = {
         **_HEADERS,
         "Upload-Offset": str(row.offset),
@@ -278,23 +278,23 @@ async def append_upload(
     _check_version(tus)
     if request.headers.get("content-type", "").lower() != "application/offset+octet-stream":
         raise MediaTypeError("The Content-Type must be application/offset+octet-stream.")
-    wanted = _checksum(checksum) if checksum else None
-    row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
+    wanted = _parse_checksum(checksum) if checksum else None
+    row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
         raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
-    with _turn(upload_id):
-        row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
+    with _only_writer(upload_id):
+        row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
         if offset != row.offset:
             raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {row.offset}.", offset=row.offset)
         expires = row.expires_at
         if row.sha256 is None and row.offset == row.length:  # the service died before it could tell
             await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
         elif row.sha256 is None:
-            expires = await _append(request, context, row, wanted)
+            expires = await _append_body(request, context, row, wanted)
         else:
             async for _ in body_blocks(request, context.settings):
                 raise TooLargeError(f"More bytes come than the {row.length:,} of Upload-Length.", limit=row.length)
-    row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
+    row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
         status_code=204,
         headers={**_HEADERS, "Upload-Offset": str(row.offset), "Upload-Expires": _http_date(expires)},
@@ -312,24 +312,24 @@ async def append_upload(
 )
 def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Give an upload up, or let go of a finished one; jobs that use it keep their file."""
-    _find(context, caller.owner, upload_id)
+    _find_upload(context, caller.owner, upload_id)
     context.store.inputs.delete_upload(upload_id, caller.owner)
     context.blobs.upload_path(upload_id).unlink(missing_ok=True)
     return Response(status_code=204, headers=_HEADERS)
 
 
 @contextlib.contextmanager
-def _turn(upload_id: str) -> Iterator[None]:
-    if upload_id in _busy:
+def _only_writer(upload_id: str) -> Iterator[None]:
+    if upload_id in _written_now:
         raise LockedError("Another request is writing to this upload. Ask for its offset, and go on from there.")
-    _busy.add(upload_id)
+    _written_now.add(upload_id)
     try:
         yield
     finally:
-        _busy.discard(upload_id)
+        _written_now.discard(upload_id)
 
 
-async def _append(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
+async def _append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
     """Write the request's body behind what is there; returns when the upload expires now."""
     writer = _Writer(context, row, wanted)
     try:
@@ -398,7 +398,7 @@ class _Writer:
         self._file.close()
 
 
-def _find(context: Context, owner: str, upload_id: str) -> UploadRow:
+def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
     if not is_id(upload_id):
         raise NotFoundError(f"There is no upload {upload_id[:60]}.")
     return context.store.inputs.upload(upload_id, owner)
@@ -416,7 +416,7 @@ def _file_name(metadata: str) -> str:
     return ""
 
 
-def _checksum(header: str) -> tuple[str, bytes]:
+def _parse_checksum(header: str) -> tuple[str, bytes]:
     name, _, value = header.partition(" ")
     if name not in _ALGORITHMS:
         raise BadRequestError(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(_ALGORITHMS)}.")
