@@ -93,7 +93,7 @@ async def create_job(
     parts = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
     wanted = await asyncio.to_thread(_find_files, context, caller, parts)
     if not wanted.checked:
-        await context.inspector.inspect("check", wanted.inputs, wanted.paths, wanted.parameters)
+        await context.inspector.inspect("validate", wanted.inputs, wanted.paths, wanted.parameters)
     if dry_run:
         return await _plan_job(context, wanted.inputs, wanted.paths, wanted.parameters)
     return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key)
@@ -126,7 +126,7 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     check_roles(inputs, orbit=parameters.orbit is not None)
     if webhook:
         check_url(webhook, context.settings)
-    checked = context.inspector.recall("check", inputs, parameters) is not None
+    checked = context.inspector.recall("validate", inputs, parameters) is not None
     if not checked:
         for entry in inputs:
             check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
