@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -11,6 +11,13 @@ from service.files.artifacts import media_type
 from service.parameters import JobParameters
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
+
+if TYPE_CHECKING:
+    StatusName = str
+    OutcomeName = str
+else:  # named where they stand in the OpenAPI document, which makes a schema of its own of every enumeration
+    StatusName = Literal[tuple(map(str, JobStatus))]
+    OutcomeName = Literal[tuple(map(str, AttemptOutcome))]
 
 #: Of the examples, which tell of one job.
 JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
@@ -90,7 +97,7 @@ class AttemptView(BaseModel):
     number: int
     started_at: datetime
     finished_at: datetime | None
-    outcome: AttemptOutcome | None = Field(
+    outcome: OutcomeName | None = Field(
         description="`lost`: its dispatcher was not heard of again; `released`: it shut down and put the job back."
     )
     error: ErrorView | None
@@ -138,7 +145,7 @@ class JobView(BaseModel):
 
     id: str
     name: str
-    status: JobStatus
+    status: StatusName
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None

@@ -8,12 +8,10 @@ so neither a job nor Ray can take the dispatcher along.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 import shutil
 import signal
-import socket
 import threading
 import time
 from types import FrameType
@@ -24,6 +22,7 @@ from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.logs import set_up
+from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
 from service.scheduling.publishing import sweep
@@ -35,7 +34,6 @@ from service.store.changes import DAY
 from service.store.leases import Lease
 from service.store.states import JobStatus
 from service.store.tables import JobRow
-from worker.processes import ProcessId, home
 
 #: Seconds between two looks for what has expired or was left behind.
 _HOUSEKEEPING_SECONDS = 60.0
@@ -201,24 +199,6 @@ class Dispatcher:
             self._blobs.collect()
         except Exception:  # stores of files raise what they like; running jobs are not to suffer
             _log.exception("not everything that is no longer needed could be removed; this is tried again")
-
-
-def own_name() -> str:
-    """Names this process for good: where it runs, its number there, and when it started."""
-    own = ProcessId.of_this()
-    return f"{socket.gethostname()[:40]}-{_home_digest()}-{own.number}-{int(own.started)}"
-
-
-def is_dead(name: str) -> bool:
-    """Whether a dispatcher of that name ran where this process can see it, and is gone."""
-    parts = name.rsplit("-", 3)
-    if len(parts) != 4 or parts[1] != _home_digest() or not (parts[2] + parts[3]).isdigit():
-        return False
-    return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
-
-
-def _home_digest() -> str:
-    return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]
 
 
 def main() -> None:

@@ -8,8 +8,9 @@ from service.settings import ServiceSettings
 from service.store.database import Clock, Database
 from service.store.inputs import Inputs
 from service.store.jobs import Jobs
-from service.store.keys import Keys, Operations
+from service.store.keys import Keys
 from service.store.leases import Leases
+from service.store.operations import Operations
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
 

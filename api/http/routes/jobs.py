@@ -22,6 +22,7 @@ from api.http.schemas import (
     JobPage,
     JobView,
     PlanView,
+    StatusName,
     job_detail,
     job_view,
     poll_seconds,
@@ -32,7 +33,6 @@ from service.files.staging import check_roles, clean_name
 from service.parameters import JobParameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
-from service.store.states import JobStatus
 from service.store.tables import JobRow, UploadRow
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -246,7 +246,7 @@ def list_jobs(
     context: ContextDep,
     caller: CallerDep,
     status: Annotated[
-        list[JobStatus] | None,
+        list[StatusName] | None,
         Query(description="Only these; may be given several times.", examples=[["queued", "running"]]),
     ] = None,
     cursor: Annotated[

@@ -13,7 +13,8 @@ import pytest
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
-from service.scheduling.dispatcher import Dispatcher, is_dead, own_name
+from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
 from service.scheduling.running import RunningAttempt
@@ -83,7 +84,7 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
 
 
 def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
-    script = "from service.scheduling.dispatcher import own_name; print(own_name())"
+    script = "from service.scheduling.identity import own_name; print(own_name())"
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
     assert is_dead(dead)
     assert not is_dead(own_name())
