@@ -33,7 +33,7 @@ class Publisher:
         self._folder, self._out = folder, folder / "out"
         self._store, self._artifacts = store, artifacts
         self._log_seconds = log_seconds
-        self._log_copied_at = 0.0
+        self._log_copied_at = float("-inf")
         self._published: dict[str, tuple[int, int]] = {}
 
     # --- while it runs ---------------------------------------------------------------------------------------------
