@@ -5,7 +5,7 @@ DEMO ?= demo
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test clean
+.PHONY: demo test lint docs clean
 
 # Stylize the built-in scene and say where the results are.
 demo: $(VENV)/installed
@@ -13,15 +13,24 @@ demo: $(VENV)/installed
 	$(BIN)/sgsst demo --out $(DEMO)
 
 # Layout, lint, types and all tests.
-test: $(VENV)/installed-dev
+test: lint
 	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/pytest
+
+# Layout, lint, types, and the directions of imports.
+lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/pre-commit validate-config
+
+# The documentation as a site in site/; a link that leads nowhere is an error.
+docs: $(VENV)/installed-docs
+	$(BIN)/mkdocs build --strict
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build site *.egg-info .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 # A file stands for each finished step: a step that was interrupted runs again, one that is up to date does not.
 $(VENV)/created:
@@ -39,3 +48,8 @@ $(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time"
 	$(PIP_INSTALL) --editable ".[dev]"
 	@touch $@ $(VENV)/installed
+
+$(VENV)/installed-docs: $(VENV)/created pyproject.toml constraints.txt
+	@echo "Installing into $(VENV)"
+	$(PIP_INSTALL) --editable ".[docs]"
+	@touch $@

@@ -68,7 +68,7 @@ def build_report(
     after: Evaluation,
     findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
-    """The report as values that JSON can hold; its fields are documented in the README.
+    """The report as values that JSON can hold; its fields are documented in docs/report-format.md.
 
     Args:
         stylizer: after its last step.
