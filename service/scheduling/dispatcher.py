@@ -30,7 +30,6 @@ from service.scheduling.running import RunningAttempt
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.changes import DAY
 from service.store.leases import Lease
 from service.store.states import JobStatus
 from service.store.tables import JobRow
@@ -192,7 +191,7 @@ class Dispatcher:
 
     def _keep_house(self) -> None:
         try:
-            for job_id in self._store.retention.expire(self._settings.retention_days * DAY):
+            for job_id in self._store.retention.expire():
                 self._artifacts.remove_job(job_id)
             for job_id, epoch in self._store.retention.unswept(_SWEEPS):
                 sweep(self._store, self._artifacts, job_id, epoch)

@@ -97,7 +97,7 @@ class Publisher:
         """Whether the stylized scene is there."""
         return (self._out / RESULT).is_file()
 
-    def succeed(self, result: dict[str, Any], retention: float) -> None:
+    def succeed(self, result: dict[str, Any]) -> None:
         """End the job with its results."""
         stem = Path(RESULT).stem
         names = {
@@ -112,7 +112,7 @@ class Publisher:
             for name, path in names.items()
             if path.is_file()
         ]
-        self._store.leases.succeed(self._lease, put, result, retention)
+        self._store.leases.succeed(self._lease, put, result)
 
     def sweep(self) -> None:
         """Remove what attempts at the job, which has ended, have left behind."""

@@ -29,7 +29,6 @@ from service.scheduling.packing import Grant
 from service.scheduling.publishing import Publisher
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.changes import DAY
 from service.store.leases import Lease
 from service.store.states import AttemptOutcome
 
@@ -130,10 +129,10 @@ class RunningAttempt:
     def _conclude(self, ending: Ending, result: dict[str, Any]) -> None:
         """Write an attempt's end into the store."""
         if ending.outcome == AttemptOutcome.SUCCEEDED:
-            self._publisher.succeed(result, self._retention)
+            self._publisher.succeed(result)
             self._publisher.sweep()
         elif ending.outcome == AttemptOutcome.CANCELED:
-            self._store.leases.stop(self.lease, self._retention)
+            self._store.leases.stop(self.lease)
             self._publisher.sweep()
         elif ending.outcome == AttemptOutcome.RELEASED:
             self._store.leases.release(self.lease)
@@ -258,14 +257,10 @@ class RunningAttempt:
         process.wait()
 
     def _fail(self, error: dict[str, Any], *, permanent: bool) -> None:
-        again = self._store.leases.fail(self.lease, error, permanent=permanent, retention=self._retention)
+        again = self._store.leases.fail(self.lease, error, permanent=permanent)
         _log.warning("%s: %s", "will be tried again" if again else "failed", error["message"], extra=self._log_fields)
         if not again:
             self._publisher.sweep()
-
-    @property
-    def _retention(self) -> float:
-        return self._settings.retention_days * DAY
 
     @property
     def _log_fields(self) -> dict[str, Any]:

@@ -20,10 +20,10 @@ class Store:
 
     def __init__(self, settings: ServiceSettings, clock: Clock = time.time) -> None:
         self.database = Database(settings.database_url, clock)
-        self.jobs = Jobs(self.database)
+        self.jobs = Jobs(self.database, settings.retention_seconds)
         policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
-        self.leases = Leases(self.database, settings.lease_seconds, policy)
-        self.retention = Retention(self.database)
+        self.leases = Leases(self.database, settings.lease_seconds, policy, settings.retention_seconds)
+        self.retention = Retention(self.database, settings.retention_seconds)
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)

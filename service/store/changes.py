@@ -11,8 +11,6 @@ from service.store.database import count, new_id
 from service.store.states import JobStatus, Transition, next_status
 from service.store.tables import Base, BlobUseRow, DeliveryRow, EventRow, JobRow
 
-DAY = 86_400.0
-
 _EVENTS = Base.metadata.tables[EventRow.__tablename__]
 
 
@@ -26,7 +24,7 @@ def move(session: Session, job: JobRow, transition: Transition, now: float) -> N
     add_status_event(session, job, now)
 
 
-def end(session: Session, job: JobRow, transition: Transition, now: float, retention: float = 30 * DAY) -> None:
+def end(session: Session, job: JobRow, transition: Transition, now: float, retention: float) -> None:
     """Bring a job to its end.
 
     Args:

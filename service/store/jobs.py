@@ -59,10 +59,15 @@ class Idempotency:
 
 
 class Jobs:
-    """The users' part of the store."""
+    """The users' part of the store.
 
-    def __init__(self, database: Database) -> None:
+    Args:
+        retention: seconds that the results of a job that has ended are kept.
+    """
+
+    def __init__(self, database: Database, retention: float) -> None:
         self._database = database
+        self._retention = retention
 
     def create(
         self,
@@ -164,7 +169,7 @@ class Jobs:
             if not allowed(job.status, Transition.CANCEL):
                 raise ConflictError(f"The job has {job.status} and cannot be canceled.", job_status=job.status)
             if job.status == JobStatus.QUEUED:
-                end(session, job, Transition.CANCEL, now)
+                end(session, job, Transition.CANCEL, now, self._retention)
             elif next_status(job.status, Transition.CANCEL) != job.status:
                 move(session, job, Transition.CANCEL, now)
         return job

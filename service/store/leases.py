@@ -56,12 +56,14 @@ class Leases:
     Args:
         seconds: after which a lease that was not renewed runs out.
         policy: what becomes of a job whose attempt failed.
+        retention: seconds that the results of a job that has ended are kept.
     """
 
-    def __init__(self, database: Database, seconds: float, policy: RetryPolicy) -> None:
+    def __init__(self, database: Database, seconds: float, policy: RetryPolicy, retention: float) -> None:
         self._database = database
         self._seconds = seconds
         self._policy = policy
+        self._retention = retention
 
     # --- taking and holding ----------------------------------------------------------------------------------------
 
@@ -188,7 +190,7 @@ class Leases:
 
     # --- the end of an attempt -------------------------------------------------------------------------------------
 
-    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any], retention: float) -> list[str]:
+    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
         """End a job with its results, all in one transaction; as `publish` otherwise.
 
         A job whose cancellation came too late has succeeded.
@@ -203,17 +205,16 @@ class Leases:
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
             count(session, "sgsst_job_seconds_sum", amount=max(0.0, now - (job.started_at or now)))
             count(session, "sgsst_job_seconds_count")
-            end(session, job, Transition.SUCCEED, now, retention)
+            end(session, job, Transition.SUCCEED, now, self._retention)
             return unused
 
-    def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool, retention: float) -> bool:
+    def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
         """End an attempt that failed: the job is queued again after a wait, or has failed for good (`retries`).
 
         Args:
             lease: of the job.
             error: `code` and `message`.
             permanent: another attempt would fail the same way.
-            retention: seconds that the results of a job that has ended are kept.
 
         Returns:
             Whether the job will be tried again.
@@ -225,7 +226,7 @@ class Leases:
             if verdict.transition != Transition.STOP:
                 job.error = error
             if verdict.transition != Transition.REQUEUE:
-                end(session, job, verdict.transition, now, retention)
+                end(session, job, verdict.transition, now, self._retention)
                 return False
             self._requeue(session, job, now, now + verdict.wait)
             return True
@@ -239,15 +240,15 @@ class Leases:
             if verdict.transition == Transition.REQUEUE:
                 self._requeue(session, job, now, now)
             else:
-                end(session, job, verdict.transition, now)
+                end(session, job, verdict.transition, now, self._retention)
 
-    def stop(self, lease: Lease, retention: float) -> None:
+    def stop(self, lease: Lease) -> None:
         """End a job that was being canceled."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
             _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
-            end(session, job, Transition.STOP, now, retention)
+            end(session, job, Transition.STOP, now, self._retention)
 
     def _close_lost(self, session: Session, job: JobRow, now: float) -> bool:
         """Close the attempt of a dispatcher that was not heard of again; True if the job has ended with it."""
@@ -258,7 +259,7 @@ class Leases:
             return False
         if verdict.transition == Transition.FAIL:
             job.error = error | {"message": f"{error['message']} This was attempt {job.attempt}."}
-        end(session, job, verdict.transition, now)
+        end(session, job, verdict.transition, now, self._retention)
         return True
 
     def _close(

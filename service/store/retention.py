@@ -11,16 +11,18 @@ from service.store.tables import ArtifactRow, IdempotencyRow, JobRow
 
 
 class Retention:
-    """The housekeeping part of the store; any dispatcher may do it."""
+    """The housekeeping part of the store; any dispatcher may do it.
 
-    def __init__(self, database: Database) -> None:
+    Args:
+        retention: seconds that results are kept, and the record of an expired job as long again.
+    """
+
+    def __init__(self, database: Database, retention: float) -> None:
         self._database = database
+        self._retention = retention
 
-    def expire(self, retention: float) -> list[str]:
+    def expire(self) -> list[str]:
         """End the time of results that have been kept long enough, and forget jobs long after.
-
-        Args:
-            retention: seconds that the record of an expired job is kept.
 
         Returns:
             Ids of jobs whose files are to be removed.
@@ -32,7 +34,7 @@ class Retention:
                 if job.status == JobStatus.EXPIRED:
                     forget(session, job)
                     continue
-                job.expires_at = now + retention
+                job.expires_at = now + self._retention
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
                 release_inputs(session, job.id)
                 move(session, job, Transition.EXPIRE, now)

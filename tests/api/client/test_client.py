@@ -192,13 +192,13 @@ def test_a_job_from_its_upload_to_its_removal(
 def finish(store: Store, service: Service, job_id: str, content: bytes, folder: Path) -> bytes:
     """Do a dispatcher's part for a job that is queued: its result is the content."""
     while (lease := store.leases.take("test")) is not None and lease.job_id != job_id:
-        store.leases.stop(lease, 1000)
+        store.leases.stop(lease)
     assert lease is not None
     source = folder / "result"
     source.write_bytes(content)
     file = Artifacts(ServiceSettings(data=service.data).artifacts_url).put(job_id, lease.epoch, "stylized.ply", source)
     store.leases.begin(lease)
-    store.leases.succeed(lease, [file], {"steps": 1}, 10_000)
+    store.leases.succeed(lease, [file], {"steps": 1})
     return content
 
 

@@ -526,7 +526,7 @@ def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, b
         now += 1000
         held = store.leases.take("one")
         assert held is not None
-        store.leases.fail(held, {"code": "x", "message": "x"}, permanent=True, retention=1000.0)
+        store.leases.fail(held, {"code": "x", "message": "x"}, permanent=True)
         for step, seconds in ((30, 10.0), (8, 4.0)):
             held = store.leases.take("one")
             assert held is not None

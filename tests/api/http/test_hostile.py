@@ -885,7 +885,7 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
                 client.post(f"/v1/jobs/{queued['id']}/cancel")
     lease = store.leases.take("test")
     while lease is not None and lease.job_id != job_id:
-        store.leases.stop(lease, 1000)
+        store.leases.stop(lease)
         lease = store.leases.take("test")
     assert lease is not None
     made = tmp_path_factory.mktemp("results")
@@ -897,7 +897,7 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
     published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", made / "log.txt"))
     store.leases.begin(lease)
     store.leases.publish(lease, published)
-    store.leases.succeed(lease, published[:-1], {}, 10_000)
+    store.leases.succeed(lease, published[:-1], {})
     return job_id
 
 

@@ -138,7 +138,7 @@ class Uploaded:
             result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
             self._store.leases.begin(lease)
             self._store.leases.publish(lease, [result])
-            self._store.leases.succeed(lease, [result], {"steps": 1}, 10_000)
+            self._store.leases.succeed(lease, [result], {"steps": 1})
 
     def delete_jobs(self) -> None:
         """So that every chain finds the same: none."""

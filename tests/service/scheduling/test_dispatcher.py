@@ -107,7 +107,7 @@ def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings
     held = leased(store, "elsewhere")
     artifacts.put(held.job_id, held.epoch, "previews/cut_off.jpg", source)
     result = artifacts.put(held.job_id, held.epoch, "stylized.ply", source)
-    store.leases.succeed(held, [result], {}, 1000.0)
+    store.leases.succeed(held, [result], {})
     running = leased(store, "elsewhere")
     published_next = artifacts.put(running.job_id, running.epoch, "stylized.ply", source)
     with at_work(settings, store):

@@ -208,7 +208,7 @@ def test_the_store_counts_what_could_be_started(eight: Queue) -> None:
     found = store.leases.take("one")
     assert found is not None
     assert store.leases.waiting() == 1
-    store.leases.fail(found, {"code": "x", "message": "x"}, permanent=False, retention=1.0)
+    store.leases.fail(found, {"code": "x", "message": "x"}, permanent=False)
     assert store.leases.waiting() == 1, "the other one has to wait for its second attempt"
     store.jobs.cancel(second, "local")
     assert store.leases.waiting() == 0

@@ -124,7 +124,7 @@ def test_the_end_publishes_results_and_sweeps_what_no_row_refers_to(
         (folder / "out" / name).write_text(name)
     Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "cut_off.jpg", folder / "log.txt")
     assert publisher.has_result()
-    publisher.succeed({"steps": 1}, 1000.0)
+    publisher.succeed({"steps": 1})
     publisher.sweep()
     job = store.jobs.get(lease.job_id, None)
     assert (job.status, job.result) == ("succeeded", {"steps": 1})

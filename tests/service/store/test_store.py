@@ -30,6 +30,7 @@ from service.store.tables import Base
 
 SHA = "a" * 64
 LEASE, RETRY, ATTEMPTS = 30.0, 5.0, 3
+RETENTION = 100.0
 
 
 class Clock:
@@ -86,7 +87,12 @@ def _fresh_database(server: str) -> str:
 
 def _settings(folder: Path, database: str | None) -> ServiceSettings:
     return ServiceSettings(
-        data=folder, database=database, lease_seconds=LEASE, retry_seconds=RETRY, max_attempts=ATTEMPTS
+        data=folder,
+        database=database,
+        lease_seconds=LEASE,
+        retry_seconds=RETRY,
+        max_attempts=ATTEMPTS,
+        retention_days=RETENTION / 86_400,
     )
 
 
@@ -230,20 +236,20 @@ def test_who_lost_the_lease_cannot_write(store: Store, clock: Clock) -> None:
         lambda: store.leases.begin(late),
         lambda: store.leases.report_progress(late, {"step": 1}),
         lambda: store.leases.publish(late, [file]),
-        lambda: store.leases.succeed(late, [file], {}, 1.0),
-        lambda: store.leases.fail(late, {"code": "x", "message": "x"}, permanent=False, retention=1.0),
+        lambda: store.leases.succeed(late, [file], {}),
+        lambda: store.leases.fail(late, {"code": "x", "message": "x"}, permanent=False),
         lambda: store.leases.release(late),
-        lambda: store.leases.stop(late, 1.0),
+        lambda: store.leases.stop(late),
     ):
         with pytest.raises(LeaseLostError):
             write()
     assert store.leases.renew([late]) == store.leases.statuses([late]) == {late.job_id: None}
     assert store.leases.renew([new]) == store.leases.statuses([new]) == {new.job_id: "starting"}
     assert not store.jobs.artifacts(new.job_id)
-    store.leases.succeed(new, [file], {"steps": 1}, 1.0)
+    store.leases.succeed(new, [file], {"steps": 1})
     assert [row.name for row in store.jobs.artifacts(new.job_id)] == ["stylized.ply"]
     with pytest.raises(LeaseLostError):
-        store.leases.succeed(new, [file], {}, 1.0)
+        store.leases.succeed(new, [file], {})
 
 
 def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
@@ -273,11 +279,11 @@ def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> No
     job_id = queue(store)
     error = {"code": "x", "message": "x"}
     for wait in (RETRY, 2 * RETRY):
-        assert store.leases.fail(lease(store), error, permanent=False, retention=1.0)
+        assert store.leases.fail(lease(store), error, permanent=False)
         clock.now += wait - 0.1
         assert store.leases.take("one") is None
         clock.now += 0.2
-    assert not store.leases.fail(lease(store), error, permanent=False, retention=1.0)
+    assert not store.leases.fail(lease(store), error, permanent=False)
     assert store.jobs.get(job_id, "local").status == "failed"
 
 
@@ -288,7 +294,7 @@ def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False
     if saved is not None:
         store.leases.publish(held, [Published(".checkpoint", f"x/{held.epoch}", 1, SHA, step=saved)])
     if not lost:
-        return store.leases.fail(held, {"code": "x", "message": "x"}, permanent=False, retention=1.0)
+        return store.leases.fail(held, {"code": "x", "message": "x"}, permanent=False)
     clock.now += LEASE + 1
     again = store.leases.take("two")
     if again is not None:
@@ -334,8 +340,8 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
         jobs.append(queue(store))
         clock.now += 1
     first, second, third = jobs
-    store.leases.succeed(lease(store), [], {}, 1000.0)
-    store.leases.fail(lease(store), error, permanent=True, retention=1000.0)
+    store.leases.succeed(lease(store), [], {})
+    store.leases.fail(lease(store), error, permanent=True)
     assert sorted(store.retention.unswept(10)) == [(first, 1), (second, 1)]
     assert len(store.retention.unswept(1)) == 1
     store.retention.mark_swept(first, 1)
@@ -344,7 +350,7 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
     store.jobs.retry(second, "local", limit=10)
     store.retention.mark_swept(second, 1)  # too late: it is not at its end any more
     store.jobs.cancel(third, "local")
-    store.leases.succeed(lease(store), [], {}, 1000.0)
+    store.leases.succeed(lease(store), [], {})
     assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
     store.retention.mark_swept(second, 1)  # of an earlier lease
     assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
@@ -352,7 +358,7 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
     store.retention.mark_swept(third, 0)
     assert store.retention.unswept(10) == []
     store.jobs.retry(third, "local", limit=10)
-    store.leases.succeed(lease(store), [], {}, 1000.0)
+    store.leases.succeed(lease(store), [], {})
     assert store.retention.unswept(10) == [(third, 1)], "it has run again since"
 
 
@@ -456,15 +462,28 @@ def test_held_blobs_stay(store: Store, clock: Clock) -> None:
 
 def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Clock) -> None:
     job_id = queue(store)
-    store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {}, 100.0)
-    clock.now += 101
-    assert store.retention.expire(100.0) == [job_id]
+    store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {})
+    clock.now += RETENTION + 1
+    assert store.retention.expire() == [job_id]
     assert store.jobs.get(job_id, "local").status == "expired"
     assert store.jobs.artifacts(job_id) == []
-    clock.now += 101
-    store.retention.expire(100.0)
+    clock.now += RETENTION + 1
+    store.retention.expire()
     with pytest.raises(NotFoundError):
         store.jobs.get(job_id, "local")
+
+
+def test_however_a_job_ends_it_is_kept_as_long(store: Store, clock: Clock) -> None:
+    ends = {
+        "succeeded": lambda: store.leases.succeed(lease(store), [], {}),
+        "failed": lambda: store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True),
+        "canceled": lambda: store.jobs.cancel(job_id, "local"),
+    }
+    for status, end in ends.items():
+        job_id = queue(store)
+        end()
+        job = store.jobs.get(job_id, "local")
+        assert (job.status, job.expires_at) == (status, pytest.approx(clock.now + RETENTION))
 
 
 def test_revoked_keys_are_unknown(store: Store) -> None:
@@ -556,18 +575,18 @@ class StoreMachine(RuleBasedStateMachine):
             self.status[job_id] = "canceling" if canceling else "running"
             return
         if how == "succeed":
-            leases.succeed(held, [Published("stylized.ply", f"{held.epoch}", 1, SHA)], {}, 1e6)
+            leases.succeed(held, [Published("stylized.ply", f"{held.epoch}", 1, SHA)], {})
             self.published[job_id] = self.published.get(job_id, 0) + 1
             self.status[job_id] = "succeeded"
         elif how in ("fail", "break"):
-            again = leases.fail(held, {"code": "x", "message": "x"}, permanent=how == "break", retention=1e6)
+            again = leases.fail(held, {"code": "x", "message": "x"}, permanent=how == "break")
             assert not (again and (how == "break" or canceling))
             self.status[job_id] = "canceled" if canceling else "queued" if again else "failed"
         elif how == "release":
             leases.release(held)
             self.status[job_id] = "canceled" if canceling else "queued"
         else:
-            leases.stop(held, 1e6)
+            leases.stop(held)
             self.status[job_id] = "canceled"
         self.old.append(self.held.pop(job_id)[0])
 
@@ -579,7 +598,7 @@ class StoreMachine(RuleBasedStateMachine):
     def late_write(self, data: st.DataObject) -> None:
         late = data.draw(st.sampled_from(self.old))
         with pytest.raises(LeaseLostError):
-            self.store.leases.succeed(late, [Published("stylized.ply", "late", 1, SHA)], {}, 1e6)
+            self.store.leases.succeed(late, [Published("stylized.ply", "late", 1, SHA)], {})
 
     @precondition(lambda self: self.status)
     @rule(data=st.data(), what=st.sampled_from(["cancel", "retry", "delete"]))
