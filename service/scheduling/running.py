@@ -22,7 +22,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.files.names import CHECKPOINT, RESULT
 from service.files.staging import stage
-from service.parameters import JobParameters
+from service.parameters import JobParameters, stored_parameters
 from service.scheduling.attempt_process import Message, Task
 from service.scheduling.endings import Ending, Wish, attempt_ending
 from service.scheduling.packing import Grant
@@ -31,6 +31,7 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.leases import Lease
 from service.store.states import AttemptOutcome
+from sgsst_core.errors import SettingsError
 
 #: Progress is written this often at most: more would be writes that nobody sees.
 _PROGRESS_SECONDS = 1.0
@@ -109,7 +110,12 @@ class RunningAttempt:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _attempt(self) -> None:
-        self._stage()
+        try:
+            parameters = stored_parameters(self.lease.job.parameters)
+        except SettingsError as error:
+            self._fail({"code": error.code, "message": str(error)}, permanent=True)
+            return
+        self._stage(parameters)
         self._launch()
         last = self._watch()
         process = self._process
@@ -141,7 +147,7 @@ class RunningAttempt:
             return
         _log.info(ending.outcome, extra=self._log_fields)
 
-    def _stage(self) -> None:
+    def _stage(self, parameters: JobParameters) -> None:
         job = self.lease.job
         self._folder.mkdir(parents=True)
         digests = sorted({entry["sha256"] for entry in job.inputs})
@@ -154,7 +160,6 @@ class RunningAttempt:
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
         if checkpoint is not None:
             self._artifacts.fetch(checkpoint.location, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
-        parameters = JobParameters(**job.parameters)
         if self.grant.memory is not None:
             parameters = parameters.model_copy(update={"memory_limit": self.grant.memory})
         seconds = self._settings.checkpoint_seconds, self._settings.preview_seconds
