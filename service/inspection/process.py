@@ -230,7 +230,7 @@ def _inspect_in_child(request: dict[str, Any]) -> bytes:
         finally:
             os._exit(0)
     os.close(writing)
-    answer = _read_until(reading, time.monotonic() + 2 * request["seconds"])
+    answer = _read_to_end(reading, time.monotonic() + 2 * request["seconds"])
     os.close(reading)
     if answer is None:
         os.kill(child, signal.SIGKILL)
@@ -243,7 +243,7 @@ def _inspect_in_child(request: dict[str, Any]) -> bytes:
     return answer or b""
 
 
-def _read_until(descriptor: int, deadline: float) -> bytes | None:
+def _read_to_end(descriptor: int, deadline: float) -> bytes | None:
     """All that comes until the other end closes; None where it is still open at the deadline."""
     parts: list[bytes] = []
     while (left := deadline - time.monotonic()) > 0:
