@@ -27,7 +27,7 @@ from worker.ranks.cluster import Cluster
 from worker.request import StylizeRequest
 
 pytestmark = [
-    pytest.mark.usefixtures("one_thread", "vgg16_weights"),
+    pytest.mark.usefixtures("one_thread", "tiny_installed"),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent"),
 ]
 
@@ -38,7 +38,7 @@ TOLERANCE = 1e-3
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster(tiny_installed: Path) -> Iterator[Cluster]:
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *([before] if before else [])])
     os.environ.pop("RAY_ADDRESS", None)
