@@ -255,7 +255,7 @@ def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytes
 
 
 def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
-    options = files.stylize("--steps-sos", "25", "--learning-rate", "0.1")
+    options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: time for a signal to arrive
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", *options]
     with subprocess.Popen(

@@ -152,6 +152,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     return Uploaded(service, store, key, tmp_path_factory.mktemp("inputs"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "behind"),
     [
