@@ -5,23 +5,44 @@ DEMO ?= demo
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test clean
+# Tests run in processes of one thread each, which on small work get further than one process of several threads.
+TEST_PROCESSES ?= 2
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
+
+.PHONY: demo test test-all test-slow lint docs clean
 
 # Stylize the built-in scene and say where the results are.
 demo: $(VENV)/installed
 	$(BIN)/sgsst weights fetch vgg16
 	$(BIN)/sgsst demo --out $(DEMO)
 
-# Layout, lint, types and all tests.
-test: $(VENV)/installed-dev
+# Layout, lint, types, and the tests that are not slow by nature.
+test: lint
 	$(BIN)/sgsst weights fetch vgg16
+	$(PYTEST) -m "not slow"
+
+# What `test` leaves out: kills, chains of requests, whole runs, the wheel.
+test-slow: $(VENV)/installed-dev
+	$(BIN)/sgsst weights fetch vgg16
+	$(PYTEST) -m slow
+
+test-all: test
+	$(MAKE) test-slow
+
+# Layout, lint, types, and the directions of imports.
+lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/pre-commit validate-config
+
+# The documentation as a site in site/; a link that leads nowhere is an error.
+docs: $(VENV)/installed-docs
+	$(BIN)/mkdocs build --strict
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build site *.egg-info .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 # A file stands for each finished step: a step that was interrupted runs again, one that is up to date does not.
 $(VENV)/created:
@@ -39,3 +60,8 @@ $(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time"
 	$(PIP_INSTALL) --editable ".[dev]"
 	@touch $@ $(VENV)/installed
+
+$(VENV)/installed-docs: $(VENV)/created pyproject.toml constraints.txt
+	@echo "Installing into $(VENV)"
+	$(PIP_INSTALL) --editable ".[docs]"
+	@touch $@

@@ -63,7 +63,8 @@ async def upload(client: httpx.AsyncClient, path: Path) -> str:
 
 class Connection:
     """A connection that is kept, and just enough HTTP: a client for all purposes takes as much processor time as the
-    API, on the same processors."""
+    API, on the same processors.
+    """
 
     def __init__(self, url: str) -> None:
         self._host, _, port = url.removeprefix("http://").partition(":")

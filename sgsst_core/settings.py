@@ -88,7 +88,7 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
-#: colours below 0 on their way and therefore need `revive` (README, "The standard preset").
+#: colours below 0 on their way and therefore need `revive` (docs/performance.md, "The standard preset").
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,

@@ -19,7 +19,7 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 def shared_data() -> Path:
     """Folder with the real scenes, photos and paintings; tests that need it are skipped where it is not."""
     if not DATA.is_dir():
-        pytest.skip(f"no real scenes at {DATA}: see README, 'Real data'")
+        pytest.skip(f"no real scenes at {DATA}: see CONTRIBUTING.md, 'Real data'")
     return DATA
 
 

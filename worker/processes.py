@@ -49,7 +49,7 @@ def home() -> tuple[str, ...]:
     if not sys.platform.startswith("linux"):
         return socket.gethostname(), str(os.geteuid())
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    return boot, os.readlink("/proc/self/ns/pid"), str(os.geteuid())
+    return boot, str(Path("/proc/self/ns/pid").readlink()), str(os.geteuid())
 
 
 def kill(processes: Sequence[ProcessId], timeout: float = 10.0) -> None:
@@ -80,5 +80,5 @@ def interface_towards(address: str) -> str | None:
         own = probe.getsockname()[0]
     for name, addresses in psutil.net_if_addrs().items():
         if any(entry.address.partition("%")[0] == own for entry in addresses):
-            return name
+            return str(name)
     return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -161,7 +160,7 @@ def check_request(request: StylizeRequest) -> Outputs:
         raise OutputError(f"{out}: is a folder. Name the PLY file to write, such as {out / 'stylized.ply'}.")
     if out.suffix.lower() != ".ply":
         raise OutputError(f"{out}: does not end in .ply. Name the PLY file to write.")
-    if out.exists() and request.source.scene.exists() and os.path.samefile(out, request.source.scene):
+    if out.exists() and request.source.scene.exists() and out.samefile(request.source.scene):
         raise OutputError(f"{out}: is the scene itself, which would be lost. Name another file.")
     check_folder(out.parent)
     return Outputs(out)

@@ -16,6 +16,7 @@ class StopFlag:
         self.signal: int | None = None
 
     def __call__(self) -> bool:
+        """Whether a signal has come."""
         return self.signal is not None
 
     @property
@@ -37,7 +38,7 @@ def stop_on_signal(announce: Callable[[], None]) -> Iterator[StopFlag]:
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def handle(number: int, _frame: FrameType | None) -> None:
         flag.signal = number
         for other, handler in before.items():
             signal.signal(other, handler)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -40,7 +39,7 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     check_choice(source)
     if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
         raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
-    if source.cameras and out.exists() and source.cameras.exists() and os.path.samefile(out, source.cameras):
+    if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
         raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
     check_folder(out.parent)
     scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene

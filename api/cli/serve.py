@@ -115,7 +115,7 @@ def _address(settings: ServiceSettings, listener: socket.socket) -> str:
 def _run(children: list[_Child], settings: ServiceSettings, say: Callable[[str], None], address: str) -> None:
     signals: list[int] = []
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def handle(number: int, _frame: FrameType | None) -> None:
         signals.append(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):

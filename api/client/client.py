@@ -401,7 +401,7 @@ class Client:
         for attempt in range(TRIES):
             try:
                 self._fetch(job_id, name, part, progress)
-                os.replace(part, target)
+                part.replace(target)
                 return target
             except (httpx.TransportError, ApiError) as error:
                 if not _again(error, attempt):

@@ -1,5 +1,6 @@
 """HTTP connections that do not wait, nor take in, for ever: uvicorn's own protocol bounds neither time nor size of a
-request's head."""
+request's head.
+"""
 
 from __future__ import annotations
 

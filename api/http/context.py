@@ -95,7 +95,8 @@ CallerDep = Annotated[Caller, Depends(get_caller)]
 
 def _check_site(request: Request, settings: ServiceSettings) -> None:
     """Keep web pages out that a browser on this machine shows: neither by their own name nor by a name of theirs that
-    leads to this machine may they use a service that asks for no key."""
+    leads to this machine may they use a service that asks for no key.
+    """
     host = _hostname(f"//{request.headers.get('host', '')}")
     if settings.on_loopback and host not in _LOOPBACK_NAMES and not host.startswith("127."):
         raise ForeignSiteError(f"The service is open to this machine only, and {host!r} is not one of its names.")

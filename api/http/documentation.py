@@ -119,7 +119,8 @@ def links(*operations: str, **parameters: str) -> dict[str, Any]:
 
 def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> None:
     """Mend FastAPI's document: it lacks models that no route takes as an argument, drops nulls from examples, and has
-    forms of its own for errors."""
+    forms of its own for errors.
+    """
     schemas = document["components"]["schemas"]
     for model in models:
         made = model.model_json_schema(ref_template="#/components/schemas/{model}")

@@ -77,7 +77,7 @@ def problem(
 ) -> JSONResponse:
     """A problem document as a response."""
     title = _TITLES.get(status) or HTTPStatus(status).phrase
-    body = Problem(title=title, status=status, code=code, detail=detail, **extra)  # type: ignore[arg-type]
+    body = Problem(title=title, status=status, code=code, detail=detail, **extra)
     return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
 
 

@@ -300,7 +300,7 @@ def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRo
             number=row.number,
             started_at=utc(row.started_at),
             finished_at=_maybe(row.finished_at),
-            outcome=row.outcome,  # type: ignore[arg-type]
+            outcome=row.outcome,
             error=ErrorView(**row.error) if row.error else None,
         )
         for row in attempts

@@ -40,7 +40,7 @@ class JobFromUploads(BaseModel):
     style: str = Field(description="Id of the upload with the style image.")
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
-    parameters: JobParameters = Field(default_factory=JobParameters)  # type: ignore[arg-type]
+    parameters: JobParameters = Field(default_factory=JobParameters)
     webhook: str | None = Field(None, max_length=2000, description="URL that is told when the job has ended.")
 
 

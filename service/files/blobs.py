@@ -87,8 +87,8 @@ class BlobFolder:
         if leave:
             os.link(path, final)
         else:
-            os.replace(path, final)
-        os.chmod(final, 0o440)
+            path.replace(final)
+        final.chmod(0o440)
         flush_folder(final.parent)
         used = self._inputs.add_blob(sha256, location, size)
         if used != location:

@@ -145,7 +145,8 @@ def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
 
 def _check_sizes(path: Path) -> None:
     """Refuse frames of a transforms.json that leave their size to an image: its path may lead anywhere on this machine,
-    and the answer would tell what is there."""
+    and the answer would tell what is there.
+    """
     for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
         try:
             content = json.loads(file.read_text(encoding="utf-8-sig"))

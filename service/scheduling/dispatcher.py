@@ -228,7 +228,7 @@ def main() -> None:
     set_up(settings.log_format)
     dispatcher = Dispatcher(settings, open_store(settings))
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def handle(_number: int, _frame: FrameType | None) -> None:
         dispatcher.stop()
 
     signal.signal(signal.SIGTERM, handle)

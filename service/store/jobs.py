@@ -603,7 +603,8 @@ def _ready(now: float) -> ColumnElement[bool]:
 
 def _count_failure(job: JobRow) -> None:
     """A failure counts where nothing has been saved since the last one: a long job outlives many accidents, and one
-    that breaks at the same step each time does not."""
+    that breaks at the same step each time does not.
+    """
     progress = (job.saved_step or 0) > (job.failed_step or 0)
     job.failures = 0 if progress else job.failures + 1
     job.failed_step = job.saved_step

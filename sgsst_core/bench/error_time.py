@@ -45,11 +45,11 @@ def _two_phases(scales: int) -> list[tuple[str, int | None, float]]:
     return [("coarse", 0, PHASE_1), ("sos", None, 1 - PHASE_1)] if scales > 1 else _sos(scales)
 
 
-def _sos(scales: int) -> list[tuple[str, int | None, float]]:
+def _sos(_scales: int) -> list[tuple[str, int | None, float]]:
     return [("sos", None, 1.0)]
 
 
-def _coarse_only(scales: int) -> list[tuple[str, int | None, float]]:
+def _coarse_only(_scales: int) -> list[tuple[str, int | None, float]]:
     return [("coarse", 0, 1.0)]
 
 

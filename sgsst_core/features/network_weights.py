@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 from torch import Tensor
@@ -266,7 +267,7 @@ def _source_of(path: Path) -> str:
         return "unknown (corrupt file)"
 
 
-def _split(content: bytes, where: str) -> tuple[dict, memoryview]:
+def _split(content: bytes, where: str) -> tuple[dict[str, Any], memoryview]:
     """Header and data of a safetensors file: eight bytes of length, JSON, tensors one after another."""
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or length > min(len(content) - 8, _MAX_HEADER):
@@ -274,7 +275,7 @@ def _split(content: bytes, where: str) -> tuple[dict, memoryview]:
     return json.loads(content[8 : 8 + length]), memoryview(content)[8 + length :]
 
 
-def _digest(header: dict, data: memoryview) -> str:
+def _digest(header: dict[str, Any], data: memoryview) -> str:
     """SHA-256 of a file's header, less the digest that it carries itself, and data."""
     metadata = {key: value for key, value in header["__metadata__"].items() if key != "sha256"}
     canonical = json.dumps(header | {"__metadata__": metadata}, sort_keys=True)

@@ -195,9 +195,10 @@ class FeatureNetwork:
         if gradient is None:
             return None
         source = kept.outputs[-1]  # the ReLU output that was pooled
-        return torch.ops.aten.max_pool2d_with_indices_backward(
+        spread: Tensor = torch.ops.aten.max_pool2d_with_indices_backward(
             gradient, source, [2, 2], [2, 2], [0, 0], [1, 1], False, positions
         )
+        return spread
 
     def held_bytes_per_pixel(self) -> float:
         """Bytes that a forward pass keeps for each pixel until `backward` has used them.

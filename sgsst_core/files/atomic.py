@@ -36,7 +36,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
         if final.exists():
             shutil.copymode(final, temporary)
         _flush(temporary)
-        os.replace(temporary, final)
+        temporary.replace(final)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         if error.errno in _NO_ROOM:

@@ -193,10 +193,10 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
     change = stored @ np.linalg.inv(_exact_rotation(f"{path}: applied_transform", applied))
     _positive(str(companion), "scale", scale)
 
-    def apply(pose: NDArray) -> NDArray:
+    def apply(pose: NDArray[Any]) -> NDArray[Any]:
         moved = change @ pose
         moved[:3, 3] *= scale
-        return moved
+        return np.asarray(moved)
 
     return apply
 
@@ -256,7 +256,8 @@ def _after_camera(data: bytes, position: int) -> int:
 def _after_image(data: bytes, position: int) -> int:
     """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, 24 bytes each)."""
     end_of_name = data.index(b"\0", position + 64)
-    return end_of_name + 9 + 24 * struct.unpack_from("<Q", data, end_of_name + 1)[0]
+    points: int = struct.unpack_from("<Q", data, end_of_name + 1)[0]
+    return end_of_name + 9 + 24 * points
 
 
 def _camera(
@@ -264,7 +265,7 @@ def _camera(
     name: str,
     size: tuple[int, int],
     intrinsics: tuple[float, float, float, float],
-    world_to_camera: NDArray,
+    world_to_camera: NDArray[Any],
 ) -> Camera:
     """The camera, after every check that all forms share."""
     fx, fy, cx, cy = intrinsics
@@ -276,7 +277,7 @@ def _camera(
     return Camera(name, size[0], size[1], fx, fy, cx, cy, matrix)
 
 
-def _exact_rotation(where: str, matrix: NDArray) -> NDArray:
+def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
     """`matrix` [4, 4] with the rotation nearest to its upper left 3x3 (polar decomposition), which must be close."""
     rotation = matrix[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -289,7 +290,7 @@ def _exact_rotation(where: str, matrix: NDArray) -> NDArray:
     return exact
 
 
-def _inverse(where: str, pose: NDArray) -> NDArray:
+def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
     """World to camera of camera to world; the position stays exact while the rotation is made so."""
     if not np.isfinite(pose).all():
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
@@ -307,7 +308,7 @@ def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
     return name
 
 
-def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray:
+def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:
     try:
         array = np.array(values[key], dtype=np.float64)
     except KeyError:

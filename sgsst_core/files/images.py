@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
@@ -140,7 +140,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise ImageError(
             f"{path}: has more than {MAX_PIXELS // 10**6} megapixels; refused before decoding. Scale it down first."
         ) from error
-    except Image.UnidentifiedImageError as error:
+    except UnidentifiedImageError as error:
         raise ImageError(f"{path}: is not an image that Pillow can read. Give a PNG or JPEG.") from error
     except Exception as error:  # Pillow's decoders raise whatever their format's parser runs into
         if isinstance(error, OSError) and error.strerror:
@@ -162,7 +162,8 @@ def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
     if image.has_transparency_data:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return np.divide(np.asarray(image.convert("RGB")), 255, dtype=np.float32)
+    pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert("RGB")), 255, dtype=np.float32)
+    return pixels
 
 
 def _full_scale(mode: str, largest: float) -> float:

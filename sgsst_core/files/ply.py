@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -192,10 +192,10 @@ def _what_else(header: PlyHeader) -> str:
     return "something else" if vertex else "a PLY without vertices"
 
 
-def _allocate(count: int, degree: int) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+def _allocate(count: int, degree: int) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """The scene's arrays (float32, uninitialised), and per PLY property the view [count] that it fills."""
     coefficients = (degree + 1) ** 2 - 1
-    arrays: dict[str, NDArray] = {name: np.empty((count, len(names)), np.float32) for name, names in _BASE.items()}
+    arrays: dict[str, NDArray[Any]] = {name: np.empty((count, len(names)), np.float32) for name, names in _BASE.items()}
     arrays["opacities"] = np.empty(count, np.float32)
     arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
     columns = {prop: arrays[name][:, i] for name, names in _BASE.items() for i, prop in enumerate(names)}
@@ -217,18 +217,19 @@ class _AsciiHeader(io.BufferedReader):
         return re.sub(rb"[\x80-\xff]", b"?", data) if self.tell() <= self._header_bytes else data
 
 
-def _read_vertices(path: Path, header: PlyHeader) -> NDArray:
+def _read_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
     """[rows] structured array of element vertex, memory-mapped for binary files."""
     try:
         with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list in text
-            return PlyData.read(stream)["vertex"].data
+            vertices: NDArray[Any] = PlyData.read(stream)["vertex"].data
+            return vertices
     except (PlyParseError, ValueError, OverflowError) as error:
         raise SceneError(f"{path}: cannot be read as PLY: {error}. Export the scene again.") from error
 
 
 def _finite_rows(
-    path: Path, arrays: dict[str, NDArray], columns: dict[str, NDArray], drop_invalid: bool
+    path: Path, arrays: dict[str, NDArray[Any]], columns: dict[str, NDArray[Any]], drop_invalid: bool
 ) -> NDArray[np.bool_] | None:
     """Which rows to keep, None for all; raises unless the others may be dropped."""
     if all(bool(np.isfinite(array).all()) for array in arrays.values()):
@@ -268,7 +269,7 @@ def _header_for(source: SceneFile) -> bytes:
     return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
 
 
-def _blocks(source: SceneFile, colours: NDArray) -> Iterator[tuple[int, NDArray[np.bool_], NDArray]]:
+def _blocks(source: SceneFile, colours: NDArray[Any]) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[Any]]]:
     """For each block of file rows: their number, which of them are kept, and the colours of those."""
     rows = source.header.vertex.count
     position = 0
@@ -280,7 +281,7 @@ def _blocks(source: SceneFile, colours: NDArray) -> Iterator[tuple[int, NDArray[
         position = following
 
 
-def _write_binary(source: SceneFile, colours: NDArray, file: BinaryIO, output: BinaryIO) -> None:
+def _write_binary(source: SceneFile, colours: NDArray[Any], file: BinaryIO, output: BinaryIO) -> None:
     dtype = source.header.vertex.dtype(source.header.byte_order)
     before = element_offsets(source.path, source.header)["vertex"] - len(source.header.raw)
     file.seek(len(source.header.raw))
@@ -304,7 +305,7 @@ def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
         count = None if count is None else count - len(data)
 
 
-def _write_text(source: SceneFile, colours: NDArray, file: BinaryIO, output: BinaryIO) -> None:
+def _write_text(source: SceneFile, colours: NDArray[Any], file: BinaryIO, output: BinaryIO) -> None:
     vertex = source.header.vertex
     before = source.header.elements[: source.header.elements.index(vertex)]
     order = [prop.name for prop in vertex.properties]
@@ -324,7 +325,7 @@ def _write_text(source: SceneFile, colours: NDArray, file: BinaryIO, output: Bin
         output.write(line.encode("latin-1"))
 
 
-def _recoloured(line: str, slots: list[tuple[int, str]], values: NDArray) -> str:
+def _recoloured(line: str, slots: list[tuple[int, str]], values: NDArray[Any]) -> str:
     """A row of text with its three colour tokens replaced where their value changes; all spacing stays."""
     tokens = list(re.finditer(r"\S+", line))
     for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):

@@ -262,11 +262,11 @@ def _share_out(
         mean(work.communication(each, link) for work in samples[1]),
         mean(work.seconds(1, link) for work in samples[1]) * groups,
     )
-    decisions = [*plan.decisions, _ranks_decision(choice, available, link, expected)]
+    decisions = [*plan.decisions, _ranks_decision(choice, available, link)]
     return replace(plan, ranks=ranks, decisions=decisions, prediction=expected)
 
 
-def _ranks_decision(choice: RanksChoice, available: int, link: Link, expected: Prediction) -> Decision:
+def _ranks_decision(choice: RanksChoice, available: int, link: Link) -> Decision:
     speed = f"{choice.speed_up:.2f} times as fast as one"
     measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
     if choice.ranks == available:

@@ -124,7 +124,8 @@ def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None =
 
 def _unit(features: Tensor) -> Tensor:
     """Features [h, w, c] scaled to unit length at every position."""
-    return features / (torch.linalg.vector_norm(features, dim=2, keepdim=True) + _LENGTH_EPS)
+    lengths: Tensor = torch.linalg.vector_norm(features, dim=2, keepdim=True)
+    return features / (lengths + _LENGTH_EPS)
 
 
 def _alexnet(tensors: dict[str, Tensor]) -> Callable[[Tensor], list[Tensor]]:

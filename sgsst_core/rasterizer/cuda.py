@@ -8,6 +8,7 @@ drop out.
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -35,13 +36,13 @@ def load_gsplat() -> ModuleType:
         SettingsError: gsplat is not installed or cannot be loaded.
     """
     try:
-        import gsplat
+        module = importlib.import_module("gsplat")
     except (ImportError, OSError) as error:
         raise SettingsError(
             f"rasterizer 'cuda' needs gsplat, which cannot be imported ({error}): install the extra, "
             "pip install 'sgsst-service[cuda]', on a machine with a CUDA GPU, or choose rasterizer 'cpu' or 'cached'"
         ) from error
-    return gsplat
+    return module
 
 
 def gsplat_alpha_max(version: str) -> float:

@@ -31,9 +31,10 @@ _BATCH_PAIRS = 1 << 20
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians on the image plane, front to back. All [V], float64; the power is (u^2 + w^2) / 2 with
+    """Gaussians on the image plane, front to back, all [V], float64.
 
-    w = dx / sqrt(p), u = (dy - (q / p) dx) sqrt(p / det) for a covariance [[p, q], [q, r]].
+    The power is (u^2 + w^2) / 2 with w = dx / sqrt(p), u = (dy - (q / p) dx) sqrt(p / det) for a covariance
+    [[p, q], [q, r]].
     """
 
     gaussians: Tensor  # int64, indices into the scene

@@ -68,7 +68,7 @@ def build_report(
     after: Evaluation,
     findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
-    """The report as values that JSON can hold; its fields are documented in the README.
+    """The report as values that JSON can hold; its fields are documented in docs/report-format.md.
 
     Args:
         stylizer: after its last step.
@@ -435,7 +435,8 @@ def running_mean(values: Sequence[float], window: int) -> NDArray[np.float64]:
     sums = np.concatenate([[0.0], np.cumsum(logs)])
     places = np.arange(len(logs))
     reach = np.minimum(np.minimum(places, places[::-1]), window // 2)
-    return np.exp((sums[places + reach + 1] - sums[places - reach]) / (2 * reach + 1))
+    means: NDArray[np.float64] = np.exp((sums[places + reach + 1] - sums[places - reach]) / (2 * reach + 1))
+    return means
 
 
 def _mark_phases(axes: Axes, history: Sequence[StepRecord]) -> None:

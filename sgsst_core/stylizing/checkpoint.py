@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -84,7 +83,7 @@ class Checkpoints:
         with atomic_path(self.latest) as temporary:
             _write(temporary, checkpoint, job)
             if self.latest.exists():
-                os.replace(self.latest, self.previous)
+                self.latest.replace(self.previous)
 
     def load(self, job: str, warn: Callable[[str], None], run: str | None = None) -> Checkpoint:
         """The newest one that can be used by the job with that fingerprint.

@@ -55,10 +55,12 @@ def _monge_map(source: Tensor, target: Tensor) -> Tensor:
     inverse = torch.where(varies, 1 / torch.where(varies, roots, 1.0), 0.0)
     root = vectors * roots @ vectors.T
     inverse_root = vectors * inverse @ vectors.T
-    return inverse_root @ _square_root(root @ target @ root) @ inverse_root
+    matrix: Tensor = inverse_root @ _square_root(root @ target @ root) @ inverse_root
+    return matrix
 
 
 def _square_root(matrix: Tensor) -> Tensor:
     """Square root of a symmetric matrix that is positive semidefinite up to rounding."""
     values, vectors = torch.linalg.eigh(matrix)
-    return vectors * values.clamp_min(0).sqrt() @ vectors.T
+    root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
+    return root

@@ -13,6 +13,7 @@ import os
 import socket
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -92,7 +93,7 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
 
 def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
     """Lay a scene into a memory file; returns the scene as it lies there, and where that is."""
-    arrays: dict[str, NDArray] = {name.name: getattr(file.scene, name.name).numpy() for name in fields(Scene)}
+    arrays: dict[str, NDArray[Any]] = {name.name: getattr(file.scene, name.name).numpy() for name in fields(Scene)}
     if file.kept is not None:
         arrays["kept"] = file.kept
     layout: _Layout = {}
@@ -113,7 +114,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
 
 def _mapped(shared: _Shared, path: str) -> SceneFile:
     """The scene in a memory file, mapped."""
-    with open(path, "rb") as file:
+    with Path(path).open("rb") as file:
         memory = mmap.mmap(file.fileno(), shared.size, access=mmap.ACCESS_COPY)
     arrays = {}
     for name, (offset, shape, kind) in shared.layout.items():
@@ -185,4 +186,4 @@ def available_memory() -> int:
             free = min(free, int(limit) - used + int(cached.get("inactive_file", 0)))
     except OSError:  # no control groups of version 2, or none around this process
         pass
-    return free
+    return int(free)

@@ -165,6 +165,7 @@ class ProcessGroupCollectives:
             except SgsstError as error:
                 message = [(None, error)]
         dist.broadcast_object_list(message, group=self._group, group_src=0, device=torch.device("cpu"))
+        value: T
         value, problem = message[0]
         if problem is not None:
             raise problem

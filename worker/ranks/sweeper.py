@@ -54,7 +54,7 @@ def _uses(process: Path, folder: str) -> bool:
             return False
         if folder.encode() in process.joinpath("cmdline").read_bytes():
             return "sweeper.py" not in process.joinpath("cmdline").read_text(errors="replace")
-        return any(os.readlink(link).startswith(folder + "/") for link in process.joinpath("fd").iterdir())
+        return any(str(link.readlink()).startswith(folder + "/") for link in process.joinpath("fd").iterdir())
     except OSError:  # gone meanwhile, or another user's
         return False
 

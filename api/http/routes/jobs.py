@@ -178,7 +178,8 @@ async def _from_json(request: Request, context: Context) -> Parts:
 
 def _resolve(context: Context, caller: Caller, received: Received) -> tuple[list[dict[str, Any]], dict[str, FilePath]]:
     """All files of a job, those that came with it and those that were uploaded before, and where they are by digest.
-    They stay for now."""
+    They stay for now.
+    """
     inputs = list(received.files)
     ids = [upload_id for _, upload_id in received.uploads if is_id(upload_id)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}

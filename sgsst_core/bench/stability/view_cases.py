@@ -56,7 +56,7 @@ def _size(width: int, height: int, full: bool) -> CaseResult:
 
 
 def _stylized_size(width: int, height: int, full: bool) -> CaseResult:
-    """Layers without a cell are left out of the loss. (A long view is cut short where the test is to be quick.)"""
+    """Layers without a cell are left out of the loss. A long view is cut short where the test is to be quick."""
     width = width if full else min(width, 512)
     image, style, content = texture(height, width, 1), texture(40, 32, 2), texture(height, width, 3)
     return compare_losses(image, style, content, untiled=min(width, height) >= 16)

@@ -1,0 +1,60 @@
+"""README, CONTRIBUTING, CHANGELOG and docs/: what they name is there. `make docs` checks the anchors, too."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+#: Columns of a line; a table's row cannot be broken.
+COLUMNS = 120
+#: Folders whose files a document may name.
+FOLDERS = ("sgsst_core", "worker", "service", "api", "tests", "benchmarks", "deploy", "docs")
+
+
+def name_of(document: Path) -> str:
+    """As a test's id."""
+    return document.relative_to(ROOT).as_posix()
+
+
+each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+#: The changelog names files and modules of before, too.
+each_document_of_today = pytest.mark.parametrize(
+    "document", [path for path in DOCUMENTS if path.name != "CHANGELOG.md"], ids=name_of
+)
+
+
+@each_document
+def test_lines_are_no_longer_than_those_of_code(document: Path) -> None:
+    lines = document.read_text().splitlines()
+    assert [line for line in lines if len(line) > COLUMNS and not line.startswith("|")] == []
+
+
+@each_document
+def test_links_lead_to_files(document: Path) -> None:
+    targets = re.findall(r"\]\(([^)#]+)", document.read_text())
+    files = [target for target in targets if "://" not in target]
+    assert [file for file in files if not (document.parent / file).exists()] == []
+
+
+@each_document_of_today
+def test_files_that_are_named_exist(document: Path) -> None:
+    named = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[^` ]*)`", document.read_text())
+    assert [path for path in named if not list(ROOT.glob(path))] == []
+
+
+@each_document_of_today
+def test_modules_that_are_named_exist(document: Path) -> None:
+    named = re.findall(rf"(?:python -m|from) ((?:{'|'.join(FOLDERS)})[\w.]*)", document.read_text())
+    assert [name for name in named if importlib.util.find_spec(name) is None] == []
+
+
+@each_document_of_today
+def test_tests_that_are_named_exist(document: Path) -> None:
+    named = set(re.findall(r"`(?:[\w/]+\.py::)?(test_\w+|Test\w+)`", document.read_text()))
+    sources = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    assert {name for name in named if not re.search(rf"(?:def |class |^){name}\b", sources, re.M)} == set()

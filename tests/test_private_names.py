@@ -1,0 +1,82 @@
+"""Names that packages do not promise, and what to do when a new version has taken one away.
+
+The upper bounds of Ray, PyTorch and uvicorn in pyproject.toml keep such a version out until these tests pass with it.
+"""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+
+def test_ray_prints_by_a_function_that_can_be_replaced() -> None:
+    import ray._private.worker as worker
+
+    assert callable(getattr(worker, "print_to_stdstream", None)), (
+        "Ray's driver prints the errors of its processes by another function now. Find what writes them to standard "
+        "output, and replace that one in worker/ranks/cluster.py."
+    )
+
+
+@pytest.mark.parametrize("option", ["_temp_dir", "_node_ip_address"])
+def test_ray_starts_in_a_folder_and_on_an_address_of_our_own(option: str) -> None:
+    import ray
+
+    assert f'"{option}"' in inspect.getsource(ray.init), (
+        f"ray.init no longer knows {option}. Find what took its place, and change worker/ranks/cluster.py: "
+        "without a folder of its own, what a killed Ray leaves behind cannot be swept away; without 127.0.0.1, Ray "
+        "listens on the network."
+    )
+
+
+def test_a_process_group_can_be_told_how_long_to_wait() -> None:
+    from torch.distributed import distributed_c10d
+
+    set_timeout = getattr(distributed_c10d, "_set_pg_timeout", None)
+    parameters = list(inspect.signature(set_timeout).parameters) if set_timeout is not None else []
+    assert parameters == ["timeout", "group"], (
+        "PyTorch sets the time-out of a process group in another way now: change "
+        "worker/ranks/process_group.py. Without it, ranks of a slow machine are taken for lost."
+    )
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        "connection_made",
+        "connection_lost",
+        "data_received",
+        "on_headers_complete",
+        "on_message_complete",
+        "send_400_response",
+    ],
+)
+def test_methods_that_the_bounded_connection_overrides(method: str) -> None:
+    from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+    from api.http.connection import Connection
+
+    assert method in vars(Connection)
+    assert method in vars(HttpToolsProtocol), (
+        f"uvicorn's HTTP protocol has no {method} any more: api/http/connection.py overrides nothing there. Find what "
+        "it is called now; tests/api/http/test_hostile.py shows whether heads are bounded again."
+    )
+
+
+@pytest.mark.parametrize("attribute", ["loop", "transport", "cycle"])
+def test_attributes_that_the_bounded_connection_reads(attribute: str) -> None:
+    from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+    assert f"self.{attribute}" in inspect.getsource(HttpToolsProtocol.__init__), (
+        f"uvicorn's HTTP protocol does not set {attribute} any more: find what api/http/connection.py can read instead."
+    )
+
+
+@pytest.mark.parametrize("attribute", ["response_started", "response_complete"])
+def test_attributes_of_an_answer_that_the_bounded_connection_reads(attribute: str) -> None:
+    from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
+
+    assert f"self.{attribute}" in inspect.getsource(RequestResponseCycle.__init__), (
+        f"uvicorn's answers have no {attribute} any more: find how api/http/connection.py can tell whether one is open."
+    )

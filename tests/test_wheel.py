@@ -1,0 +1,93 @@
+"""The wheel, installed into an environment of its own and used from another folder.
+
+The environment sees the packages of the one that the tests run in, so that nothing is downloaded, but not this project:
+what the wheel does not bring along is missing there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.features.network_weights import BackboneWeights
+from tests.small_scenes import wall, write_files
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("sgsst_core", "worker", "service", "api")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this working tree, built in a copy of it: building leaves folders behind."""
+    copy = tmp_path_factory.mktemp("source")
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    subprocess.run([sys.executable, "-m", "build", "--no-isolation", "--wheel", str(copy)], check=True)
+    (built,) = (copy / "dist").glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the commands of an environment that the wheel is installed in."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False)
+    commands = folder / "bin"
+    pip = [sys.executable, "-m", "pip", "--python", str(commands / "python"), "--disable-pip-version-check"]
+    subprocess.run([*pip, "install", "--quiet", "--no-deps", "--no-index", str(wheel)], check=True)
+    packages = sysconfig.get_path("purelib", vars={"base": str(folder), "platbase": str(folder)})
+    # a folder that a .pth file names is searched, but .pth files in it are not read: no editable installation is seen
+    Path(packages, "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return commands
+
+
+def run(command: list[str | Path], folder: Path, **variables: str) -> str:
+    """What a command prints that runs in another folder than this project's; it must not fail."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, cwd=folder, env={**environment, **variables}, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_every_file_of_the_packages_is_in_the_wheel(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        packed = {name for name in archive.namelist() if not name.split("/")[0].endswith(".dist-info")}
+    paths = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
+    assert packed == {path.relative_to(ROOT).as_posix() for path in paths if "__pycache__" not in path.parts}
+    assert {f"{name}/py.typed" for name in PACKAGES} <= packed
+
+
+def test_the_installed_packages_are_those_of_the_wheel(installed: Path, tmp_path: Path) -> None:
+    code = f"import {', '.join(PACKAGES)}; print(*(package.__file__ for package in ({', '.join(PACKAGES)})))"
+    files = run([installed / "python", "-c", code], tmp_path).split()
+    assert all(Path(file).is_relative_to(installed.parent) for file in files), files
+    assert run([installed / "sgsst", "--version"], tmp_path).strip()
+
+
+def test_a_scene_is_stylized_and_reported(installed: Path, vgg16_weights: BackboneWeights, tmp_path: Path) -> None:
+    ply, cameras, style = write_files(tmp_path, wall())
+    out = tmp_path / "new" / "stylized.ply"
+    options = ["--cameras", cameras, "--style", style, "--out", out, "--backbone", "vgg16"]
+    run([installed / "sgsst", "stylize", ply, *options, "--steps-sos", "2"], tmp_path, OMP_NUM_THREADS="1")
+    assert out.stat().st_size == ply.stat().st_size
+    assert "</html>" in out.with_name("stylized.report.html").read_text()
+
+
+def test_a_database_is_made_by_the_migrations(installed: Path, tmp_path: Path) -> None:
+    arguments = ["--data", str(tmp_path / "data"), "--json"]
+    run([installed / "sgsst", "keys", "create", "alice", *arguments], tmp_path)
+    listed = json.loads(run([installed / "sgsst", "keys", "list", *arguments], tmp_path))
+    assert [key["name"] for key in listed] == ["alice"]
