@@ -16,8 +16,9 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
+from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import read_scene, write_stylized
-from sgsst_core.report.document import machine, write_json
+from sgsst_core.report.machine import machine
 from worker.job import read_cameras_of
 from worker.request import SceneRequest, check_choice, check_folder
 
@@ -62,9 +63,8 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
     file = read_scene(request.source.scene, drop_invalid=request.source.drop_invalid)
     cameras = read_cameras_of(request.source, file.scene)
     ensure_writable_folder(request.out)
-    options = {name: value for name, value in request.settings.items() if value is not None}
     arguments = (file.scene, cameras, style, variants, request.seconds)
-    curves = error_time(*arguments, weights=weights, progress=progress, **options)
+    curves = error_time(*arguments, weights=weights, progress=progress, **request.settings)
     values = {
         "version": 1,
         "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
@@ -72,7 +72,7 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
         "views": len(cameras),
         "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],
         "budget_seconds": request.seconds,
-        "settings": options,
+        "settings": request.settings,
         "backbone": weights.name,
         "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
         **as_dict(curves),

@@ -241,8 +241,8 @@ def test_photos_are_the_content_where_they_are_given(tiny_weights: BackboneWeigh
     settings = make_settings()
     own = Stylizer(scene, cameras(1), style(), settings, weights=tiny_weights)
     given = Stylizer(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
-    assert own.evaluate([0])[0].content == 0
-    assert given.evaluate([0])[0].content > 0
+    assert own.evaluate([0])[0]["content"] == 0
+    assert given.evaluate([0])[0]["content"] > 0
 
 
 def test_larger_views_are_brought_down_to_the_limit() -> None:
