@@ -33,9 +33,11 @@ load_all_checks()
 
 
 def refuses_what_is_wrong(ctx: Any, response: Response, case: schemathesis.Case) -> bool | None:
-    """As the library has it, but for headers that nobody knows, which HTTP has ignored, and for more refusals, such as
-    tus' 412 and 460."""
-    if "x-schemathesis-unknown-property" in case.headers or 400 <= response.status_code < 500:
+    """As the library has it, but for headers and queries that nobody knows, which HTTP has ignored, and for more
+    refusals, such as tus' 412 and 460."""
+    known = {parameter["name"] for parameter in case.operation.definition.raw.get("parameters", [])}
+    unknown = "x-schemathesis-unknown-property" in case.headers or not known.issuperset(case.query or {})
+    if unknown or 400 <= response.status_code < 500:
         return None
     return negative_data_rejection(ctx, response, case)
 
@@ -152,6 +154,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     return Uploaded(service, store, key, tmp_path_factory.mktemp("inputs"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "behind"),
     [
