@@ -47,7 +47,7 @@ class RefusedError(Exception):
         self.code = code
 
 
-def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
+def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
     """Read every input of a job as the job would; nothing is rendered.
 
     Returns:
@@ -62,13 +62,13 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
 def _read_inputs(
     staged: Staged, parameters: JobParameters, limits: dict[str, Any]
 ) -> tuple[dict[str, Any], Scene, list[Camera], Tensor]:
-    """What `check` finds, and what it has read: the scene, the cameras, and the style [H, W, 3]."""
+    """What `validate` finds, and what it has read: the scene, the cameras, and the style [H, W, 3]."""
     settings = parameters.settings()
     check_steps(settings)
-    _check_weights(parameters.backbone)
+    _check_network_weights(parameters.backbone)
     found: dict[str, Any] = {}
     source = scene_request(staged, parameters)
-    with _Part("scene"):
+    with _ErrorsOf("scene"):
         header = read_header(staged.scene)
         element_offsets(staged.scene, header)
         declared = header.vertex.count if "vertex" in header.names else 0
@@ -78,13 +78,13 @@ def _read_inputs(
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
-    with _Part("style"):
-        _check_pixels(staged.style, limits)
+    with _ErrorsOf("style"):
+        _check_pixel_count(staged.style, limits)
         image = load_image(staged.style)
         found["style"] = [image.shape[1], image.shape[0]]
-    with _Part("cameras"):
+    with _ErrorsOf("cameras"):
         if source.cameras is not None:
-            _check_sizes(source.cameras)
+            _check_frames_have_sizes(source.cameras)
         cameras = fit_cameras(read_cameras_of(source, file.scene), settings)
         if len(cameras) > limits["views"]:
             raise RefusedError("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
@@ -93,17 +93,17 @@ def _read_inputs(
             raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
-    with _Part("photos"):
+    with _ErrorsOf("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
         for path in paths:
-            _check_pixels(path, limits)
+            _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
     return found, file.scene, cameras, image
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
-    """What a job would do: what `check` finds, and the plan of `sgsst plan`."""
+    """What a job would do: what `validate` finds, and the plan of `sgsst plan`."""
     found, scene, cameras, style = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_weights(request.backbone)
@@ -117,10 +117,13 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     return {**found, "plan": plan_json(made), "estimated_seconds": seconds, "memory_bytes": memory}
 
 
-WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {"check": check, "plan": plan}
+WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {
+    "validate": validate,
+    "plan": plan,
+}
 
 
-class _Part:
+class _ErrorsOf:
     """Marks errors with the part of the request that they are about."""
 
     def __init__(self, name: str) -> None:
@@ -134,14 +137,14 @@ class _Part:
             error.part = self._name  # type: ignore[attr-defined]
 
 
-def _check_weights(backbone: str) -> None:
+def _check_network_weights(backbone: str) -> None:
     installed = [entry.name for entry in list_weights() if entry.path]
     wanted = [name for name in ("vgg19", "vgg16") if backbone in ("auto", name)]
     if not any(name in installed for name in wanted):
         raise WeightsError(f"The service has no weights of {' or '.join(wanted)}: its operator has to fetch them.")
 
 
-def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
+def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
     width, height = image_size(path)
     if width * height > limits["image_pixels"]:
         raise RefusedError(
@@ -149,7 +152,7 @@ def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
         )
 
 
-def _check_sizes(path: Path) -> None:
+def _check_frames_have_sizes(path: Path) -> None:
     """Refuse frames of a transforms.json that leave their size to an image: its path may lead anywhere on this machine,
     and the answer would tell what is there.
     """
@@ -167,7 +170,7 @@ def _check_sizes(path: Path) -> None:
 # --- one request in a child ----------------------------------------------------------------------------------------
 
 
-def _answer(request: dict[str, Any]) -> dict[str, Any]:
+def _inspect(request: dict[str, Any]) -> dict[str, Any]:
     """What a child writes: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
@@ -191,7 +194,7 @@ def _refusal(code: str, message: str, part: str | None) -> dict[str, Any]:
     return {"error": {"code": code, "message": message.removeprefix(f"{part}/"), "input": part}}
 
 
-def _limit(seconds: float, size: int) -> None:
+def _limit_resources(seconds: float, size: int) -> None:
     own = psutil.Process().memory_info().vms
     resource.setrlimit(resource.RLIMIT_AS, (own + size, own + size))
     cpu = max(1, int(seconds))
@@ -199,7 +202,7 @@ def _limit(seconds: float, size: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _in_child(request: dict[str, Any]) -> bytes:
+def _inspect_in_child(request: dict[str, Any]) -> bytes:
     """Fork, limit, answer; what the child has to say comes through a pipe. A child that says nothing hit a limit."""
     reading, writing = os.pipe()
     child = os.fork()
@@ -207,23 +210,23 @@ def _in_child(request: dict[str, Any]) -> bytes:
         os.close(reading)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         try:
-            _limit(request["seconds"], request["bytes"])
+            _limit_resources(request["seconds"], request["bytes"])
             with os.fdopen(writing, "wb") as file:
-                file.write(json.dumps(_answer(request)).encode())
+                file.write(json.dumps(_inspect(request)).encode())
         finally:
             os._exit(0)
     os.close(writing)
-    said = _read_to_end(reading, time.monotonic() + 2 * request["seconds"])
+    answer = _read_to_end(reading, time.monotonic() + 2 * request["seconds"])
     os.close(reading)
-    if said is None:
+    if answer is None:
         os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     try:
-        json.loads(said or b"")
+        json.loads(answer or b"")
     except ValueError:
         limit = "Reading the files takes more time or memory than allowed, or breaks their reader."
         return json.dumps(_refusal("inspection-limit", limit, None)).encode()
-    return said or b""
+    return answer or b""
 
 
 def _read_to_end(descriptor: int, deadline: float) -> bytes | None:
@@ -245,7 +248,7 @@ def main() -> None:
 
     die_with_parent()
     for line in sys.stdin.buffer:
-        sys.stdout.buffer.write(_in_child(json.loads(line)) + b"\n")
+        sys.stdout.buffer.write(_inspect_in_child(json.loads(line)) + b"\n")
         sys.stdout.buffer.flush()
 
 

@@ -15,7 +15,7 @@ from worker.execute import Result, execute
 from worker.prepare import Job, prepare
 from worker.request import Resume, StylizeRequest
 
-pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
 
 def go_on(

@@ -18,7 +18,7 @@ from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
 from worker.ranks.listener import Listener
 
 pytestmark = [
-    pytest.mark.usefixtures("one_thread", "vgg16_weights"),
+    pytest.mark.usefixtures("one_thread", "tiny_installed"),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent"),
 ]
 
