@@ -22,8 +22,12 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, write_stylized
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.probe import common_device
+from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
-from sgsst_core.quality.measure import Measurements, with_measuring
+from sgsst_core.quality.measure import Measurements
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import (
     Sources,
@@ -35,12 +39,13 @@ from sgsst_core.report.document import (
     write_loss_curves,
 )
 from sgsst_core.report.page import write_page
-from sgsst_core.scene.camera import Camera, orbit, resized, spread
+from sgsst_core.scene.camera import Camera, fit_cameras, orbit, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, versions
+from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
-from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, fit_cameras
+from sgsst_core.stylizing.stylizer import Stylizer
 from worker.ranks.geometry import read_shared_scene
 from worker.request import Outputs, Resume, SceneRequest, StylizeRequest, check_request
 
@@ -116,13 +121,15 @@ def prepare(
     collectives: Collectives = ALONE,
     resume: Resume | None = None,
     warn: Warn = lambda line: None,
+    show_planning: ShowPlanning | None = None,
 ) -> Job:
-    """Read and check every input; nothing is written. Every rank calls this.
+    """Read and check every input, and plan; nothing is written. Every rank calls this.
 
     Args:
         collectives: of all ranks.
         resume: None for what the request says.
         warn: told of checkpoints that cannot be used.
+        show_planning: told how far the survey of the views has come; not used where a checkpoint has one.
 
     Raises:
         InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
@@ -144,9 +151,22 @@ def prepare(
     resumed = collectives.broadcast(lambda: _resumed(outputs, job_id, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
-    # A plan made for fewer ranks cannot say what more of them are good for.
-    plan = resumed.plan if resumed and collectives.size <= resumed.ranks else None
+    plan, workshop, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
+    if plan is not None and resumed is not None:
+        planned_ranks = resumed.ranks
+    else:
+        plan, workshop = make_plan(
+            scene_file.scene,
+            cameras,
+            settings,
+            weights=weights,
+            collectives=collectives,
+            looked=resumed.plan.survey if resumed else None,
+            measured=True,
+            show=show_planning,
+        )
     stylizer = Stylizer(
+        plan,
         scene_file.scene,
         cameras,
         style,
@@ -154,14 +174,21 @@ def prepare(
         weights=weights,
         photos=(lambda index: load_photo(photos[index], cameras[index])) if photos else None,
         collectives=collectives,
-        plan=plan,
+        workshop=workshop,
     )
-    planned_ranks = resumed.ranks if resumed and plan else collectives.size
-    if plan is None:
-        stylizer.plan = with_measuring(stylizer.plan)
     sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
     return Job(request, outputs, scene_file, style, sources, stylizer, job_id, resumed, planned_ranks, workers)
+
+
+def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
+    """The plan of a resumed job; None where there is none, or where it was made for another device.
+
+    Nor can a plan made for fewer ranks say what more of them are good for.
+    """
+    if resumed is None or collectives.size > resumed.ranks:
+        return None
+    return resumed.plan if resumed.plan.device == common_device(collectives) else None
 
 
 def together(collectives: Collectives, make: Callable[[], T]) -> T:

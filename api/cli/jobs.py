@@ -14,16 +14,15 @@ from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.ply import read_scene
-from sgsst_core.planning.planner import Plan
+from sgsst_core.planning import planner
+from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import SEEN_COVERAGE
 from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
-from sgsst_core.quality.measure import with_measuring
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import plan_json, write_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import read_cameras_of
 from worker.request import SceneRequest, check_choice, check_folder
 
@@ -44,9 +43,10 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
     check_folder(out.parent)
     scene = read_scene(source.scene, drop_invalid=source.drop_invalid).scene
     weights = load_weights(backbone)
-    stylizer = Stylizer(scene, read_cameras_of(source, scene), load_image(style), settings, weights=weights)
+    cameras = read_cameras_of(source, scene)
+    load_image(style)  # a style that cannot be used is told before the work, too
+    plan, _ = planner.make_plan(scene, cameras, settings, weights=weights, measured=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    plan = with_measuring(stylizer.plan)
     write_json(out, plan_json(plan))
     return plan
 

@@ -29,11 +29,10 @@ from sgsst_core.features.network_weights import list_weights, load_weights
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene
 from sgsst_core.files.ply_header import element_offsets, read_header
-from sgsst_core.quality.measure import with_measuring
+from sgsst_core.planning.planner import make_plan
 from sgsst_core.report.document import plan_json
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.stylizer import Stylizer, fit_cameras
 from worker.job import read_cameras_of
 
 
@@ -101,8 +100,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     scene = read_scene(staged.scene, drop_invalid=parameters.drop_invalid).scene
     cameras = fit_cameras(read_cameras_of(request.source, scene), request.settings)
     weights = load_weights(request.backbone)
-    stylizer = Stylizer(scene, cameras, load_image(staged.style), request.settings, weights=weights)
-    made = with_measuring(stylizer.plan)
+    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True)
     seconds = memory = None
     if made.prediction:
         memory = made.prediction.peak_bytes

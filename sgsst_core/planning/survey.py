@@ -6,6 +6,7 @@ each looks at some of the views.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from sgsst_core.errors import CameraError
 from sgsst_core.features.partition import Rectangle, covered_region
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -50,25 +52,32 @@ class _Look:
     covered: bool
 
 
-def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, collectives: Collectives = ALONE) -> Survey:
+def survey(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    rasterizer: Rasterizer,
+    collectives: Collectives = ALONE,
+    show: ShowPlanning | None = None,
+) -> Survey:
     """Look at every view once; every rank gets the same survey.
+
+    Args:
+        show: told before the first view of this rank, and after each.
 
     Raises:
         CameraError: no camera sees a Gaussian.
     """
     weights = torch.zeros(len(scene), dtype=torch.float64)
-    own: dict[int, _Look] = {}
-    for index in range(collectives.rank, len(cameras), collectives.size):
-        camera = cameras[index]
-        coverage = rasterizer.coverage(camera)
-        seen = float(coverage.amax()) > SEEN_COVERAGE
-        uncovered = float((1 - coverage).sum(dtype=torch.float64))
-        own[index] = _Look(covered_region(coverage), uncovered, coverage.numel(), seen)
-        if seen:
-            ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
-            weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
     looks: dict[int, _Look] = {}
-    for part in collectives.all_gather(own):
+    own = range(collectives.rank, len(cameras), collectives.size)
+    started = time.perf_counter()
+    for done, index in enumerate(own):
+        if show:
+            show(_progress(done, len(cameras), collectives.size, time.perf_counter() - started))
+        looks[index] = _look(cameras[index], rasterizer, weights)
+    if show:
+        show(_progress(len(own), len(cameras), collectives.size, time.perf_counter() - started))
+    for part in collectives.all_gather(looks):
         looks |= part
     covered = [index for index in range(len(cameras)) if looks[index].covered]
     if not covered:
@@ -80,3 +89,20 @@ def survey(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer, coll
     uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
     regions = [looks[index].region for index in range(len(cameras))]
     return Survey(weights, covered, regions, uncovered_share)
+
+
+def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
+    """What a view shows; its blend weights are added to weights [N] float64."""
+    coverage = rasterizer.coverage(camera)
+    seen = float(coverage.amax()) > SEEN_COVERAGE
+    uncovered = float((1 - coverage).sum(dtype=torch.float64))
+    if seen:
+        ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
+        weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
+    return _Look(covered_region(coverage), uncovered, coverage.numel(), seen)
+
+
+def _progress(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
+    """After so many views of this rank: the others are taken to be as far."""
+    done = min(total, own * ranks)
+    return PlanningProgress(done, total, seconds * (total - done) / done if done else None)

@@ -26,12 +26,14 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.planner import Plan
+from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.checkpoint import versions
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
 from sgsst_core.stylizing.loop import Stopped
-from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, Stylizer, mean_loss
+from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Of report.json: raised whenever a field changes its meaning or goes away.
 REPORT_VERSION = 2

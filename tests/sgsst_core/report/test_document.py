@@ -26,7 +26,8 @@ from sgsst_core.report.document import (
 )
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylizer import StepRecord, Stylizer
+from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, blind_camera, cameras, style
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -37,7 +38,7 @@ def finished(vgg16_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Eval
     """Six views of a ball of which one sees nothing, after seven steps; the loss before and after."""
     views = [*cameras(3), blind_camera(), *cameras(2)]
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3)
-    stylizer = Stylizer(ball(), views, style(), settings, weights=vgg16_weights)
+    stylizer = Stylizer.planned(ball(), views, style(), settings, weights=vgg16_weights)
     before = stylizer.evaluate(stylizer.evaluation_views)
     run(stylizer)
     return stylizer, before, stylizer.evaluate(stylizer.evaluation_views)

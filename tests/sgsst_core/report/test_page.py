@@ -556,7 +556,7 @@ def test_thinning_leaves_far_points_as_they_are() -> None:
 
 
 def test_page_of_a_real_job(vgg16_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
-    stylizer = Stylizer(
+    stylizer = Stylizer.planned(
         ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=vgg16_weights
     )
     before = stylizer.evaluate(stylizer.evaluation_views)
