@@ -12,16 +12,7 @@ from worker.request import SceneRequest, StylizeRequest
 
 def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:
     """Scene and cameras."""
-    return SceneRequest(
-        staged.scene,
-        staged.cameras,
-        parameters.orbit,
-        parameters.up,
-        parameters.views,
-        parameters.resolution,
-        parameters.near,
-        parameters.drop_invalid,
-    )
+    return SceneRequest.of(staged.scene, staged.cameras, parameters)
 
 
 def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
+from sgsst_core.options import Declared, Option
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "bfloat16"]
@@ -16,71 +18,121 @@ KeptWeights = Literal["auto", "float32", "half", "none"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
+#: How the default of a setting that presets decide begins, in words.
+BY_PRESET = "by preset"
+M = TypeVar("M", bound=BaseModel)
+
+
+#: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
+MAX_RESOLUTION = 16384
+#: More would be a slip of the hand.
+_MAX_STEPS, _MAX_WEIGHT = 10_000_000, 1e12
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Near = Annotated[
+    float,
+    Option(unit="scene units"),
+    Field(gt=0, allow_inf_nan=False, description="Near plane, in the scene's units."),
+]
+Resolution = Annotated[
+    int | None,
+    Option(unit="pixels", name="resolution", default="the cameras' own"),
+    Field(ge=1, le=MAX_RESOLUTION, description="Pixels of every view's longer side."),
+]
 
 
 class Settings(BaseModel):
     """Everything that decides a result, apart from scene, cameras, style and photos.
 
-    Attributes:
-        preset: the preset that the values started from.
-        steps_coarse: iterations of phase 1, on the coarsest scale alone.
-        steps_sos: iterations of phase 2, on all scales.
-        learning_rate: Adam's, at the start.
-        learning_rate_end: Adam's at the end, reached exponentially; equal to learning_rate for a constant one.
-        content_weight: lambda_c; 0 leaves the content branch out.
-        position_weights: weigh statistics by rendered coverage: always, never, or where views have uncovered pixels.
-        precision: of the feature network.
-        max_resolution: longer side to which larger views are brought down; None for the cameras' own.
-        background: RGB in 0..1 behind the Gaussians.
-        near: near plane, world units.
-        seed: of the order of views.
-        max_seconds: wall-clock budget of the iterations; None for none.
-        memory_limit: bytes to plan with; None for most of what is free.
-        unseen: colours of Gaussians that no view sees: their neighbours' change, or kept as they are.
-        coarsest_side: pixels of the coarsest scale's shorter side at most; the method's is 511.
-        warm_start: begin with colours whose mean and covariance are the style's.
-        revive: colours that the clamp holds at 0 take gradients that would raise them, instead of staying black.
-        early_stop: end when the smoothed loss of all scales has stopped falling (`convergence`).
-        target_loss: end when the smoothed loss of all scales, relative to the start, is at most this; None for never.
-        prune_weight: Gaussians whose blend weights, summed over all pixels of all views, are at most this are treated
-            as unseen; 0 takes out none that any pixel shows.
-        similar_views: leave out views whose picture differs from that of a kept view by a shift of less than this share
-            of the longer side; 0 leaves out none.
-        kept_weights: how blend weights are kept between iterations; "auto" lets the memory decide.
-        views_per_step: views of each step, whose gradients are averaged; ranks that form groups take them side by side.
-        rebalance: share the work out anew, once, when ranks turn out to differ in speed. Without it a run on the same
-            number of ranks can be repeated bit for bit even then.
-        keep: items that are not left out although the scene does not need them; for comparison, the result is the same.
+    Each field is declared here and nowhere else: options of the command line, parameters of the API and the reference
+    in docs/options.md follow from it. Names and order are part of a checkpoint's fingerprint: another name, or one more
+    field, and checkpoints of before belong to another job.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    preset: PresetName = "standard"
-    steps_coarse: int = Field(ge=0, le=10_000_000)
-    steps_sos: int = Field(ge=0, le=10_000_000)
-    learning_rate: float = Field(gt=0, le=100, allow_inf_nan=False)
-    learning_rate_end: float = Field(gt=0, le=100, allow_inf_nan=False)
-    content_weight: float = Field(1.0, ge=0, le=1e12, allow_inf_nan=False)
-    position_weights: PositionWeights = "auto"
-    precision: Precision = "float32"
-    max_resolution: int | None = Field(None, ge=1)
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    near: float = Field(NEAR, gt=0, allow_inf_nan=False)
-    seed: int = Field(0, ge=0, lt=2**63)
-    max_seconds: float | None = Field(None, gt=0)
-    memory_limit: int | None = Field(None, gt=0)
-    unseen: Literal["neighbours", "keep"] = "neighbours"
-    coarsest_side: int = Field(COARSEST_SHORTER_SIDE, ge=16)
-    warm_start: bool = False
-    revive: bool = False
-    early_stop: bool = False
-    target_loss: float | None = Field(None, gt=0, lt=1)
-    prune_weight: float = Field(0.0, ge=0, allow_inf_nan=False)
-    similar_views: float = Field(0.0, ge=0, lt=1)
-    kept_weights: KeptWeights = "auto"
-    views_per_step: int = Field(1, ge=1, le=10_000)
-    rebalance: bool = True
-    keep: tuple[Item, ...] = ()
+    preset: PresetName = Field("standard", description="Where the settings below start from.")
+    steps_coarse: Annotated[int, Option(unit="steps", metavar="N")] = Field(
+        ge=0, le=_MAX_STEPS, description="Steps of phase 1, on the coarsest scale alone."
+    )
+    steps_sos: Annotated[int, Option(unit="steps", metavar="N")] = Field(
+        ge=0, le=_MAX_STEPS, description="Steps of phase 2, on all scales."
+    )
+    learning_rate: Annotated[float, Option(unit="of a colour, a step", metavar="R")] = Field(
+        gt=0, le=100, allow_inf_nan=False, description="Adam's learning rate; constant where it is given."
+    )
+    learning_rate_end: Annotated[float, Option(unit="as learning_rate", instead="learning_rate")] = Field(
+        gt=0, le=100, allow_inf_nan=False, description="Adam's learning rate at the end, reached exponentially."
+    )
+    content_weight: Annotated[float, Option(unit="factor", metavar="W")] = Field(
+        1.0, ge=0, le=_MAX_WEIGHT, allow_inf_nan=False, description="Weight of the content term; 0 leaves it out."
+    )
+    position_weights: PositionWeights = Field(
+        "auto",
+        description="Weigh statistics by coverage, so that an empty surround does not count; auto does so where views "
+        "have uncovered pixels.",
+    )
+    precision: Precision = Field("float32", description="Number format of the feature network.")
+    max_resolution: Resolution = None
+    background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
+        (0.0, 0.0, 0.0), description="Colour behind the Gaussians."
+    )
+    near: Near = NEAR
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views.")
+    max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
+        None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."
+    )
+    memory_limit: Annotated[int | None, Option(unit="bytes", default="40 % of all, at most")] = Field(
+        None, gt=0, le=2**50, description="Bytes of memory to plan with."
+    )
+    unseen: Literal["neighbours", "keep"] = Field(
+        "neighbours", description="Colours of Gaussians that no view sees: their neighbours' change, or kept."
+    )
+    coarsest_side: Annotated[int, Option(unit="pixels", metavar="N")] = Field(
+        COARSEST_SHORTER_SIDE,
+        ge=16,
+        le=MAX_RESOLUTION,
+        description="Shorter side of the coarsest scale in pixels, at most; the method's is 511.",
+    )
+    warm_start: Annotated[bool, Option(flags="--warm-start/--cold-start")] = Field(
+        False, description="Begin with the style's mean colour and spread."
+    )
+    revive: bool = Field(
+        False, description="Let colours that fell below black come back, by gradients that would raise them."
+    )
+    early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales has stopped falling.")
+    target_loss: Annotated[
+        float | None, Option(unit="share of the loss at the start", metavar="R", default="never")
+    ] = Field(
+        None, gt=0, lt=1, description="Stop when the loss has come down to this share of the start, such as 0.05."
+    )
+    prune_weight: Annotated[float, Option(unit="pixels", metavar="W")] = Field(
+        0.0,
+        ge=0,
+        allow_inf_nan=False,
+        description="Leave out Gaussians that all views together show in no more than W pixels; 0 takes out none that "
+        "any pixel shows.",
+    )
+    similar_views: Annotated[float, Option(unit="share of the longer side", metavar="S")] = Field(
+        0.0, ge=0, lt=1, description="Leave out views that another, shifted by less than S of its side, shows."
+    )
+    kept_weights: KeptWeights = Field(
+        "auto", description="How blend weights are kept between steps; auto: as memory allows."
+    )
+    views_per_step: Annotated[int, Option(unit="views", metavar="V")] = Field(
+        1,
+        ge=1,
+        le=10_000,
+        description="Average the gradients of V views in each step; groups of workers take them side by side.",
+    )
+    rebalance: bool = Field(
+        True,
+        description="Give slower workers less to do, once. Without it a run on as many workers repeats bit for bit "
+        "even where they differ in speed.",
+    )
+    keep: Annotated[tuple[Item, ...], Option(instead="keep_everything")] = Field(
+        (), description="Items that are not left out although the scene does not need them; the result is the same."
+    )
 
     def learning_rate_at(self, share: float) -> float:
         """Adam's learning rate when `share` (0..1) of all steps is done."""
@@ -128,9 +180,26 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     chosen = {name: value for name, value in values.items() if value is not None}
     if "learning_rate" in chosen:  # a rate given by hand is meant as it is, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
+    return checked(Settings, {"preset": preset, **_PRESETS[preset], **chosen})
+
+
+def checked(model: type[M], values: Mapping[str, object]) -> M:
+    """A model of these values.
+
+    Raises:
+        SettingsError: one of them is unknown, or not what the model declares; named with what is wrong.
+    """
     try:
-        return Settings(**{"preset": preset, **_PRESETS[preset], **chosen})
+        return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise SettingsError(f"Setting {name} = {first['input']!r}: {first['msg']}.") from error
+
+
+def default_text(setting: Declared) -> str:
+    """What holds for a setting that is not given, in words; each preset's where they differ."""
+    values = {preset: setting.text(getattr(make_settings(preset), setting.field)) for preset in _PRESETS}
+    if len(set(values.values())) == 1:
+        return values["standard"]
+    return f"{BY_PRESET}: " + ", ".join(f"{preset} {value}" for preset, value in values.items())

@@ -4,39 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from sgsst_core.errors import CameraError, OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
+from worker.options import Backbone, ViewOptions
 
-Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 
-
-@dataclass(frozen=True)
-class SceneRequest:
+class SceneRequest(ViewOptions):
     """A scene and the cameras to see it with, as the user names them.
 
     Attributes:
         scene: 3DGS PLY.
         cameras: camera file or folder; None for an orbit.
-        orbit: number of views of a ring around the scene; None for `cameras`.
-        up: world axis that points up, for the orbit.
-        views: how many of the cameras to take, spread evenly; None for all.
-        resolution: pixels of every view's longer side; None for the cameras' own.
-        near: near plane, world units.
-        drop_invalid: leave Gaussians with non-finite values out.
     """
 
     scene: Path
-    cameras: Path | None
-    orbit: int | None
-    up: Up
-    views: int | None
-    resolution: int | None
-    near: float
-    drop_invalid: bool
+    cameras: Path | None = None
+
+    @staticmethod
+    def of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneRequest:
+        """These files, seen as some options say, which may have others beside."""
+        seen = options.model_dump(include=set(ViewOptions.model_fields))
+        return SceneRequest(scene=scene, cameras=cameras, **seen)
 
 
 @dataclass(frozen=True)
@@ -48,7 +39,7 @@ class StylizeRequest:
         style: style image.
         images: folder of photos for the content term; None for unstylized renders.
         out: PLY to write.
-        backbone: "auto", "vgg19" or "vgg16".
+        backbone: feature network.
         resume: go on from the checkpoint beside `out`.
         settings: everything else.
     """
@@ -57,7 +48,7 @@ class StylizeRequest:
     style: Path
     images: Path | None
     out: Path
-    backbone: str
+    backbone: Backbone
     resume: bool
     settings: Settings
 

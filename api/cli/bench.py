@@ -62,9 +62,8 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
     file = read_scene(request.source.scene, drop_invalid=request.source.drop_invalid)
     cameras = read_cameras_of(request.source, file.scene)
     ensure_writable_folder(request.out)
-    options = {name: value for name, value in request.settings.items() if value is not None}
     arguments = (file.scene, cameras, style, variants, request.seconds)
-    curves = error_time(*arguments, weights=weights, progress=progress, **options)
+    curves = error_time(*arguments, weights=weights, progress=progress, **request.settings)
     values = {
         "version": 1,
         "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
@@ -72,7 +71,7 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
         "views": len(cameras),
         "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],
         "budget_seconds": request.seconds,
-        "settings": options,
+        "settings": request.settings,
         "backbone": weights.name,
         "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
         **as_dict(curves),

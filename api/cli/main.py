@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -25,10 +25,10 @@ from rich.table import Column, Table
 
 from api.cli import service_commands
 from api.cli.interrupt import stop_on_signal
-from api.cli.values import parse_background, parse_bytes
-from sgsst_core.constants import NEAR
+from api.cli.options import with_options
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
-from sgsst_core.settings import EVERYTHING, KeptWeights, PositionWeights, Precision, PresetName, make_settings
+from sgsst_core.settings import make_settings
+from worker.options import RunOptions, StylizeOptions, ViewOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from sgsst_core.stylizing.loop import Progress
@@ -38,8 +38,6 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command impo
 
 #: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
 BAD_INPUT, FAILURE = 2, 1
-#: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
-MAX_RESOLUTION = 16384
 #: Where the progress bar cannot be drawn (a log file), a line is printed instead, this often.
 LOG_SECONDS = 60.0
 #: Characters of tables that would be cut in a narrower terminal.
@@ -70,34 +68,7 @@ CamerasOption = Annotated[
         help="cameras.json (INRIA), a COLMAP sparse model's folder, or transforms.json (nerfstudio, Blender)."
     ),
 ]
-OrbitOption = Annotated[int | None, typer.Option(min=1, help="Instead of --cameras: N views around the scene.")]
-UpOption = Annotated[
-    Literal["x", "-x", "y", "-y", "z", "-z"], typer.Option(help="Axis that points up in the scene, for --orbit.")
-]
-ViewsOption = Annotated[int | None, typer.Option(min=1, help="Take N of the cameras, spread evenly.")]
-ResolutionOption = Annotated[
-    int | None, typer.Option(min=1, max=MAX_RESOLUTION, help="Pixels of every view's longer side. [the cameras' own]")
-]
-BackgroundOption = Annotated[
-    Any, typer.Option(parser=parse_background, metavar="COLOUR", help="black, white, or R,G,B from 0 to 255.")
-]
-NearOption = Annotated[float, typer.Option(min=1e-6, help="Near plane, in the scene's units.")]
-MemoryOption = Annotated[
-    Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Memory to plan with, such as 8GB. [40 % of all]")
-]
-CoarsestOption = Annotated[
-    int | None,
-    typer.Option(min=16, help="Shorter side of the coarsest scale in pixels, at most. [511, the method's]"),
-]
-PruneOption = Annotated[
-    float | None,
-    typer.Option(min=0, metavar="W", help="Leave out Gaussians that all views together show in less than W pixels."),
-]
-SimilarOption = Annotated[
-    float | None,
-    typer.Option(min=0, metavar="S", help="Leave out views that another, shifted by less than S of its side, shows."),
-]
-DropOption = Annotated[bool, typer.Option("--drop-invalid", help="Leave Gaussians with NaN or infinite values out.")]
+StyleOption = Annotated[Path, typer.Option(help="Style image.", show_default=False)]
 
 
 @app.callback(invoke_without_command=True)
@@ -111,117 +82,27 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 
 @app.command()
+@with_options(StylizeOptions)
+@with_options(RunOptions, "run")
 def stylize(
     context: typer.Context,
     scene: SceneArgument,
-    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    style: StyleOption,
     out: Annotated[Path, typer.Option(help="Stylized PLY to write; report and pictures go beside it.")],
     cameras: CamerasOption = None,
-    orbit: OrbitOption = None,
-    up: UpOption = "-y",
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
-    views: ViewsOption = None,
-    resolution: ResolutionOption = None,
-    preset: Annotated[PresetName, typer.Option(help="Where the settings below start from.")] = "standard",
-    steps_coarse: Annotated[int | None, typer.Option(min=0, help="Steps on the coarsest scale.")] = None,
-    steps_sos: Annotated[int | None, typer.Option(min=0, help="Steps on all scales.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Adam's learning rate, then constant.")] = None,
-    content_weight: Annotated[float | None, typer.Option(min=0, help="Weight of the content term. [1]")] = None,
-    position_weights: Annotated[
-        PositionWeights | None,
-        typer.Option(help="Weigh positions by coverage, so that an empty surround does not count. [auto; paper: off]"),
-    ] = None,
-    background: BackgroundOption = "black",
-    near: NearOption = NEAR,
-    drop_invalid: DropOption = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the order of views.")] = 0,
-    precision: Annotated[Precision, typer.Option(help="Of the feature network.")] = "float32",
-    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
-    memory_limit: MemoryOption = None,
-    max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and write the result.")] = None,
-    target_loss: Annotated[
-        float | None,
-        typer.Option(metavar="R", help="Stop when the loss has come down to this share of the start, such as 0.05."),
-    ] = None,
-    early_stop: Annotated[
-        bool | None,
-        typer.Option("--early-stop/--no-early-stop", help="Stop when the loss has stopped falling. [by preset]"),
-    ] = None,
-    warm_start: Annotated[
-        bool | None,
-        typer.Option("--warm-start/--cold-start", help="Begin with the style's mean colour and spread. [by preset]"),
-    ] = None,
-    revive: Annotated[
-        bool | None,
-        typer.Option("--revive/--no-revive", help="Let colours that fell below black come back. [by preset]"),
-    ] = None,
-    coarsest_side: CoarsestOption = None,
-    prune_weight: PruneOption = None,
-    similar_views: SimilarOption = None,
-    kept_weights: Annotated[
-        KeptWeights | None, typer.Option(help="How blend weights are kept between steps. [auto: as memory allows]")
-    ] = None,
-    unseen: Annotated[
-        Literal["neighbours", "keep"] | None,
-        typer.Option(help="Colours of Gaussians that no view sees: their neighbours' change, or kept. [paper: keep]"),
-    ] = None,
-    keep_everything: Annotated[
-        bool, typer.Option("--keep-everything", help="Leave nothing out; slower, with the same result.")
-    ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")] = False,
-    checkpoint_seconds: Annotated[
-        float, typer.Option(min=0, help="Between checkpoints: what is lost at most when a worker is.")
-    ] = 60.0,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Work on so many GPUs, or parts of the processor: here, or in RAY_ADDRESS's cluster."),
-    ] = None,
-    rank_timeout: Annotated[
-        float, typer.Option(min=1, help="Seconds without an answer after which a worker counts as lost.")
-    ] = 120.0,
-    views_per_step: Annotated[
-        int | None,
-        typer.Option(min=1, help="Average the gradients of V views in each step; groups of workers share them."),
-    ] = None,
-    rebalance: Annotated[
-        bool | None,
-        typer.Option("--rebalance/--no-rebalance", help="Give slower workers less to do, once. [--rebalance]"),
-    ] = None,
+    *,
+    options: StylizeOptions,
+    run: RunOptions,
 ) -> None:
     """Give a scene the style of a picture."""
-    settings = make_settings(
-        preset,
-        steps_coarse=steps_coarse,
-        steps_sos=steps_sos,
-        learning_rate=learning_rate,
-        content_weight=content_weight,
-        position_weights=position_weights,
-        max_resolution=resolution,
-        background=background,
-        near=near,
-        seed=seed,
-        precision=precision,
-        memory_limit=memory_limit,
-        max_seconds=max_seconds,
-        unseen=unseen,
-        coarsest_side=coarsest_side,
-        warm_start=warm_start,
-        revive=revive,
-        early_stop=early_stop,
-        target_loss=target_loss,
-        prune_weight=prune_weight,
-        similar_views=similar_views,
-        kept_weights=kept_weights,
-        views_per_step=views_per_step,
-        rebalance=rebalance,
-        keep=EVERYTHING if keep_everything else None,
-    )
+    settings = options.settings()
     from worker.ranks.attempts import WorkerOptions
     from worker.request import SceneRequest, StylizeRequest
 
-    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
-    request = StylizeRequest(source, style, images, out, backbone, resume, settings)
-    _stylize(request, context.obj, workers, WorkerOptions(rank_timeout, checkpoint_seconds))
+    source = SceneRequest.of(scene, cameras, options)
+    request = StylizeRequest(source, style, images, out, options.backbone, run.resume, settings)
+    _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
 
 
 def _stylize(
@@ -358,40 +239,23 @@ def _time_bought(result: Result) -> list[str]:
 
 
 @app.command()
+@with_options(StylizeOptions, without=("workers",))
 def plan(
     scene: SceneArgument,
-    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    style: StyleOption,
     out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
     cameras: CamerasOption = None,
-    orbit: OrbitOption = None,
-    up: UpOption = "-y",
-    views: ViewsOption = None,
-    resolution: ResolutionOption = None,
-    preset: Annotated[PresetName, typer.Option(help="As for stylize.")] = "standard",
-    coarsest_side: CoarsestOption = None,
-    prune_weight: PruneOption = None,
-    similar_views: SimilarOption = None,
-    near: NearOption = NEAR,
-    drop_invalid: DropOption = False,
-    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
-    memory_limit: MemoryOption = None,
+    *,
+    options: StylizeOptions,
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
     from api.cli.jobs import make_plan
     from worker.request import SceneRequest
 
-    settings = make_settings(
-        preset,
-        max_resolution=resolution,
-        coarsest_side=coarsest_side,
-        prune_weight=prune_weight,
-        similar_views=similar_views,
-        near=near,
-        memory_limit=memory_limit,
-    )
-    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    settings = options.settings()
+    source = SceneRequest.of(scene, cameras, options)
     with _status("Looking at every view"):
-        made = make_plan(source, style, backbone, settings, out)
+        made = make_plan(source, style, options.backbone, settings, out)
     table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
         saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
@@ -407,21 +271,19 @@ def plan(
 
 
 @app.command()
+@with_options(ViewOptions, without=("drop_invalid",))
 def check(
     scene: SceneArgument,
     cameras: CamerasOption = None,
-    orbit: OrbitOption = None,
-    up: UpOption = "-y",
     style: Annotated[Path | None, typer.Option(help="Style image.")] = None,
-    views: ViewsOption = None,
-    resolution: ResolutionOption = None,
-    near: NearOption = NEAR,
+    *,
+    options: ViewOptions,
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
     from api.cli.jobs import check_inputs
     from worker.request import SceneRequest
 
-    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, True)
+    source = SceneRequest.of(scene, cameras, options)
     with _status("Looking at the scene and every view"):
         found = check_inputs(source, style)
     if not found:
@@ -434,23 +296,22 @@ def check(
 
 
 @app.command()
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=("background",))
 def render(
     scene: SceneArgument,
     out: Annotated[Path, typer.Option(help="Folder for the pictures, PNG.", show_default=False)],
     cameras: CamerasOption = None,
-    orbit: OrbitOption = None,
-    up: UpOption = "-y",
-    views: ViewsOption = None,
-    resolution: ResolutionOption = None,
-    background: BackgroundOption = "black",
-    near: NearOption = NEAR,
-    drop_invalid: DropOption = False,
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
 ) -> None:
     """Render the views of a scene."""
     from api.cli.jobs import render_views
     from worker.request import SceneRequest
 
-    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
+    source = SceneRequest.of(scene, cameras, options)
+    background = chosen.settings().background
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with _bar(*columns) as bar:
         task = bar.add_task("", total=None)
@@ -474,7 +335,7 @@ def demo(
         fetch("vgg16")
     with _status("Building the scene"):
         files = build_demo(out)
-    source = SceneRequest(files.ply, files.cameras, None, "-y", None, DEMO_RESOLUTION, NEAR, False)
+    source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
     settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
     request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, settings)
     options: dict[str, object] = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
@@ -486,32 +347,27 @@ def demo(
 
 
 @bench_app.command("error-time")
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=("coarsest_side", "background", "backbone", "memory_limit"))
 def bench_error_time(
     scene: SceneArgument,
-    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    style: StyleOption,
     out: Annotated[Path, typer.Option(help="Folder for table, plot, JSON and scenes.")] = Path("error_time"),
     cameras: CamerasOption = None,
-    orbit: OrbitOption = None,
-    up: UpOption = "-y",
-    views: ViewsOption = None,
-    resolution: ResolutionOption = None,
     variants: Annotated[str, typer.Option(help="Names with commas between. [all]")] = "",
     seconds: Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")] = 300.0,
-    coarsest_side: CoarsestOption = None,
-    background: BackgroundOption = "black",
-    near: NearOption = NEAR,
-    drop_invalid: DropOption = False,
-    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
-    memory_limit: MemoryOption = None,
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
 ) -> None:
     """Run variants of a job for the same time each, and plot the error that is left against seconds."""
     from api.cli.bench import ErrorTimeRequest, error_time_table, point_line, run_error_time
     from worker.request import SceneRequest
 
-    source = SceneRequest(scene, cameras, orbit, up, views, resolution, near, drop_invalid)
-    settings = {"coarsest_side": coarsest_side, "background": background, "near": near, "memory_limit": memory_limit}
+    source = SceneRequest.of(scene, cameras, options)
+    settings = {**chosen.given_settings(), "near": options.near}
     names = [name.strip() for name in variants.split(",") if name.strip()]
-    request = ErrorTimeRequest(source, style, out, names, seconds, backbone, settings)
+    request = ErrorTimeRequest(source, style, out, names, seconds, chosen.backbone, settings)
     curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
     Console(width=TABLE_WIDTH).print(error_time_table(curves))
     for curve in curves:

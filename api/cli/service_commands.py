@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -16,8 +16,8 @@ from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingCo
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from api.cli.values import parse_background, parse_bytes
-from sgsst_core.settings import PresetName
+from api.cli.options import with_options
+from service.parameters import JobParameters
 
 if TYPE_CHECKING:
     from api.client.client import Client, Job
@@ -61,30 +61,14 @@ def serve(
     run(_service_settings(), error_console.print)
 
 
+@with_options(JobParameters)
 def submit(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)],
     style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
     cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
-    orbit: Annotated[int | None, typer.Option(min=1, help="Instead of --cameras: N views around the scene.")] = None,
-    up: Annotated[Literal["x", "-x", "y", "-y", "z", "-z"] | None, typer.Option(help="Axis that points up.")] = None,
-    images: Annotated[Path | None, typer.Option(help="Photos for the content term.")] = None,
-    views: Annotated[int | None, typer.Option(min=1, help="Take N of the cameras, spread evenly.")] = None,
-    resolution: Annotated[int | None, typer.Option(min=1, help="Pixels of every view's longer side.")] = None,
-    preset: Annotated[PresetName, typer.Option(help="Where the settings below start from.")] = "standard",
-    steps_coarse: Annotated[int | None, typer.Option(min=0, help="Steps on the coarsest scale.")] = None,
-    steps_sos: Annotated[int | None, typer.Option(min=0, help="Steps on all scales.")] = None,
-    content_weight: Annotated[float | None, typer.Option(min=0, help="Weight of the content term.")] = None,
-    background: Annotated[
-        Any, typer.Option(parser=parse_background, metavar="COLOUR", help="black, white, or R,G,B from 0 to 255.")
-    ] = None,
-    drop_invalid: Annotated[bool, typer.Option("--drop-invalid", help="Leave invalid Gaussians out.")] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the order of views.")] = None,
-    backbone: Annotated[Literal["auto", "vgg19", "vgg16"], typer.Option(help="Feature network.")] = "auto",
-    memory_limit: Annotated[Any, typer.Option(parser=parse_bytes, metavar="SIZE", help="Such as 8GB.")] = None,
-    max_seconds: Annotated[float | None, typer.Option(help="Stop after so long and take what is there.")] = None,
-    target_loss: Annotated[float | None, typer.Option(help="Stop at this share of the loss at the start.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Ranks to spread the job over.")] = None,
-    name: Annotated[str | None, typer.Option(help="For people.")] = None,
+    images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    *,
+    options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
     webhook: Annotated[str | None, typer.Option(help="URL that is told when the job has ended.")] = None,
     out: Annotated[Path | None, typer.Option(help="Wait for the end, and write the stylized PLY here.")] = None,
@@ -94,26 +78,8 @@ def submit(
     key: KeyOption = None,
 ) -> None:
     """Send a job to a service. Options are those of stylize; with --out, wait for the result."""
-    chosen = {
-        "orbit": orbit,
-        "up": up,
-        "views": views,
-        "resolution": resolution,
-        "preset": preset,
-        "steps_coarse": steps_coarse,
-        "steps_sos": steps_sos,
-        "content_weight": content_weight,
-        "background": background,
-        "drop_invalid": drop_invalid or None,
-        "seed": seed,
-        "backbone": backbone,
-        "memory_limit": memory_limit,
-        "max_seconds": max_seconds,
-        "target_loss": target_loss,
-        "workers": workers,
-        "name": name if name is not None else scene.stem,
-        **_further(parameters),
-    }
+    told = options.model_dump(mode="json", exclude_unset=True)
+    chosen = {"name": scene.stem, **told, **_further(parameters)}
     with _client(url, key) as client:
         if dry_run:
             plan = client.plan(scene, style, cameras=cameras, photos=images, **chosen)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import typer
 
@@ -11,10 +13,23 @@ _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "
 _COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
-def parse_background(text: str) -> tuple[float, float, float]:
+@dataclass(frozen=True)
+class Form:
+    """How values of a unit are written on the command line.
+
+    Attributes:
+        parse: makes the value of its text.
+        metavar: stands for the value in the help.
+        hint: goes on where the help text ends.
+    """
+
+    parse: Callable[[str], object]
+    metavar: str
+    hint: str
+
+
+def parse_colour(text: str) -> tuple[float, float, float]:
     """RGB in 0..1 from "black", "white" or three numbers 0 to 255: "40,40,48"."""
-    if isinstance(text, tuple):  # the default value comes by here too
-        return text
     if text.lower() in _COLOURS:
         return _COLOURS[text.lower()]
     try:
@@ -32,3 +47,10 @@ def parse_bytes(text: str) -> int:
     if not match or match[2] not in _UNITS or not (size := int(float(match[1]) * _UNITS[match[2]])):
         raise typer.BadParameter(f"{text!r} is not an amount of memory such as 8GB or 512MB.")
     return size
+
+
+#: Units whose values are written in another way than in JSON.
+FORMS = {
+    "RGB, 0 to 1": Form(parse_colour, "COLOUR", ": black, white, or R,G,B from 0 to 255."),
+    "bytes": Form(parse_bytes, "SIZE", ", such as 8GB."),
+}

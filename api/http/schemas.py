@@ -151,7 +151,10 @@ class JobView(BaseModel):
     progress: ProgressView | None
     result: dict[str, Any] | None = Field(description="Steps, why it stopped, loss before and after.")
     error: ErrorView | None
-    parameters: JobParameters
+    parameters: dict[str, Any] = Field(
+        description="As `JobParameters`, with defaults for what was not told; what an earlier version took is shown as "
+        "it was told then."
+    )
     inputs: list[InputView]
     links: Links
 
@@ -324,7 +327,7 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
         "progress": ProgressView(**{**progress, "updated_at": utc(progress["updated_at"])}) if progress else None,
         "result": job.result,
         "error": ErrorView(**job.error) if job.error else None,
-        "parameters": JobParameters(**job.parameters),
+        "parameters": JobParameters().model_dump(mode="json") | job.parameters,
         "inputs": [InputView(**entry) for entry in job.inputs],
         "links": Links(
             self=here,

@@ -77,7 +77,7 @@ class Room:
         places = self._free_places(held)
         if places < 1:
             return None
-        asked = int(job.parameters.get("workers") or 0)
+        asked = _asked(job, "workers")
         if self._machine.gpus:
             return self._on_gpus(asked, self._free_gpus(held), min(max(waiting, 1), places))
         return self._on_cores(job, asked or 1, places)
@@ -97,7 +97,7 @@ class Room:
         if self._places == 1 or self._machine.cluster:
             return Grant(ranks)
         share = _MEMORY_SHARE * self._machine.memory / self._places
-        asked = job.parameters.get("memory_limit")
+        asked = _asked(job, "memory_limit")
         scene = _SCENE_COPIES * sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
         places = min(math.ceil((scene + (asked or _LEAST_MEMORY)) / share), self._places)
         if places > free:
@@ -105,3 +105,11 @@ class Room:
         limit = max(int(min(_JOB_SHARE * self._machine.memory, places * share - scene)), _LEAST_MEMORY)
         threads = max(1, self._machine.cores * places // self._places)
         return Grant(ranks, (), places, threads, min(asked or limit, limit))
+
+
+def _asked(job: JobRow, name: str) -> int:
+    """A number that a job was told; 0 without one. What is none was stored by an earlier version: the attempt refuses
+    it, and needs no room for that.
+    """
+    value = job.parameters.get(name)
+    return max(value, 0) if isinstance(value, int) else 0

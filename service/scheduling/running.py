@@ -24,12 +24,13 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.files.names import CHECKPOINT, RESULT
 from service.files.staging import stage
-from service.parameters import JobParameters
+from service.parameters import JobParameters, stored_parameters
 from service.scheduling.attempt_process import Message, Task
 from service.scheduling.packing import Grant
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import DAY, Jobs, Lease, Published
+from sgsst_core.errors import SettingsError
 
 #: Progress is written this often at most: more would be writes that nobody sees.
 _PROGRESS_SECONDS = 1.0
@@ -115,7 +116,12 @@ class RunningAttempt:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _attempt(self) -> None:
-        self._stage()
+        try:
+            parameters = stored_parameters(self.lease.job.parameters)
+        except SettingsError as error:
+            self._fail({"code": error.code, "message": str(error)}, permanent=True)
+            return
+        self._stage(parameters)
         self._launch()
         last = self._watch()
         process = self._process
@@ -137,7 +143,7 @@ class RunningAttempt:
         else:
             self._fail(self._crash(process.returncode), permanent=False)
 
-    def _stage(self) -> None:
+    def _stage(self, parameters: JobParameters) -> None:
         job = self.lease.job
         self._folder.mkdir(parents=True)
         digests = sorted({entry["sha256"] for entry in job.inputs})
@@ -150,7 +156,6 @@ class RunningAttempt:
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
         if checkpoint is not None:
             self._artifacts.fetch(checkpoint.location, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
-        parameters = JobParameters(**job.parameters)
         if self.grant.memory is not None:
             parameters = parameters.model_copy(update={"memory_limit": self.grant.memory})
         seconds = self._settings.checkpoint_seconds, self._settings.preview_seconds

@@ -30,7 +30,7 @@ from api.http.schemas import (
 from api.http.submission import BODY, REFUSALS, JobFromUploads
 from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError, TooLargeError
 from service.files.staging import check_roles, clean_name
-from service.parameters import JobParameters
+from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
 from service.store.tables import JobRow, UploadRow
@@ -227,7 +227,8 @@ def _idempotency(
 ) -> Idempotency | None:
     if key is None:
         return None
-    text = json.dumps([list(inputs), parameters.model_dump(mode="json"), webhook], sort_keys=True)
+    told = parameters.model_dump(mode="json", exclude_defaults=True)  # the same once there are more parameters
+    text = json.dumps([list(inputs), told, webhook], sort_keys=True)
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
 
 
@@ -317,13 +318,18 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
                 job_status="running",
             ),
             QueueFullError("There are 100 unfinished jobs of this key already.", limit=100),
+            RefusedInputError(
+                "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by a version of the service "
+                "that took this. Submit it anew without.",
+                "invalid-settings",
+            ),
         ),
     },
     operation_id="retry_job",
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
-    check_id(job_id)
+    stored_parameters(find(context, caller, job_id).parameters)
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
     return _shown(context, caller, job_id, status=202)
 

@@ -11,18 +11,24 @@ import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import httpx
 import psutil
 import pytest
+from annotated_types import Ge, Gt
 
+from api.cli.main import main
+from api.cli.options import kind_of
 from api.cli.serve import ServeError, serve
 from service.files.blobs import BlobFolder
+from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
+from service.store.jobs import NewJob
+from sgsst_core.options import Declared, declared
 from tests.api.service import Service, check_documented, wait_for
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import ball, wall, write_files
 
 MB = 1_000_000
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -195,6 +201,56 @@ def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> No
         (shown,) = [entry["name"] for entry in answer.json()["inputs"] if entry["role"] == "scene"]
         assert "/" not in shown
         assert not shown.startswith(".")
+
+
+def test_stored_jobs_are_shown_as_they_were_stored(
+    service: Service, client: httpx.Client, files: dict[str, bytes]
+) -> None:
+    """Whatever parameters are called today: of a job that this version would refuse, only a retry is refused."""
+    made = client.post("/v1/jobs", files=form(files)).json()
+    store = open_store(ServiceSettings(data=service.data))
+    told = {"preset": "preview", "sharpness": 3, "steps_sos": -5, "workers": "many"}
+    job, _ = store.jobs.create(NewJob("local", "old", 0, told, made["inputs"]), limit=1000)
+    (listed,) = [entry for entry in client.get("/v1/jobs").json()["jobs"] if entry["id"] == job.id]
+    answer = client.get(f"/v1/jobs/{job.id}")
+    assert answer.status_code == 200
+    assert listed["parameters"] == answer.json()["parameters"] == made["parameters"] | told
+    assert client.post(f"/v1/jobs/{job.id}/cancel").json()["status"] == "canceled"
+    problem = refused(client.post(f"/v1/jobs/{job.id}/retry"), 422, "invalid-settings")
+    assert "stored by a version" in problem["detail"]
+    assert client.get(f"/v1/jobs/{job.id}").json()["status"] == "canceled"
+    assert client.delete(f"/v1/jobs/{job.id}").status_code == 204
+    store.close()
+
+
+def value_of(option: Declared) -> object:
+    """One that an option may have."""
+    kind = kind_of(option)
+    if kind is bool:
+        return True
+    if get_origin(kind) is Literal:
+        return get_args(kind)[-1]
+    bounds = [
+        item.ge if isinstance(item, Ge) else item.gt for item in option.info.metadata if isinstance(item, Ge | Gt)
+    ]
+    return kind(bounds[0] + (1 if kind is int else 0.5))
+
+
+def test_the_command_line_sends_every_parameter(
+    service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0]}
+    texts = {"background": "white"}
+    ply, _, style = write_files(tmp_path, ball())
+    command = ["submit", str(ply), "--style", str(style), "--url", service.url, "--json"]
+    for name, option in declared(JobParameters).items():
+        told[name] = told.get(name) or value_of(option)
+        command += [f"--{name.replace('_', '-')}"]
+        command += [] if told[name] is True else [texts.get(name, str(told[name]))]
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out)["parameters"] == told
+    assert client.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]["parameters"] == told
+    assert told.keys() == JobParameters.model_fields.keys()
 
 
 # --- bodies --------------------------------------------------------------------------------------------------------

@@ -20,13 +20,17 @@ from urllib.parse import urlsplit
 import httpx
 import psutil
 import pytest
+from annotated_types import Ge
 from PIL import Image, PngImagePlugin
 
+from api.cli.options import kind_of
 from api.http.connection import MAX_HEAD_BYTES
 from service.files.artifacts import Artifacts
+from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.tables import UploadRow
+from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -600,25 +604,9 @@ def test_too_long(client: httpx.Client, files: Files) -> None:
 # --- JSON ----------------------------------------------------------------------------------------------------------
 
 NUMBERS = ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "1" + "0" * 400, "-1", "1.5e-400", "9" * 5000]
-MAY_BE_0 = ("content_weight", "prune_weight", "similar_views", "steps_coarse", "steps_sos", "seed")
-FIELDS = [
-    "orbit",
-    "views",
-    "resolution",
-    "steps_coarse",
-    "steps_sos",
-    "learning_rate",
-    "content_weight",
-    "near",
-    "seed",
-    "memory_limit",
-    "max_seconds",
-    "target_loss",
-    "coarsest_side",
-    "prune_weight",
-    "similar_views",
-    "workers",
-]
+OPTIONS = declared(JobParameters)
+FIELDS = [name for name, option in OPTIONS.items() if kind_of(option) in (int, float)]
+MAY_BE_0 = {name for name in FIELDS if Ge(0) in OPTIONS[name].info.metadata}
 
 
 def told(client: httpx.Client, parameters: str) -> httpx.Response:

@@ -81,6 +81,21 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     assert following == Grant(2, ("5", "7"))
 
 
+def test_a_job_with_parameters_of_an_earlier_version_fails_with_a_sentence(
+    settings: ServiceSettings, store: Store
+) -> None:
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    told = {"sharpness": 3, "workers": "many", "memory_limit": "all"}
+    job, _ = store.jobs.create(NewJob("local", "", 0, told, [scene]), limit=10)
+    with at_work(settings, store):
+        wait_for(lambda: store.jobs.get(job.id, None).status == "failed", "the job to fail")
+    ended = store.jobs.get(job.id, None)
+    assert ended.attempt == 1, "it would fail again"
+    assert ended.error is not None
+    assert ended.error["code"] == "invalid-settings"
+    assert "stored by a version" in ended.error["message"]
+
+
 def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
     script = "from service.scheduling.dispatcher import own_name; print(own_name())"
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()

@@ -112,7 +112,7 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())
     options = {"steps_sos": steps, "early_stop": False, "keep": ("ranks",), "rebalance": False, **settings}
-    source = SceneRequest(ply, cameras, None, "-y", None, None, 0.2, False)
+    source = SceneRequest(scene=ply, cameras=cameras)
     return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
 
 

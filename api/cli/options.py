@@ -1,0 +1,118 @@
+"""Options of commands, made from the fields that declare them."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+
+import typer
+from pydantic import BaseModel, ValidationError
+
+from api.cli.values import FORMS
+from sgsst_core.errors import SettingsError
+from sgsst_core.options import Declared, declared
+from sgsst_core.settings import BY_PRESET
+
+Command = Callable[..., None]
+M = TypeVar("M", bound=BaseModel)
+
+
+def with_options(
+    model: type[BaseModel],
+    argument: str = "options",
+    *,
+    only: Collection[str] | None = None,
+    without: Collection[str] = (),
+) -> Callable[[Command], Command]:
+    """Offer the fields of a model as options of a command, in the place of one argument of its function.
+
+    The function gets a model of what was given: values that were not are unset in it.
+
+    Args:
+        argument: of the function.
+        only: names of the options to offer; None for all.
+        without: names of options that are not offered.
+    """
+    chosen = (declared(model).keys() if only is None else set(only)) - set(without)
+    offered = {name: option for name, option in declared(model).items() if name in chosen}
+
+    def decorate(function: Command) -> Command:
+        def command(**arguments: Any) -> None:
+            given = {name: value for name in offered if (value := arguments.pop(name)) is not None}
+            function(**arguments, **{argument: _checked(model, given)})
+
+        parameters: list[inspect.Parameter] = []
+        for parameter in inspect.signature(function, eval_str=True).parameters.values():
+            made = [_parameter(each) for each in offered.values()] if parameter.name == argument else [parameter]
+            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in made]
+        command.__name__, command.__doc__ = function.__name__, function.__doc__
+        command.__annotations__ = {each.name: each.annotation for each in parameters}
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        return command
+
+    return decorate
+
+
+def flags(option: Declared) -> str:
+    """The names of an option on the command line, such as "--seed" or "--revive/--no-revive"."""
+    plain = "--" + option.name.replace("_", "-")
+    if option.option.flags or not is_switch(option):
+        return option.option.flags or plain
+    return plain if option.info.default is False else f"{plain}/--no-{plain[2:]}"
+
+
+def metavar(option: Declared) -> str:
+    """What stands for the value; empty for a switch."""
+    kind = kind_of(option)
+    if is_switch(option):
+        return ""
+    if get_origin(kind) is Literal:
+        return f"<{'|'.join(get_args(kind))}>"
+    form = FORMS.get(option.option.unit)
+    return form.metavar if form else option.option.metavar or f"<{kind.__name__}>"
+
+
+def help_text(option: Declared) -> str:
+    """What an option does, what holds without it, and what it may be."""
+    form = FORMS.get(option.option.unit)
+    parts = [option.help.removesuffix(".") + form.hint if form else option.help]
+    default = option.text(option.info.default)
+    if not (is_switch(option) and option.info.default is False):
+        parts.append(f"[{default}]" if default.startswith(BY_PRESET) else f"[default: {default}]")
+    if option.bounds and form is None:
+        parts.append(f"[{option.bounds}]")
+    return "  ".join(parts)
+
+
+def _parameter(option: Declared) -> inspect.Parameter:
+    """Of a command's function. Words and switches are typer's to check, all else is the model's."""
+    form = FORMS.get(option.option.unit)
+    kind: Any = kind_of(option) if is_switch(option) or get_origin(kind_of(option)) is Literal else str
+    shown: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
+    made = typer.Option(flags(option), help=help_text(option), parser=form.parse if form else None, **shown)
+    return inspect.Parameter(
+        option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, made]
+    )
+
+
+def kind_of(option: Declared) -> Any:
+    """The type of its values, without None."""
+    found = option.info.annotation
+    kinds = [kind for kind in get_args(found) if kind is not type(None)]
+    return kinds[0] if type(None) in get_args(found) else found
+
+
+def is_switch(option: Declared) -> bool:
+    """Whether it is on or off, and has no value."""
+    return kind_of(option) is bool
+
+
+def _checked(model: type[M], given: dict[str, object]) -> M:
+    """A model of what was given, or an error that names the option."""
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = flags(declared(model)[str(first["loc"][0])])
+        raise SettingsError(f"{option} {first['input']}: {first['msg']}.") from error

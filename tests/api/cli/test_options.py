@@ -1,0 +1,152 @@
+"""Options are declared once: commands, parameters of the API and the reference have all of them, with the same words
+and the same bounds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, get_origin
+
+import pytest
+import typer
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import ValidationError
+
+from api.cli.main import app, main
+from api.cli.options import flags, help_text, kind_of
+from api.cli.options_table import reference
+from service.parameters import JobParameters
+from sgsst_core.errors import SettingsError
+from sgsst_core.options import Declared, declared
+from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
+from worker.options import RunOptions, StylizeOptions, ViewOptions
+from worker.request import SceneRequest
+
+ROOT = Path(__file__).resolve().parents[3]
+OPTIONS = declared(StylizeOptions)
+#: Options that the API has not, and parameters that `sgsst stylize` has not, with the reason.
+OPERATORS = {"resume", "checkpoint_seconds", "rank_timeout"}  # the service's operator says this for all jobs
+SERVICES = {"name"}  # for people who look at a list of jobs
+#: Numbers that measure nothing.
+NO_QUANTITY = {"seed"}
+
+
+def shown(command: str) -> dict[str, str]:
+    """Help texts of a command's options by their flags."""
+    group: Any = typer.main.get_command(app)
+    return {"/".join(each.opts + each.secondary_opts): each.help for each in group.commands[command].params}
+
+
+def test_every_setting_is_an_option_or_names_the_one_that_stands_for_it() -> None:
+    options = declared(Settings)
+    standing = {
+        info.metadata[-1].instead for name, info in Settings.model_fields.items() if name not in fields(options)
+    }
+    assert standing == {"learning_rate", "keep_everything"}
+    assert options.keys() | standing <= OPTIONS.keys()
+
+
+def fields(options: dict[str, Declared]) -> set[str]:
+    return {each.field for each in options.values()}
+
+
+@pytest.mark.parametrize("model", [Settings, StylizeOptions, RunOptions, JobParameters])
+def test_every_field_is_described_and_every_quantity_has_a_unit(model: Any) -> None:
+    for name, option in declared(model).items():
+        assert option.help.endswith("."), name
+        number = kind_of(option) in (int, float) or get_origin(kind_of(option)) is tuple
+        assert bool(option.option.unit) == (number and name not in NO_QUANTITY), name
+
+
+def test_commands_and_parameters_have_every_option() -> None:
+    assert declared(JobParameters).keys() - OPTIONS.keys() == SERVICES
+    assert declared(RunOptions).keys() == OPERATORS
+    texts = {flags(option): help_text(option) for option in OPTIONS.values()}
+    for command in ("stylize", "submit"):
+        assert texts.items() <= shown(command).items(), command
+    assert {flags(option) for option in declared(RunOptions).values()} <= shown("stylize").keys()
+    assert texts.keys() - shown("plan").keys() == {"--workers"}
+    properties = JobParameters.model_json_schema()["properties"]
+    for name, option in OPTIONS.items():
+        assert properties[name]["description"] == option.help
+        assert properties[name].get("x-unit", "") == option.option.unit
+
+
+def outside(option: Declared) -> list[float]:
+    """Numbers just beyond an option's bounds."""
+    found: list[float] = []
+    for item in option.info.metadata:
+        if isinstance(item, Ge | Le):
+            bound, away = (item.ge, -1) if isinstance(item, Ge) else (item.le, 1)
+            found.append(bound + away * max(1, abs(bound) * 1e-9))  # type: ignore[operator, arg-type]
+        elif isinstance(item, Gt | Lt):
+            found.append(item.gt if isinstance(item, Gt) else item.lt)  # type: ignore[arg-type]
+    return found
+
+
+BEYOND = [(name, value) for name, option in OPTIONS.items() for value in outside(option)]
+
+
+@pytest.mark.parametrize(("name", "value"), BEYOND)
+def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValidationError) as refused:
+        JobParameters.model_validate({name: value})
+    (error,) = refused.value.errors()
+    if name in declared(Settings):
+        with pytest.raises(SettingsError, match=declared(Settings)[name].field):
+            make_settings(**{declared(Settings)[name].field: value})
+    if name in ViewOptions.model_fields:
+        with pytest.raises(SettingsError, match=name):
+            checked(SceneRequest, {"scene": "scene.ply", name: value})
+    if name == "memory_limit":  # its form on the command line has no digits for these
+        return
+    for command in ("stylize", "submit"):
+        assert main([command, "scene.ply", "--style", "x.png", "--out", "x.ply", flags(OPTIONS[name]), str(value)]) == 2
+        said = capsys.readouterr().err
+        assert flags(OPTIONS[name]) in said
+        assert error["msg"] in said
+
+
+def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
+    """Where a number ends, the number itself is in, or out, as the help says."""
+    assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}
+    assert OPTIONS["similar_views"].bounds == "0<=x<1"
+    assert OPTIONS["near"].bounds == "x>0"
+    assert OPTIONS["steps_sos"].bounds == "0<=x<=10000000"
+    assert OPTIONS["prune_weight"].bounds == "x>=0"
+    assert OPTIONS["up"].bounds == ""
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "many", ""])
+def test_what_is_no_number_is_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for flag in ("--near", "--max-seconds", "--workers"):
+        assert main(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", flag, value]) == 2
+        assert flag in capsys.readouterr().err
+
+
+def test_the_help_says_what_holds_for_an_option_that_is_not_given() -> None:
+    texts = shown("stylize")
+    assert "[by preset: preview 50, standard 100, paper 10000]" in texts["--steps-coarse"]
+    assert "[by preset: preview off, standard on, paper off]" in texts["--early-stop/--no-early-stop"]
+    assert "preview 640, standard the cameras' own" in texts["--resolution"]
+    assert "[default: the cameras' own]" in shown("render")["--resolution"]
+    assert "[default: -y]" in texts["--up"]
+    assert "default" not in texts["--drop-invalid"]
+
+
+def test_the_reference_is_up_to_date() -> None:
+    page = (ROOT / "docs" / "options.md").read_text()
+    assert page == reference(), "run: python -m api.cli.options_table > docs/options.md"
+    for option in [*declared(JobParameters).values(), *declared(RunOptions).values()]:
+        assert f"| `{flags(option)}" in page
+        assert option.help in page
+
+
+def test_options_become_settings() -> None:
+    told = StylizeOptions.model_validate({"preset": "preview", "steps_sos": "7", "near": 0.5, "keep_everything": True})
+    assert told.settings() == make_settings("preview", steps_sos=7, near=0.5, keep=EVERYTHING)
+    assert StylizeOptions().settings() == make_settings()
+    assert StylizeOptions().given_settings() == {}
+    assert StylizeOptions(resolution=80).settings().max_resolution == 80
+    again = JobParameters.model_validate(json.loads(JobParameters().model_dump_json()))
+    assert again.settings() == make_settings(), "null leaves a setting to the preset"

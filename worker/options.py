@@ -1,0 +1,115 @@
+"""What a job may be told beside its files and its settings: declared once, for the command line and for the API.
+
+`StylizeOptions` is all that both take: how the scene is seen, every setting, and what is the job's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from sgsst_core.constants import NEAR
+from sgsst_core.options import Option, declared
+from sgsst_core.settings import (
+    BY_PRESET,
+    EVERYTHING,
+    Near,
+    PresetName,
+    Resolution,
+    Settings,
+    default_text,
+    make_settings,
+)
+
+Backbone = Literal["auto", "vgg19", "vgg16"]
+Up = Literal["x", "-x", "y", "-y", "z", "-z"]
+#: Settings that no preset changes, and that answers of the API have always shown.
+_SHOWN = ("preset", "seed", "precision")
+
+
+class ViewOptions(BaseModel):
+    """How a scene is seen."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    orbit: Annotated[int | None, Option(unit="views", metavar="N", default="cameras from files")] = Field(
+        None, ge=1, le=2000, description="Instead of camera files: N views around the scene."
+    )
+    up: Up = Field("-y", description="Axis that points up in the scene, for an orbit.")
+    views: Annotated[int | None, Option(unit="views", metavar="N", default="all")] = Field(
+        None, ge=1, le=1_000_000, description="Take N of the cameras, spread evenly."
+    )
+    resolution: Resolution = None
+    near: Near = NEAR
+    drop_invalid: bool = Field(False, description="Leave Gaussians with NaN or infinite values out.")
+
+
+def _settings_to_choose() -> dict[str, Any]:
+    """A field for each setting, in which None leaves it to the preset."""
+    fields: dict[str, Any] = {}
+    for name, setting in declared(Settings).items():
+        text = default_text(setting)
+        if name in ViewOptions.model_fields and not text.startswith(BY_PRESET):
+            continue
+        info, shown = setting.info, name in _SHOWN
+        constraints = [item for item in info.metadata if not isinstance(item, Option)]
+        kind = info.annotation if shown else info.annotation | None  # type: ignore[operator]
+        option = setting.option if shown else replace(setting.option, default=text, name="")
+        told = Field(info.default if shown else None, description=info.description)
+        fields[name] = (Annotated[kind, *constraints, option], told)
+    return fields
+
+
+if TYPE_CHECKING:
+
+    class _Chosen(ViewOptions):
+        preset: PresetName = "standard"
+
+else:
+    _Chosen = create_model("_Chosen", __base__=ViewOptions, **_settings_to_choose())
+
+
+class StylizeOptions(_Chosen):
+    """What `sgsst stylize` and a job of the service may be told; what is left out is the preset's."""
+
+    backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 where it is installed, else VGG16.")
+    keep_everything: bool = Field(False, description="Leave nothing out; slower, with the same result.")
+    workers: Annotated[
+        int | None, Option(unit="ranks", metavar="N", default="this process alone; the service decides itself")
+    ] = Field(
+        None,
+        ge=1,
+        le=1024,
+        description="Work on N GPUs, or parts of the processor: of this machine, or of RAY_ADDRESS's cluster.",
+    )
+
+    def given_settings(self) -> dict[str, Any]:
+        """The settings that were given, by their names in `Settings`; without the preset."""
+        known = declared(Settings)
+        given = {known[name].field: getattr(self, name) for name in self.model_fields_set & known.keys() - {"preset"}}
+        given["keep"] = EVERYTHING if self.keep_everything else None
+        return {name: value for name, value in given.items() if value is not None}
+
+    def settings(self) -> Settings:
+        """The method's settings.
+
+        Raises:
+            SettingsError: values that contradict each other.
+        """
+        return make_settings(self.preset, **self.given_settings())
+
+
+class RunOptions(BaseModel):
+    """How `sgsst stylize` runs a job. A service's operator says this for all jobs, so that the API does not take it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    resume: bool = Field(False, description="Go on from the checkpoint beside --out.")
+    checkpoint_seconds: Annotated[float, Option(unit="seconds", metavar="S")] = Field(
+        60.0, ge=0, description="Seconds between checkpoints: what is lost at most when a worker is."
+    )
+    rank_timeout: Annotated[float, Option(unit="seconds", metavar="S")] = Field(
+        120.0, ge=1, description="Seconds without an answer after which a worker counts as lost."
+    )
