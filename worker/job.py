@@ -20,24 +20,18 @@ from sgsst_core.features.network_weights import BackboneWeights, load_weights
 from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
+from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import SceneFile, write_stylized
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import common_device
 from sgsst_core.planning.progress import ShowPlanning
-from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
+from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
-from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.document import (
-    Sources,
-    bought,
-    build_report,
-    plan_json,
-    write_contact_sheet,
-    write_json,
-    write_loss_curves,
-)
+from sgsst_core.report.charts import write_loss_chart
+from sgsst_core.report.contact_sheet import write_contact_sheet
+from sgsst_core.report.document import Sources, bought, build_report, plan_json
 from sgsst_core.report.page import write_page
 from sgsst_core.scene.camera import Camera, fit_cameras, orbit, resized, spread
 from sgsst_core.scene.gaussians import Scene
@@ -312,24 +306,18 @@ def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evalua
     """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
-        report = build_report(stylizer, job.sources, stopped, before, after, _findings(job))
+        near = stylizer.settings.near
+        findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near)
+        report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         report["workers"] = {**job.workers, "seconds_lost": round(lost, 3)}
         write_json(outputs.report, report)
         write_contact_sheet(outputs.sheet, stylizer)
-        write_loss_curves(outputs.curves, stylizer.history, stylizer.round_length)
+        write_loss_chart(outputs.curves, report)
         write_page(outputs.page, report, outputs.sheet)
     except Exception as error:  # whatever it is, it must not look as if the job itself had failed
         return error
     return None
-
-
-def _findings(job: Job) -> list[Finding]:
-    stylizer = job.stylizer
-    cameras, near = stylizer.views.cameras, stylizer.settings.near
-    rasterizer = make_rasterizer("cpu", stylizer.scene, near=near)
-    found = [*check_scene(job.scene_file), *check_views(job.scene_file, cameras, rasterizer, near=near)]
-    return [*found, *check_style(stylizer.style, cameras)]
 
 
 def describe(job: Job) -> Prepared:

@@ -16,8 +16,9 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
+from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import read_scene, write_stylized
-from sgsst_core.report.document import machine, write_json
+from sgsst_core.report.machine import machine
 from worker.job import read_cameras_of
 from worker.request import SceneRequest, check_choice, check_folder
 

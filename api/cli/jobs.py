@@ -13,13 +13,14 @@ from sgsst_core.errors import CameraError, OutputError
 from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
+from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import read_scene
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import SEEN_COVERAGE
-from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views
+from sgsst_core.quality.findings import Finding, findings_of
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.document import plan_json, write_json
+from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
@@ -54,7 +55,7 @@ def make_plan(source: SceneRequest, style: Path, backbone: str, settings: Settin
 # --- check ---------------------------------------------------------------------------------------------------------
 
 
-def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
+def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]:
     """What is extreme in a scene, its views and its style; nothing is written.
 
     Raises:
@@ -64,9 +65,7 @@ def check_inputs(source: SceneRequest, style: Path | None) -> list[Finding]:
     image = load_image(style) if style else None
     file = read_scene(source.scene, drop_invalid=True)
     cameras = read_cameras_of(source, file.scene)
-    rasterizer = make_rasterizer("cpu", file.scene, near=source.near)
-    found = [*check_scene(file), *check_views(file, cameras, rasterizer, near=source.near)]
-    return found if image is None else [*found, *check_style(image, cameras)]
+    return findings_of(file, cameras, image, near=source.near)
 
 
 # --- render --------------------------------------------------------------------------------------------------------

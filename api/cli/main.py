@@ -75,7 +75,7 @@ StyleOption = Annotated[Path, typer.Option(help="Style image.", show_default=Fal
 def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
     if version:
-        from sgsst_core.report.document import program_version
+        from sgsst_core.report.machine import program_version
 
         out_console.print(f"sgsst {program_version()}")
         raise typer.Exit()
@@ -280,12 +280,12 @@ def check(
     options: ViewOptions,
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
-    from api.cli.jobs import check_inputs
+    from api.cli.jobs import look_for_extremes
     from worker.request import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
     with _status("Looking at the scene and every view"):
-        found = check_inputs(source, style)
+        found = look_for_extremes(source, style)
     if not found:
         out_console.print("Nothing extreme was found.")
         return

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -22,6 +24,9 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.report.charts import RELATIVE_LOSS, STYLE, draw_legend, draw_points, scale_name, set_log_x, set_log_y
+from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
+from sgsst_core.report.palette import INK, colour_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings, make_settings
@@ -266,7 +271,8 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
     }
 
 
-_MARKERS = "osD^vP*X<>hd"
+#: As many as have no divisor in common with the number of colours: the pairs of both last for 42 variants.
+_MARKERS = "osD^vP*"
 
 
 def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
@@ -277,23 +283,31 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     """
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for point in curve.points for scale in point.by_scale})
-    figure = Figure(figsize=(5.2 * (1 + len(scales)), 4.6), dpi=110, layout="constrained")
-    panels = figure.subplots(1, 1 + len(scales), sharey=True, squeeze=False)[0]
-    for number, axes in enumerate(panels):
-        scale = None if number == 0 else scales[number - 1]
-        for place, curve in enumerate(shown):
-            values = [point.relative if scale is None else point.by_scale.get(scale) for point in curve.points]
-            seconds = [point.seconds for point in curve.points]
-            marker = _MARKERS[place % len(_MARKERS)]
-            axes.plot(seconds, values, marker=marker, markersize=4, linewidth=1, label=curve.variant.name)
-        axes.set(xscale="log", yscale="log", xlabel="seconds of optimisation")
-        axes.grid(True, which="both", alpha=0.15)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.set_title("mean of all scales" if scale is None else f"scale {scale} (1/{1 << scale})", fontsize=10)
-    front = [point for _, point in pareto_front(shown)]
-    panels[0].plot([p.seconds for p in front], [p.relative for p in front], "k--", linewidth=2.5, alpha=0.35)
-    panels[0].set_ylabel("loss, relative to the unstylized scene")
-    panels[-1].legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.suptitle(f"{title} (dashed: Pareto front)", fontsize=11)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.2 * (1 + len(scales)), 4.8), dpi=110, layout="constrained")
+        panels = figure.subplots(1, 1 + len(scales), sharey=True, squeeze=False)[0]
+        losses = [_draw_curves(axes, shown, scale) for axes, scale in zip(panels, (None, *scales), strict=True)]
+        for axes in panels:
+            set_log_y(axes, losses)
+        front = [point for _, point in pareto_front(shown)]
+        panels[0].plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
+        panels[0].set_ylabel(RELATIVE_LOSS)
+        draw_legend(figure, in_row=7)
+        figure.suptitle(f"{title} (dashed: Pareto front)")
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png")
+
+
+def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floats:
+    """Draw the loss of a scale (None: the mean of the scales) against seconds, one line a curve; returns the losses."""
+    seconds = [column([point.seconds for point in curve.points]) for curve in curves]
+    losses = [
+        column([point.relative if scale is None else point.by_scale.get(scale) for point in curve.points])
+        for curve in curves
+    ]
+    for place, curve in enumerate(curves):
+        look = {"marker": _MARKERS[place % len(_MARKERS)], "color": colour_of(place), "label": curve.variant.name}
+        draw_points(axes, seconds[place], losses[place], markersize=4, linewidth=1, **look)
+    set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimisation")
+    axes.set_title("mean of the scales" if scale is None else scale_name(scale))
+    return joined(losses)

@@ -78,7 +78,7 @@ def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
     return reduce(merge, parts)
 
 
-def layer_statistics(features: Tensor, weights: Tensor | None = None) -> LayerStatistics:
+def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """Statistics of features [h, w, c], with optional position weights [h, w] >= 0.
 
     The GEMM runs in the features' precision (float32 for half-precision features) on centred chunks; sums over
@@ -93,7 +93,8 @@ def layer_statistics(features: Tensor, weights: Tensor | None = None) -> LayerSt
     rows = max(1, CHUNK_VALUES // (width * channels))
     for top in range(0, height, rows):
         centred = (features[top : top + rows].to(precision) - shift).reshape(-1, channels)
-        total.add(centred, None if weights is None else weights[top : top + rows].reshape(-1).to(precision))
+        chunk = None if position_weights is None else position_weights[top : top + rows].reshape(-1).to(precision)
+        total.add(centred, chunk)
     return total.statistics(shift.double())
 
 
@@ -105,14 +106,14 @@ class _ShiftedSums:
         self.first = torch.zeros(channels, dtype=torch.float64, device=device)
         self.second = torch.zeros((channels, channels), dtype=torch.float64, device=device)
 
-    def add(self, centred: Tensor, weights: Tensor | None) -> None:
-        """Add positions centred [n, c] with weights [n]."""
-        if weights is None:
+    def add(self, centred: Tensor, position_weights: Tensor | None) -> None:
+        """Add positions centred [n, c] with their weights [n]."""
+        if position_weights is None:
             self.count += centred.shape[0]
             weighted = centred
         else:
-            self.count += weights.double().sum()
-            weighted = centred * weights[:, None]
+            self.count += position_weights.double().sum()
+            weighted = centred * position_weights[:, None]
         self.first += weighted.sum(dim=0, dtype=torch.float64)
         self.second += weighted.T @ centred
 
@@ -123,10 +124,11 @@ class _ShiftedSums:
         return LayerStatistics(self.count, shift + offset, self.second - torch.outer(offset, offset) * self.count)
 
 
-def layer_statistics_reference(features: Tensor, weights: Tensor | None = None) -> LayerStatistics:
+def layer_statistics_reference(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """The same in float64 and in one step: the definition, against which `layer_statistics` is tested."""
     flat = features.double().reshape(-1, features.shape[-1])
-    a = torch.ones(flat.shape[0], dtype=torch.float64) if weights is None else weights.double().reshape(-1)
+    equal = torch.ones(flat.shape[0], dtype=torch.float64)
+    a = equal if position_weights is None else position_weights.double().reshape(-1)
     count = a.sum()
     mean = (a[:, None] * flat).sum(0) / count
     centred = (flat - mean) * a[:, None].sqrt()

@@ -24,7 +24,7 @@ from sgsst_core.features.vgg import (
     FeatureNetwork,
     layer_stride,
 )
-from sgsst_core.loss.terms import LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
+from sgsst_core.loss.terms import TERMS, LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
 from sgsst_core.parallel.division import Piece, Size, divide, rounds
@@ -290,20 +290,19 @@ class SosLoss:
         ]
         merged, kept = self._first_passes(passes, keep=gradient)
         for pass_, waiting in zip(passes, merged, strict=True):
-            statistics, content = self._wait(waiting)
+            parts, numbers = self._wait(waiting)
             with self.timer("statistics"):
-                self._compare(pass_, dict(zip(self.style_layers, statistics, strict=True)), content, style[pass_.scale])
+                statistics = dict(zip(self.style_layers, parts, strict=True))
+                pass_.terms = LossTerms(**dict(zip(TERMS, numbers, strict=True)))
+                self._compare(pass_, statistics, style[pass_.scale])
         yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
 
-    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], float]:
+    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], list[float]]:
         with self.timer("communication"):
             return merged()
 
-    def _compare(
-        self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], content: float, style: ScaleTarget
-    ) -> None:
-        """Loss of one scale and its gradient maps, from the statistics of the whole scale."""
-        pass_.terms = LossTerms(content=content)
+    def _compare(self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], style: ScaleTarget) -> None:
+        """Style loss of one scale, added to its terms, and gradient maps, from the statistics of the whole scale."""
         for layer, part in statistics.items():
             if layer in style and not part.empty:
                 eps = torch.finfo(self.network.dtype).eps
@@ -340,7 +339,7 @@ class SosLoss:
     def _first_passes(
         self, passes: Sequence[_ScalePass], *, keep: bool
     ) -> tuple[list[Merged], list[dict[PartitionTile, Activations]]]:
-        """For each scale, the merge of its statistics and content loss under way, and the activations that fit."""
+        """For each scale, the merge of its statistics and terms under way, and the activations that fit."""
         merged: list[Merged] = []
         kept: list[dict[PartitionTile, Activations]] = []
         fits = iter(self.tiling.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
@@ -348,7 +347,7 @@ class SosLoss:
             statistics = [
                 LayerStatistics.zero(self.network.channels(layer), pass_.image.device) for layer in self.style_layers
             ]
-            content = 0.0
+            terms = LossTerms()
             kept.append({})
             for tile in pass_.tiles:
                 keep_this = next(fits) and keep
@@ -357,10 +356,10 @@ class SosLoss:
                     for place, layer in enumerate(self.style_layers):
                         part = pass_.statistics(layer, tile, activations.features[layer])
                         statistics[place] = merge(statistics[place], part)
-                    content += pass_.content_loss(tile, activations.features.get(CONTENT_LAYER))[0]
+                    terms += pass_.tile_terms(tile, activations)
                 if keep_this:
                     kept[-1][tile] = activations
-            merged.append(self.collectives.all_reduce_statistics(statistics, content))
+            merged.append(self.collectives.all_reduce_statistics(statistics, list(terms.values())))
         return merged, kept
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
@@ -394,10 +393,10 @@ class _ScalePass:
         if content is not None:
             stride = layer_stride(CONTENT_LAYER)
             cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
-            weights = self.weights(CONTENT_LAYER, cells)
+            weights = self.position_weights(CONTENT_LAYER, cells)
             self._content_count = cells.pixels if weights is None else float(weights.sum(dtype=torch.float64))
 
-    def weights(self, layer: str, cells: Rectangle) -> Tensor | None:
+    def position_weights(self, layer: str, cells: Rectangle) -> Tensor | None:
         """Weights [h, w] of some cells of a layer: the coverage, box-averaged to the cells; None for equal weights."""
         if self._coverage is None:
             return None
@@ -406,7 +405,11 @@ class _ScalePass:
     def statistics(self, layer: str, tile: PartitionTile, features: Tensor) -> LayerStatistics:
         """Of the cells that a tile owns; features are those of all its cells."""
         view, own = tile.owned_cells(layer, self.size)
-        return layer_statistics(features[own.slices], self.weights(layer, view))
+        return layer_statistics(features[own.slices], self.position_weights(layer, view))
+
+    def tile_terms(self, tile: PartitionTile, activations: Activations) -> LossTerms:
+        """The tile's share of the terms that are sums over positions; the others follow from the whole scale."""
+        return LossTerms(content=self.content_loss(tile, activations.features.get(CONTENT_LAYER))[0])
 
     def content_loss(self, tile: PartitionTile, features: Tensor | None) -> tuple[float, Tensor | None]:
         """The tile's share of the content loss and its gradient on owned cells; features are those of all its cells."""
@@ -418,7 +421,7 @@ class _ScalePass:
             self._content[tile],
             self._content_count,
             self._content_weight,
-            self.weights(CONTENT_LAYER, view),
+            self.position_weights(CONTENT_LAYER, view),
         )
 
     def feature_gradient(self, tile: PartitionTile) -> FeatureGradient:
@@ -428,7 +431,8 @@ class _ScalePass:
             view, own = tile.owned_cells(layer, self.size)
             with self._timer("statistics"):
                 if layer in self.maps:
-                    self.maps[layer].add_to(gradient[own.slices], features[own.slices], self.weights(layer, view))
+                    weights = self.position_weights(layer, view)
+                    self.maps[layer].add_to(gradient[own.slices], features[own.slices], weights)
                 elif layer == CONTENT_LAYER and (owned := self.content_loss(tile, features)[1]) is not None:
                     gradient[own.slices] += owned
 

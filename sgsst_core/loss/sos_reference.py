@@ -9,17 +9,17 @@ from torch import Tensor
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
-from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
+from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget
 from sgsst_core.scene.pyramid import scale_count
 
 
-def features_reference(weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
+def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
     """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
-    x = rgb.double() * weights.input_scale.double() + weights.input_shift.double()
+    x = rgb.double() * network_weights.input_scale.double() + network_weights.input_shift.double()
     x = x.permute(2, 0, 1).unsqueeze(0)
     features: dict[str, Tensor] = {}
     block = 1
-    for name, (weight, bias) in weights.convolutions.items():
+    for name, (weight, bias) in network_weights.convolutions.items():
         if int(name[4]) > block:
             block += 1
             x = F.max_pool2d(x, 2)
@@ -35,19 +35,35 @@ def box_average_reference(image: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(image.permute(2, 0, 1).unsqueeze(0), side)[0].permute(1, 2, 0)
 
 
-def _moments(features: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    flat = features.reshape(-1, features.shape[-1])
-    a = torch.ones(flat.shape[0], dtype=torch.float64) if weights is None else weights.reshape(-1).double()
+def style_loss_reference(features: Tensor, target: LayerTarget, position_weights: Tensor | None = None) -> Tensor:
+    """One layer's style loss by its definition, float64 and differentiable: the twin of `terms.style_loss`.
+
+    Args:
+        features: [h, w, c].
+        target: of the style.
+        position_weights: [h, w]; None for equal weights.
+    """
+    found = _statistics(features, position_weights)
+    loss = GRAM_WEIGHT / features.shape[-1] ** 2 * (found.gram - target.gram).square().mean()
+    loss = loss + MEAN_WEIGHT * (found.mean - target.mean).square().mean()
+    return loss + STD_WEIGHT * (found.std - target.std).square().mean()
+
+
+def _statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerTarget:
+    flat = features.double().reshape(-1, features.shape[-1])
+    equal = torch.ones(flat.shape[0], dtype=torch.float64)
+    a = equal if position_weights is None else position_weights.reshape(-1).double()
     mean = (a[:, None] * flat).sum(0) / a.sum()
     gram = (a[:, None] * flat).T @ flat / a.sum()
     variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
-    # The root of an exact zero (a dead channel) has no derivative; it takes no part, as in the closed form.
-    std = torch.where(variance > 0, variance, 1.0).sqrt() * (variance > 0)
-    return gram, mean, std
+    # The root of an exact zero (a dead channel) has no derivative, and that of a constant channel's rounding has a wild
+    # one; such a channel takes no part, as in the closed form.
+    alive = variance > (1e-12 * mean).square()
+    return LayerTarget(gram, mean, torch.where(alive, variance, 1.0).sqrt() * alive)
 
 
 def sos_reference(
-    weights: BackboneWeights,
+    network_weights: BackboneWeights,
     image: Tensor,
     style: Tensor,
     content: Tensor | None = None,
@@ -69,16 +85,13 @@ def sos_reference(
     scales = scale_count(image.shape[0], image.shape[1], coarsest)
     for scale in range(scales):
         side = 1 << scale
-        features = features_reference(weights, box_average_reference(x, side))
-        wanted = features_reference(weights, box_average_reference(style.double(), side))
+        features = features_reference(network_weights, box_average_reference(x, side))
+        wanted = features_reference(network_weights, box_average_reference(style.double(), side))
         for layer in STYLE_LAYERS:
             position = _cells(coverage, side * layer_stride(layer))
-            gram, mean, std = _moments(features[layer], position)
-            gram_v, mean_v, std_v = _moments(wanted[layer], None)
-            loss = loss + GRAM_WEIGHT / mean.shape[0] ** 2 * (gram - gram_v).square().mean()
-            loss = loss + MEAN_WEIGHT * (mean - mean_v).square().mean() + STD_WEIGHT * (std - std_v).square().mean()
+            loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position)
         if content is not None and content_weight:
-            difference = features[CONTENT_LAYER] - _content_reference(weights, content, side)
+            difference = features[CONTENT_LAYER] - _content_reference(network_weights, content, side)
             position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
             a = torch.ones(difference.shape[:2], dtype=torch.float64) if position is None else position
             loss = loss + content_weight * (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
@@ -87,8 +100,8 @@ def sos_reference(
     return loss.item(), gradient
 
 
-def _content_reference(weights: BackboneWeights, content: Tensor, side: int) -> Tensor:
-    return features_reference(weights, box_average_reference(content.double(), side))[CONTENT_LAYER].detach()
+def _content_reference(network_weights: BackboneWeights, content: Tensor, side: int) -> Tensor:
+    return features_reference(network_weights, box_average_reference(content.double(), side))[CONTENT_LAYER].detach()
 
 
 def _cells(coverage: Tensor | None, side: int) -> Tensor | None:

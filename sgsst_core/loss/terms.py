@@ -9,12 +9,19 @@ With position weights a_p, n becomes their sum and the content mean is weighted 
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
 
 from sgsst_core.features.statistics import CHUNK_VALUES, LayerStatistics
+
+#: What the loss of a scale is the sum of: names, as files and reports have them, to what people read. The order is that
+#: in which they are added up, shown and given their colours.
+TERMS = {"gram": "Gram matrix", "mean": "mean", "std": "standard deviation", "content": "content"}
 
 #: w_G = GRAM_WEIGHT / c^2: the numerator.
 GRAM_WEIGHT = 1e3
@@ -38,28 +45,48 @@ class LayerTarget:
         return LayerTarget(statistics.gram(), statistics.mean, statistics.std())
 
 
-@dataclass(frozen=True)
-class LossTerms:
-    """One scale's loss, split; `total` is what is minimised."""
+class LossTerms(Mapping[str, float]):
+    """One scale's loss, split: every name in `TERMS` to its value, in that order; it does not change.
 
-    gram: float = 0.0
-    mean: float = 0.0
-    std: float = 0.0
-    content: float = 0.0
+    Args:
+        values: by name; those that are not given are 0.
+
+    Raises:
+        TypeError: there is no such term.
+    """
+
+    __slots__ = ("_values",)
+
+    def __init__(self, **values: float) -> None:
+        unknown = ", ".join(values.keys() - TERMS.keys())
+        if unknown:
+            raise TypeError(f"the loss has no term {unknown}; it has {', '.join(TERMS)}")
+        self._values = {name: values.get(name, 0.0) for name in TERMS}
 
     @property
     def total(self) -> float:
-        """E_style + E_content."""
-        return self.gram + self.mean + self.std + self.content
+        """What is minimised: E_style + E_content."""
+        # `sum` would round otherwise from Python 3.12 on, and results would depend on the interpreter.
+        return reduce(operator.add, self._values.values())
 
-    def divided(self, count: int) -> LossTerms:
-        """Each part divided by a count: the mean of a sum."""
-        return LossTerms(self.gram / count, self.mean / count, self.std / count, self.content / count)
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
 
     def __add__(self, other: LossTerms) -> LossTerms:
-        return LossTerms(
-            self.gram + other.gram, self.mean + other.mean, self.std + other.std, self.content + other.content
-        )
+        return LossTerms(**{name: value + other[name] for name, value in self.items()})
+
+    def __truediv__(self, count: int) -> LossTerms:
+        """Each term divided by a count: the mean of a sum."""
+        return LossTerms(**{name: value / count for name, value in self.items()})
+
+    def __repr__(self) -> str:
+        return f"LossTerms({', '.join(f'{name}={value!r}' for name, value in self.items())})"
 
 
 @dataclass(frozen=True)
@@ -74,13 +101,13 @@ class StyleGradient:
     mean: Tensor  # [c] float64
     offset: Tensor  # [c] float64
 
-    def apply(self, features: Tensor, weights: Tensor | None = None) -> Tensor:
+    def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
         """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
         result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
-        self.add_to(result, features, weights)
+        self.add_to(result, features, position_weights)
         return result
 
-    def add_to(self, gradient: Tensor, features: Tensor, weights: Tensor | None = None) -> None:
+    def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
         """Add `apply` to a gradient [h, w, c] in place, chunk by chunk: nothing as large as the features is made."""
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
@@ -89,8 +116,8 @@ class StyleGradient:
         for top in range(0, height, rows):
             centred = features[top : top + rows].to(precision) - mean
             part = torch.addmm(offset, centred.reshape(-1, channels), matrix).view(centred.shape)
-            if weights is not None:
-                part = part.mul_(weights[top : top + rows, :, None].to(precision))
+            if position_weights is not None:
+                part = part.mul_(position_weights[top : top + rows, :, None].to(precision))
             gradient[top : top + rows] += part
 
 

@@ -131,7 +131,8 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     """On a GPU, which rasterizer renders; on the CPU there is nothing to choose."""
     if plan.device != "cuda":
         return []
-    how = {"cuda": "gsplat on the GPU", "cached": "kept blend weights on the GPU"}.get(plan.rasterizer, "on the CPU")
+    names = {"cuda": "gsplat on the GPU", "triton": "Triton on the GPU", "cached": "kept blend weights on the GPU"}
+    how = names.get(plan.rasterizer, "on the CPU")
     problem = probe.machine.gsplat_problem
     reason = "gsplat works here" if problem is None else f"gsplat cannot be used: {problem}"
     if problem is None and plan.rasterizer != "cuda":

@@ -310,7 +310,7 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     count = min(SAMPLED_VIEWS, len(cameras))
     sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
     seconds = sum(_raster_seconds(rasterizer, len(scene), camera) for camera in sample) / count
-    if rasterizer.name == "cuda":
+    if rasterizer.device.type == "cuda":
         return RasterCost(seconds)
     device = workshop.machine.device
     cpu = rasterizer if isinstance(rasterizer, CpuRasterizer) else CpuRasterizer(scene, near=settings.near)

@@ -19,7 +19,7 @@ from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.ply import SceneFile
 from sgsst_core.planning.survey import SEEN_COVERAGE
-from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
@@ -72,21 +72,28 @@ class Finding:
     done: str
 
 
-def check_scene(file: SceneFile) -> list[Finding]:
+def findings_of(file: SceneFile, cameras: Sequence[Camera], style: Tensor | None, *, near: float) -> list[Finding]:
+    """What is extreme in a scene that was read with `drop_invalid`, its views, and a style image [H, W, 3] if given."""
+    rasterizer = make_rasterizer("cpu", file.scene, near=near)
+    found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near)]
+    return found if style is None else [*found, *style_findings(style, cameras)]
+
+
+def scene_findings(file: SceneFile) -> list[Finding]:
     """What is extreme in a scene that was read with `drop_invalid`; indices are rows of the file."""
-    checked = _Scene(file)
+    scene = _Scene(file)
     return [
-        *checked.invalid(),
-        *checked.rotations(),
-        *checked.sizes(),
-        *checked.opacities(),
-        *checked.harmonics(),
-        *checked.place(),
+        *scene.invalid(),
+        *scene.rotations(),
+        *scene.sizes(),
+        *scene.opacities(),
+        *scene.harmonics(),
+        *scene.place(),
     ]
 
 
 class _Scene:
-    """A scene's columns with what several checks need: the extent, and the file's row of each Gaussian."""
+    """A scene's columns with what several findings need: the extent, and the file's row of each Gaussian."""
 
     def __init__(self, file: SceneFile) -> None:
         self.file, self.scene = file, file.scene
@@ -211,7 +218,7 @@ def scene_extent(scene: Scene) -> tuple[Tensor, float]:
     return centre, extent or 1.0
 
 
-def check_views(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float) -> list[Finding]:
+def view_findings(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float) -> list[Finding]:
     """What is extreme in the views, and which Gaussians they do not show; each is rendered once, forwards and back."""
     return [*_lenses(cameras), *_near(file.scene, cameras, near), *_shown(file, cameras, rasterizer)]
 
@@ -282,7 +289,7 @@ def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]
 
 def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -> list[Finding]:
     """Total blend weights, and each view's uncovered share."""
-    weights = torch.zeros(len(file.scene), dtype=torch.float64)
+    blend_weights = torch.zeros(len(file.scene), dtype=torch.float64)
     uncovered: list[float] = []
     refused: list[str] = []
     for camera in cameras:
@@ -295,7 +302,7 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
         seen = bool((coverage > SEEN_COVERAGE).any())
         uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
         ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
-        weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
+        blend_weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
     found = (
         [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops a job")]
         if refused
@@ -315,24 +322,25 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
         cameras,
         "statistics are weighted by coverage where the views' mean is above 1 % (--position-weights auto)",
     )
-    return found if refused else [*found, *_weights(file, weights)]
+    return found if refused else [*found, *_seldom_seen(file, blend_weights)]
 
 
-def _weights(file: SceneFile, weights: Tensor) -> list[Finding]:
-    checked = _Scene(file)
-    hardly = (weights > 0) & (weights < HARDLY_SEEN)
+def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
+    """Gaussians that no view shows or hardly any, from their total blend weights [N]."""
+    scene = _Scene(file)
+    hardly = (blend_weights > 0) & (blend_weights < HARDLY_SEEN)
     return [
-        *checked.finding(
+        *scene.finding(
             "in no view",
-            weights == 0,
-            weights,
+            blend_weights == 0,
+            blend_weights,
             "neither drawn nor optimised; at the end they take their neighbours' colour change (`paper`: none)",
             subject="views",
         ),
-        *checked.finding(
+        *scene.finding(
             "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)",
             hardly,
-            weights,
+            blend_weights,
             "optimised as all others, and as fast: from other viewpoints their colours may be extreme",
             largest=False,
             subject="views",
@@ -340,7 +348,7 @@ def _weights(file: SceneFile, weights: Tensor) -> list[Finding]:
     ]
 
 
-def check_style(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
+def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
     """What is extreme in a style image [H, W, 3]."""
     height, width = int(style.shape[0]), int(style.shape[1])
     found = []

@@ -271,7 +271,7 @@ class HeldOut:
             target = self._loss.view_target(image, coverage)
             style = self._style_targets(self.cameras[index])
             for scale, terms in self._loss.evaluate(image, style, target, gradient=False).terms.items():
-                values.setdefault(scale, []).append(terms.gram)
+                values.setdefault(scale, []).append(terms["gram"])
         return {scale: sum(found) / len(found) for scale, found in sorted(values.items())}
 
     def _consistency(self, gap: int, picture: Callable[[int], Tensor]) -> Consistency | None:

@@ -1,4 +1,4 @@
-"""Rasterizers: one small protocol, five implementations.
+"""Rasterizers: one small protocol, six implementations.
 
 Geometry is frozen, so a view's image is linear in its colours: image = W c + T_final * background,
 and the gradient with respect to the colours is W^T dL/dimage.
@@ -19,7 +19,7 @@ from sgsst_core.scene.gaussians import Scene
 
 __all__ = ["Rasterizer", "RasterizerName", "Rows", "make_rasterizer"]
 
-RasterizerName = Literal["reference", "cpu", "cached", "cuda"]
+RasterizerName = Literal["reference", "cpu", "cached", "triton", "cuda"]
 
 
 class Rasterizer(Protocol):
@@ -60,15 +60,15 @@ def make_rasterizer(
     device: torch.device | str | None = None,
     **options: Any,
 ) -> Rasterizer:
-    """The rasterizer called `name` (`reference`, `cpu`, `cached` or `cuda`) for a scene.
+    """The rasterizer called `name` (`reference`, `cpu`, `cached`, `triton` or `cuda`) for a scene.
 
     Args:
         name: `cpu` computes blend weights in every call, `cached` keeps them (its options `precision` and `max_bytes`),
-            `cuda` is gsplat, `reference` is slow and float64.
+            `triton` runs on GPUs, `cuda` is gsplat, `reference` is slow and float64.
         scene: its geometry must not change while the rasterizer lives.
         background: three values added where Gaussians leave pixels uncovered.
         near: near plane in world units.
-        device: for `cached` and `cuda`; None is the CPU and the current CUDA device.
+        device: for `cached`, `triton` and `cuda`; None is the CPU for the first and the current GPU for the others.
         options: of the implementation's own constructor.
 
     Raises:
@@ -89,8 +89,12 @@ def make_rasterizer(
         from sgsst_core.rasterizer.cached import CachedRasterizer
 
         return CachedRasterizer(scene, device=device or "cpu", **settings)
+    if name == "triton":
+        from sgsst_core.rasterizer.triton import TritonRasterizer
+
+        return TritonRasterizer(scene, device=device or "cuda", **settings)
     if name == "cuda":
         from sgsst_core.rasterizer.cuda import CudaRasterizer
 
         return CudaRasterizer(scene, device=device or "cuda", **settings)
-    raise SettingsError(f"no rasterizer is called {name!r}: choose reference, cpu, cached or cuda")
+    raise SettingsError(f"no rasterizer is called {name!r}: choose reference, cpu, cached, triton or cuda")

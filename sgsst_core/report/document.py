@@ -1,11 +1,7 @@
-"""What is written beside a stylized scene: the report's values, a before/after contact sheet, and the loss curves."""
+"""A report's values, as JSON holds them: what was stylized with what, what was decided, and what came out."""
 
 from __future__ import annotations
 
-import json
-import os
-import platform
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -13,23 +9,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
-import psutil
-import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
-
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.atomic import atomic_path
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
-from sgsst_core.scene.camera import Camera
-from sgsst_core.stylizing.checkpoint import versions
+from sgsst_core.report.machine import machine, peak_memory, program_version
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
 from sgsst_core.stylizing.loop import Stopped
 from sgsst_core.stylizing.state import StepRecord
@@ -78,8 +63,21 @@ def build_report(
         before, after: loss on the stylizer's `evaluation_views`, of the unstylized and the stylized scene.
         findings: what is extreme in scene, views and style.
     """
-    history = stylizer.history
-    coarse = sum(record.stage == "coarse" for record in history)
+    return {
+        **_outcome_json(stylizer, stopped, before, after),
+        "findings": [asdict(finding) for finding in findings],
+        **_inputs_json(stylizer, sources),
+        "plan": {**stylizer.plan.as_dict(), "measured": _measured(stylizer)},
+        "rasterizer": stylizer.views.rasterizer.name,
+        "memory": {"limit_bytes": stylizer.memory, "peak_bytes": peak_memory()},
+        "machine": machine(stylizer.network.device),
+        "history": [_record_json(record, before) for record in stylizer.history],
+    }
+
+
+def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, after: Evaluation) -> dict[str, Any]:
+    """What was made by which program in what time, and how good it is."""
+    coarse = sum(record.stage == "coarse" for record in stylizer.history)
     return {
         "version": REPORT_VERSION,
         "program": {"name": "sgsst-service", "version": program_version()},
@@ -87,7 +85,7 @@ def build_report(
         "stopped": stopped,
         "steps": {
             "coarse": {"planned": stylizer.plan.steps_coarse, "done": coarse},
-            "sos": {"planned": stylizer.settings.steps_sos, "done": len(history) - coarse},
+            "sos": {"planned": stylizer.settings.steps_sos, "done": len(stylizer.history) - coarse},
         },
         "seconds": round(stylizer.seconds, 3),
         "seconds_by_part": {name: round(seconds, 3) for name, seconds in sorted(stylizer.seconds_by_part.items())},
@@ -101,43 +99,28 @@ def build_report(
         "bought": bought(stylizer, before),
         "held_out": held_out_json(stylizer.measured),
         "approximations": approximations_json(stylizer.measured),
-        "findings": [asdict(finding) for finding in findings],
+    }
+
+
+def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
+    """What was stylized with what."""
+    backbone, style = sources.backbone, stylizer.style
+    return {
         "settings": stylizer.settings.model_dump(mode="json"),
-        "backbone": {
-            "name": sources.backbone.name,
-            "source": sources.backbone.source,
-            "sha256": sources.backbone.sha256,
-        },
+        "backbone": {"name": backbone.name, "source": backbone.source, "sha256": backbone.sha256},
         "scene": {
             "path": str(sources.scene),
             "gaussians": len(stylizer.scene),
             "sh_degree": stylizer.scene.sh_degree,
             "dropped": sources.dropped,
         },
-        "style": {"path": str(sources.style), "width": stylizer.style.shape[1], "height": stylizer.style.shape[0]},
+        "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.views.weighted,
             "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
         },
-        "plan": {**stylizer.plan.as_dict(), "measured": _measured(stylizer)},
-        "rasterizer": stylizer.views.rasterizer.name,
-        "memory": {"limit_bytes": stylizer.memory, "peak_bytes": peak_memory()},
-        "machine": machine(stylizer.network.device),
-        "history": [_record_json(record, before) for record in history],
     }
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write values as JSON; the file appears whole or not at all.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    with atomic_path(path) as temporary:
-        # A file name that is no valid Unicode holds lone surrogates: as escapes they are what JSON means by them.
-        text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:
@@ -235,13 +218,7 @@ def _evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _terms_json(terms: LossTerms) -> dict[str, float]:
-    return {
-        "gram": terms.gram,
-        "mean": terms.mean,
-        "std": terms.std,
-        "content": terms.content,
-        "total": terms.total,
-    }
+    return {**terms, "total": terms.total}
 
 
 def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
@@ -257,198 +234,3 @@ def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
         "parts": {name: round(seconds, 4) for name, seconds in record.parts.items()},
         "memory_bytes": record.memory,
     }
-
-
-def program_version() -> str:
-    """Version of the installed distribution; "unknown" where the source tree is used without installing it."""
-    return versions()["program"]
-
-
-def peak_memory() -> int:
-    """Most bytes of physical memory that this process has held so far."""
-    if sys.platform == "win32":
-        return int(psutil.Process().memory_info().peak_wset)
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere but on macOS
-
-
-def machine(device: torch.device) -> dict[str, Any]:
-    """What the job ran on."""
-    return {
-        "system": platform.platform(),
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "memory_bytes": psutil.virtual_memory().total,
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):  # not Linux, or a processor that does not name itself
-        return platform.processor() or platform.machine()
-
-
-# --- contact sheet -------------------------------------------------------------------------------------------------
-
-#: Pixels of the sheet: height of a picture, the style's width at most, gaps, and the labels' text.
-_CELL_HEIGHT = 330
-_MAX_CELL_WIDTH = 520
-_GAP = 12
-_LABEL = 18
-_PAPER, _INK = (255, 255, 255), (60, 60, 60)
-
-
-def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
-    """Write a JPEG: the style image, then for each evaluation view the original above the stylized render.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    views = stylizer.views
-    device = views.rasterizer.device
-    pairs = []
-    with torch.no_grad():
-        for index in stylizer.evaluation_views:
-            dcs = (views.scene.sh_dc.to(device), stylizer.sh_dc.detach())
-            # The rasterizer's own render: one rank writes the sheet, and the others take no part in it.
-            camera = views.cameras[index]
-            renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]
-            pairs.append((camera, renders))
-    sheet = _sheet(_picture(stylizer.style), pairs)
-    with atomic_path(path) as temporary:
-        sheet.save(temporary, format="JPEG", quality=88)
-
-
-def _picture(image: Tensor) -> Image.Image:
-    values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
-    return Image.fromarray(values.numpy())
-
-
-def _fitted(picture: Image.Image, width: int, height: int) -> Image.Image:
-    """The picture at the largest size that fits a box, enlarged at need."""
-    factor = min(width / picture.width, height / picture.height)
-    size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
-    return picture.resize(size, Image.Resampling.LANCZOS)
-
-
-def _sheet(style: Image.Image, pairs: Sequence[tuple[Camera, list[Image.Image]]]) -> Image.Image:
-    style = _fitted(style, _MAX_CELL_WIDTH, _CELL_HEIGHT)
-    columns = [
-        (camera.name, [_fitted(picture, _MAX_CELL_WIDTH, _CELL_HEIGHT) for picture in pictures])
-        for camera, pictures in pairs
-    ]
-    heights = [max(pictures[row].height for _, pictures in columns) for row in (0, 1)]
-    widths = [style.width, *(pictures[0].width for _, pictures in columns)]
-    line = _LABEL + _GAP
-    size = (sum(widths) + _GAP * (len(widths) + 1), max(sum(heights) + 2 * line, style.height + line) + _GAP)
-    sheet = Image.new("RGB", size, _PAPER)
-    draw = ImageDraw.Draw(sheet)
-    _place(sheet, draw, style, _GAP, line, "style")
-    left = _GAP + style.width + _GAP
-    for name, pictures in columns:
-        short = name if len(name) <= 24 else "…" + name[-23:]
-        _place(sheet, draw, pictures[0], left, line, f"{short}: original")
-        _place(sheet, draw, pictures[1], left, line + heights[0] + line, "stylized")
-        left += pictures[0].width + _GAP
-    return sheet
-
-
-def _place(
-    sheet: Image.Image, draw: ImageDraw.ImageDraw, picture: Image.Image, left: int, top: int, label: str
-) -> None:
-    sheet.paste(picture, (left, top))
-    font = ImageFont.load_default(size=_LABEL - 4)
-    while label and draw.textlength(label, font) > picture.width:  # narrow portrait views
-        label = label[:-1]
-    draw.text((left, top - _LABEL), label, _INK, font)
-
-
-# --- loss curves ---------------------------------------------------------------------------------------------------
-
-_TOTAL_COLOUR = "#222222"
-_SCALE_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-
-
-def write_loss_curves(path: Path, history: Sequence[StepRecord], round_length: int) -> None:
-    """Write a PNG of the loss against seconds, on a logarithmic axis: one line for each scale, and E.
-
-    Args:
-        history: of a stylizer; may be empty.
-        round_length: steps in which every view comes once; lines are geometric means over so many, the raw values
-            lie faintly behind.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
-    axes = figure.subplots()
-    scales = sorted({scale for record in history for scale in record.terms})
-    for scale in scales:
-        label = f"scale {scale} (1/{1 << scale})" if scale else "scale 0 (full size)"
-        colour = _SCALE_COLOURS[scale % len(_SCALE_COLOURS)]
-        for part in _phases(history):
-            chosen = [record for record in part if scale in record.terms]
-            _draw(axes, chosen, [record.terms[scale].total for record in chosen], round_length, colour, label)
-            label = "" if chosen else label  # one legend entry for both phases
-    sos = [record for record in history if record.stage == "sos"]
-    if len(scales) > 1:
-        _draw(axes, sos, [record.loss for record in sos], round_length, _TOTAL_COLOUR, "mean of the scales")
-    _mark_phases(axes, history)
-    axes.set_xlabel("seconds")
-    axes.set_ylabel("loss")
-    if history:
-        totals = [terms.total for record in history for terms in record.terms.values()]
-        axes.set_ylim(max(min(totals), 1e-300) / 1.3, max(max(totals), 1e-300) * 1.3)
-        axes.set_yscale("log")
-        axes.set_xlim(left=0)
-        axes.legend(frameon=False)
-    axes.grid(True, which="both", alpha=0.15)
-    axes.spines[["top", "right"]].set_visible(False)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
-
-
-def _phases(history: Sequence[StepRecord]) -> list[list[StepRecord]]:
-    return [[record for record in history if record.stage == stage] for stage in ("coarse", "sos")]
-
-
-def _draw(
-    axes: Axes, records: Sequence[StepRecord], values: Sequence[float], window: int, colour: str, label: str
-) -> None:
-    if not records:
-        return
-    seconds = [record.seconds for record in records]
-    marker = "o" if len(records) == 1 else None
-    axes.plot(seconds, values, color=colour, alpha=0.2, linewidth=0.8)
-    axes.plot(seconds, running_mean(values, window), color=colour, label=label or None, marker=marker)
-
-
-def running_mean(values: Sequence[float], window: int) -> NDArray[np.float64]:
-    """Geometric mean of the `window` values around each place, of fewer towards the ends."""
-    logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
-    sums = np.concatenate([[0.0], np.cumsum(logs)])
-    places = np.arange(len(logs))
-    reach = np.minimum(np.minimum(places, places[::-1]), window // 2)
-    means: NDArray[np.float64] = np.exp((sums[places + reach + 1] - sums[places - reach]) / (2 * reach + 1))
-    return means
-
-
-def _mark_phases(axes: Axes, history: Sequence[StepRecord]) -> None:
-    coarse = [record for record in history if record.stage == "coarse"]
-    if not coarse:
-        return
-    border = coarse[-1].seconds
-    transform = axes.get_xaxis_transform()
-    axes.text(border / 2, 1.02, "coarsest scale", transform=transform, ha="center", color=_TOTAL_COLOUR, fontsize=9)
-    if len(coarse) < len(history):
-        axes.axvline(border, color=_TOTAL_COLOUR, linewidth=0.8, linestyle=":")
-        middle = (border + history[-1].seconds) / 2
-        axes.text(middle, 1.02, "all scales", transform=transform, ha="center", color=_TOTAL_COLOUR, fontsize=9)

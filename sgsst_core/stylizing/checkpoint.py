@@ -173,13 +173,13 @@ def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
         "step": str(state.step),
         "seconds": repr(state.seconds),
         "queue": json.dumps(state.queue),
-        "history": json.dumps([asdict(record) for record in state.history]),
+        "history": json.dumps([_record_values(record) for record in state.history]),
         "seconds_by_part": json.dumps(state.seconds_by_part),
         "memory": json.dumps(state.memory),
         "measured": json.dumps(state.measured),
         "plan": json.dumps(plan_values),
         "ranks": str(checkpoint.ranks),
-        "before": json.dumps({scale: asdict(terms) for scale, terms in checkpoint.before.items()}),
+        "before": json.dumps(_evaluation_values(checkpoint.before)),
     }
     try:
         save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
@@ -309,6 +309,14 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
         prediction=Prediction(**expected) if expected else None,
         **values,
     )
+
+
+def _evaluation_values(evaluation: Evaluation) -> dict[int, dict[str, float]]:
+    return {scale: dict(terms) for scale, terms in evaluation.items()}
+
+
+def _record_values(record: StepRecord) -> dict[str, Any]:
+    return {**vars(record), "terms": _evaluation_values(record.terms)}
 
 
 def _evaluation(values: dict[str, dict[str, float]]) -> Evaluation:

@@ -44,7 +44,7 @@ def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
     for evaluation in evaluations:
         for scale, part in evaluation.items():
             total[scale] = total.get(scale, LossTerms()) + part
-    return {scale: terms.divided(len(evaluations)) for scale, terms in total.items()}
+    return {scale: terms / len(evaluations) for scale, terms in total.items()}
 
 
 def mean_loss(evaluation: Evaluation) -> float:

@@ -121,11 +121,11 @@ class ProcessGroupCollectives:
         dist.all_reduce(tensor, group=self._group)
         return tensor
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], number: float) -> Merged:
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Sequence[float]) -> Merged:
         """See `Collectives`."""
-        return self._background.submit(self._merge, list(parts), number).result
+        return self._background.submit(self._merge, list(parts), list(numbers)).result
 
-    def _merge(self, parts: list[LayerStatistics], number: float) -> tuple[list[LayerStatistics], float]:
+    def _merge(self, parts: list[LayerStatistics], numbers: list[float]) -> tuple[list[LayerStatistics], list[float]]:
         """Mean first, then second moments about it: sums of squares only, in which nothing can cancel.
 
         C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T, the pairwise update of
@@ -134,9 +134,9 @@ class ProcessGroupCollectives:
         if self._device.type == "cuda":
             torch.cuda.set_device(self._device)  # the current device belongs to a thread
         sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
-        extra = torch.tensor([number], dtype=torch.float64, device=sums[0].device)
+        extra = torch.tensor(numbers, dtype=torch.float64, device=sums[0].device)
         flat = self.all_reduce(torch.cat([*sums, extra]))
-        totals = flat[:-1].split([len(part) for part in sums])
+        *totals, added = flat.split([*(len(part) for part in sums), len(numbers)])
         means = [total[1:] / total[0].clamp_min(torch.finfo(total.dtype).tiny) for total in totals]
         moments = []
         for part, mean in zip(parts, means, strict=True):
@@ -148,7 +148,7 @@ class ProcessGroupCollectives:
             LayerStatistics(total[0], mean, _symmetric(half, len(mean)))
             for total, mean, half in zip(totals, means, halves, strict=True)
         ]
-        return merged, float(flat[-1])
+        return merged, added.tolist()
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""

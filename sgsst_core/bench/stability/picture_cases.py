@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sgsst_core.bench.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, texture
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from sgsst_core.loss.sos_reference import style_loss_reference
 from sgsst_core.loss.terms import LayerTarget, style_loss
 
 _LOSS = "loss and pixel gradient, relative to float64"
@@ -113,7 +114,7 @@ def _long_style(full: bool) -> CaseResult:
             (getattr(single[layer], name) - getattr(double[layer], name)).norm() / getattr(double[layer], name).norm()
         )
         for layer in STYLE_LAYERS
-        for name in ("gram", "mean", "std")
+        for name in vars(double[layer])
     ]
     worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
     return CaseResult(worst, LOSS_BOUND, f"used at {10000 * size[0] // 50} x {size[0]} pixels, in partition tiles")
@@ -167,20 +168,9 @@ def _steep(full: bool) -> CaseResult:
 
 
 def _autograd(features: Tensor, target: LayerTarget) -> Tensor:
-    """Gradient of one layer's style loss by its definition, float64; constant channels have no sigma term."""
+    """Gradient of one layer's style loss by its definition, float64."""
     x = features.double().clone().requires_grad_()
-    flat = x.reshape(-1, x.shape[-1])
-    count, channels = flat.shape
-    mean = flat.mean(0)
-    variance = (flat - mean).square().mean(0)
-    alive = variance > 1e-18
-    std = torch.where(alive, variance, 1.0).sqrt() * alive
-    loss = (
-        1e3 / channels**2 * (flat.T @ flat / count - target.gram).square().mean()
-        + 1e4 * (mean - target.mean).square().mean()
-        + 1e4 * (std - target.std).square().mean()
-    )
-    (gradient,) = torch.autograd.grad(loss, x)
+    (gradient,) = torch.autograd.grad(style_loss_reference(x, target), x)
     return gradient
 
 

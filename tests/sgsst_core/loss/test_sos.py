@@ -132,7 +132,7 @@ def test_content_features_kept_or_computed_again(vgg16_weights):
     again = loss.evaluate(image, targets, loss.view_target(content, keep_content=False))
     assert kept.loss == again.loss
     assert torch.equal(kept.image_gradient, again.image_gradient)
-    assert kept.terms[0].content > 0
+    assert kept.terms[0]["content"] > 0
 
 
 def test_left_out_content_and_layers(vgg16_weights):

@@ -1,8 +1,18 @@
+import copy
+import pickle
+
 import pytest
 import torch
 
 from sgsst_core.features.statistics import layer_statistics
-from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget, content_loss, style_loss
+from sgsst_core.loss.sos_reference import style_loss_reference
+from sgsst_core.loss.terms import (
+    TERMS,
+    LayerTarget,
+    LossTerms,
+    content_loss,
+    style_loss,
+)
 from tests.sgsst_core.pictures import relative_error
 
 
@@ -15,17 +25,7 @@ def make_features(height, width, channels, seed, dtype=torch.float64):
 def autograd_style(x, target, weights):
     """Style loss by its definition, gradient by autograd."""
     x = x.double().clone().requires_grad_()
-    flat = x.reshape(-1, x.shape[-1])
-    a = torch.ones(len(flat), dtype=torch.float64) if weights is None else weights.double().reshape(-1)
-    n, c = a.sum(), flat.shape[1]
-    mean = (a[:, None] * flat).sum(0) / n
-    gram = (a[:, None] * flat).T @ flat / n
-    std = ((a[:, None] * (flat - mean) ** 2).sum(0) / n).sqrt()
-    loss = (
-        GRAM_WEIGHT / c**2 * (gram - target.gram).square().mean()
-        + MEAN_WEIGHT * (mean - target.mean).square().mean()
-        + STD_WEIGHT * (std - target.std).square().mean()
-    )
+    loss = style_loss_reference(x, target, weights)
     return loss.item(), torch.autograd.grad(loss, x)[0]
 
 
@@ -81,3 +81,33 @@ def test_content_gradient_agrees_with_autograd(weighted):
     loss, gradient = content_loss(x.detach(), content, float(a.sum()), 0.7, a if weighted else None)
     assert loss == pytest.approx(expected.item(), rel=1e-12)
     torch.testing.assert_close(gradient, torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
+
+
+def test_terms_are_added_up_in_their_order_to_the_bit():
+    """An exact sum (of `math.fsum`, or of `sum` in later versions of Python) has another last digit."""
+    terms = LossTerms(content=3.0, std=1e16, mean=1.0, gram=1.0)
+    assert list(terms) == list(TERMS)
+    assert terms.total == ((1.0 + 1.0) + 1e16) + 3.0 == 1e16 + 4
+    assert LossTerms(gram=1e16, mean=1.0, std=1.0).total == 1e16
+
+
+def test_terms_add_divide_and_compare_by_name():
+    total = LossTerms(gram=1.0, mean=2.0) + LossTerms(mean=4.0, content=5.0)
+    assert total == LossTerms(gram=1.0, mean=6.0, content=5.0)
+    assert dict(total / 4) == dict.fromkeys(TERMS, 0.0) | {"gram": 0.25, "mean": 1.5, "content": 1.25}
+    assert total != LossTerms(gram=1.0)
+    assert LossTerms().total == 0.0
+
+
+def test_terms_travel_between_processes_and_cannot_be_changed():
+    terms = LossTerms(gram=1 / 3, content=2.5e-30)
+    assert pickle.loads(pickle.dumps(terms)) == copy.deepcopy(terms) == terms
+    with pytest.raises(TypeError):
+        terms["gram"] = 1.0
+
+
+def test_a_term_that_is_not_declared_is_refused():
+    with pytest.raises(TypeError, match="no term colour; it has gram, mean"):
+        LossTerms(colour=1.0)
+    with pytest.raises(KeyError):
+        LossTerms()["colour"]

@@ -11,7 +11,7 @@ import torch
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.ply import SceneFile, read_scene, write_scene
-from sgsst_core.quality.findings import Finding, check_scene, check_style, check_views, scene_extent
+from sgsst_core.quality.findings import Finding, scene_extent, scene_findings, style_findings, view_findings
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -26,13 +26,13 @@ def stored(folder: Path, scene: Scene) -> SceneFile:
 
 
 def found_in(folder: Path, scene: Scene) -> dict[str, Finding]:
-    return {finding.what: finding for finding in check_scene(stored(folder, scene))}
+    return {finding.what: finding for finding in scene_findings(stored(folder, scene))}
 
 
 def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Finding]:
     file = stored(folder, scene)
     rasterizer = make_rasterizer("cpu", file.scene)
-    return {finding.what: finding for finding in check_views(file, views, rasterizer, near=NEAR)}
+    return {finding.what: finding for finding in view_findings(file, views, rasterizer, near=NEAR)}
 
 
 def the(found: dict[str, Finding], text: str) -> Finding:
@@ -46,7 +46,7 @@ def test_nothing_extreme_is_found_in_an_ordinary_scene(tmp_path: Path) -> None:
     # the wall is larger than what its cameras see of it
     found = seen_by(tmp_path, wall(), cameras())
     assert {what.split(":")[0] for what in found} == {"in no view", "hardly seen"}
-    assert check_style(style(), cameras()) == []
+    assert style_findings(style(), cameras()) == []
 
 
 @pytest.mark.parametrize(
@@ -165,9 +165,9 @@ def test_a_view_with_too_many_intersections_is_told_not_raised(tmp_path: Path) -
 
 def test_extreme_styles_are_told() -> None:
     views = cameras()
-    (flat,) = check_style(torch.full((60, 60, 3), 0.4), views)
+    (flat,) = style_findings(torch.full((60, 60, 3), 0.4), views)
     assert flat.what == "one colour throughout"
-    (tiny,) = check_style(torch.rand(8, 9, 3), views)
+    (tiny,) = style_findings(torch.rand(8, 9, 3), views)
     assert tiny.worst == "used at 9 x 8"
-    (long,) = check_style(torch.rand(1000, 50, 3), views)
+    (long,) = style_findings(torch.rand(1000, 50, 3), views)
     assert long.worst == "50 x 1000"

@@ -369,7 +369,7 @@ def test_arguments_are_checked_before_any_work() -> None:
 
 
 def test_unknown_rasterizers_and_devices_are_refused() -> None:
-    with pytest.raises(SettingsError, match="choose reference, cpu, cached or cuda"):
+    with pytest.raises(SettingsError, match="choose reference, cpu, cached, triton or cuda"):
         make_rasterizer("fast", cloud(10))
     with pytest.raises(SettingsError, match="runs on the CPU"):
         make_rasterizer("cpu", cloud(10), device="cuda")

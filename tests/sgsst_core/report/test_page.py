@@ -15,13 +15,20 @@ from PIL import Image
 
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.report.document import Sources, build_report, running_mean
-from sgsst_core.report.figures import PLACES, draw_figures, thinned
+from sgsst_core.loss.terms import TERMS
+from sgsst_core.report.document import Sources, build_report
+from sgsst_core.report.figures import draw_figures
+from sgsst_core.report.history import PLACES
 from sgsst_core.report.page import render_page, write_page
+from sgsst_core.report.palette import COLOURS, GRID, INK, ON_DARK
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.report.sample import sample_report
 from tests.small_scenes import ball, cameras, style
+
+#: What the layout of a figure cannot do it says in a warning.
+pytestmark = pytest.mark.filterwarnings("error")
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
 HOSTILE = '"><script>alert(\'x\')</script><b onclick="y">&amp; {{ 7 * 7 }} $x^2$ \u202egnp.\u540d\u524d'
@@ -88,117 +95,6 @@ class Page(HTMLParser):
         for sheet in re.findall(r"<style>(.*?)</style>", self.html, re.DOTALL):
             assert "url(" not in sheet
             assert "@import" not in sheet
-
-
-def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, Any]:
-    """A report of version 2 with a value in every field, of so many steps."""
-    history = [_record(step, "coarse" if step <= coarse else "sos", scales) for step in range(1, coarse + sos + 1)]
-    seconds = history[-1]["seconds"] if history else 0.0
-    before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}
-    after = {str(scale): _terms(1e5 / 4**scale) for scale in range(scales)}
-    return {
-        "version": 2,
-        "program": {"name": "sgsst-service", "version": "0.1.0"},
-        "created": "2026-01-02T03:04:05+00:00",
-        "stopped": "finished",
-        "steps": {"coarse": {"planned": coarse, "done": coarse}, "sos": {"planned": sos, "done": sos}},
-        "seconds": seconds,
-        "seconds_by_part": {"vgg_forward": 0.5 * seconds, "render": 0.2 * seconds, "optimiser": 0.1 * seconds},
-        "loss": {
-            "views": ["a", "b"],
-            "before": {"total": 6e5, "scales": before},
-            "after": {"total": 6e4, "scales": after},
-            "relative": 0.1,
-            "relative_by_scale": dict.fromkeys(before, 0.1),
-        },
-        "settings": {"preset": "preview", "seed": 3, "max_seconds": None, "background": [0.0, 0.5, 1.0]},
-        "backbone": {"name": "vgg16", "source": "package index", "sha256": "0123456789abcdef" * 4},
-        "scene": {"path": "folder/garden.ply", "gaussians": 123_456, "sh_degree": 3, "dropped": 0},
-        "style": {"path": "styles/wave.jpg", "width": 800, "height": 600},
-        "cameras": {
-            "path": None,
-            "form": "orbit",
-            "content": "unstylized renders",
-            "count": 5,
-            "sizes": [[640, 480], [1280, 720]],
-            "names": ["a", "b", "c", "d", "e"],
-            "seeing_nothing": ["e"],
-        },
-        "position_weights": {"used": True, "uncovered_share": 0.25},
-        "plan": {
-            "decisions": [_decision(index) for index in range(3)],
-            "prediction": {"seconds": 2.0, "peak_bytes": 3_000_000_000},
-            "measured": {"seconds": 2.5, "peak_bytes": 2_400_000_000},
-        },
-        "rasterizer": "cached",
-        "memory": {"limit_bytes": 8_000_000_000, "peak_bytes": 2_400_000_000},
-        "machine": {"processor": "some processor", "cores": 2, "device": "cpu"},
-        "history": history,
-        "held_out": {"views": ["c"], "lpips": "alex", "moments": [_moment(s, history) for s in (0, 4, coarse + sos)]},
-        "approximations": {
-            "what": ["bfloat16 features", "half-precision blend weights"],
-            "moments": [
-                {"step": step, "view": 1, "relative_error": e, "cosine": 0.97, "seconds": 0.5, "seconds_exact": 1.25}
-                for step, e in ((3, 0.21), (9, 0.24))
-            ],
-        },
-        "bought": {
-            "relative": 0.0987,
-            "reached": [{"relative": 0.5, "seconds": 1.5, "step": 7}, {"relative": 0.25, "seconds": 2.5, "step": 9}],
-            "last_tenth": {"seconds": 0.4, "from": 0.101, "to": 0.0987},
-        },
-        "findings": [
-            {
-                "subject": "scene",
-                "what": "needles",
-                "count": 1200,
-                "total": 5000,
-                "worst": "Gaussian 7",
-                "done": "drawn",
-            },
-            {"subject": "style", "what": "extreme aspect", "count": 1, "total": 1, "worst": "", "done": "used whole"},
-        ],
-    }
-
-
-def _terms(total: float) -> dict[str, float]:
-    shares = {"gram": 0.7, "mean": 0.15, "std": 0.1, "content": 0.05}
-    return {**{term: share * total for term, share in shares.items()}, "total": total}
-
-
-def _record(step: int, stage: str, scales: int) -> dict[str, Any]:
-    relative = (1 + 0.2 * math.sin(1.7 * step)) / step**0.5
-    chosen = range(scales - 1, scales) if stage == "coarse" else range(scales)
-    return {
-        "step": step,
-        "stage": stage,
-        "seconds": round(0.2 * step, 3),
-        "view": step % 4,
-        "loss": 6e5 * relative,
-        "relative": relative,
-        "scales": {str(scale): _terms(1e6 / 4**scale * relative) for scale in chosen},
-        "parts": {"render": 0.04, "vgg_forward": 0.1},
-        "memory_bytes": 2_000_000_000 + 1_000_000 * (step % 7),
-    }
-
-
-def _decision(index: int) -> dict[str, Any]:
-    """Decisions with and without seconds and bytes."""
-    saved = {"seconds": 0.25 * index or None, "bytes": 4_000_000 * index or None}
-    texts = {name: f"{name} number {index}" for name in ("item", "decision", "reason", "error")}
-    return {**texts, **saved}
-
-
-def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
-    relative = 1.0 if step == 0 else 0.9 / step**0.5
-    pairs = {"pairs": 4, "compared": 0.83, "rmse": 0.04 + 0.01 * relative, "lpips": 0.1 - 0.05 * relative}
-    return {
-        "step": step,
-        "seconds": 0.2 * step,
-        "gram": {"0": 1e5 * relative, "1": 3e4 * relative},
-        "gram_relative": relative,
-        "consistency": {"short": {"gap": 1, **pairs}, "long": {"gap": 7, **pairs, "lpips": None}},
-    }
 
 
 def sample_sheet() -> bytes:
@@ -316,7 +212,7 @@ def test_lines_are_named_and_phases_marked() -> None:
 def test_split_has_a_panel_for_each_scale() -> None:
     words = Page(draw_figures(sample_report(scales=3))[1].svg["seconds"]).text
     assert [words.count(f"scale {scale} (") for scale in range(4)] == [1, 1, 1, 0]
-    assert all(term in words for term in ("gram", "mean", "std", "content"))
+    assert all(name in words for name in TERMS.values())
 
 
 def test_both_axes_of_the_loss_are_logarithmic() -> None:
@@ -475,6 +371,49 @@ def test_held_out_views_without_numbers() -> None:
     parsed(report)
 
 
+@pytest.mark.parametrize("missing", ["short", "long"])
+def test_views_of_one_reach_alone_leave_both_panels_their_room(missing: str) -> None:
+    """Four cameras make too few held-out views for the long range: it is in no panel, and nor is its name."""
+    report = sample_report()
+    for moment in report["held_out"]["moments"]:
+        moment["consistency"]["long"] = {**moment["consistency"]["short"], "gap": 7}
+        moment["consistency"][missing] = None
+    svg = {figure.name: figure for figure in draw_figures(report)}["consistency"].svg
+    for against in ("seconds", "steps"):
+        words = Page(svg[against]).text
+        assert f"{missing} range" not in words
+        assert "RMSE" in words
+        left, right = panel_borders(svg[against])
+        assert right[0] > left[1], "the panels lie over each other"
+        assert min(left[1] - left[0], right[1] - right[0]) > 100
+
+
+def panel_borders(svg: str) -> list[tuple[float, float]]:
+    """Left and right ends of each panel's x axis, in points."""
+    paths = [attributes["d"] or "" for tag, attributes in Page(svg).elements if tag == "path"]
+    lines = [re.fullmatch(r"M ([\d.]+) ([\d.]+) L ([\d.]+) ([\d.]+)", path) for path in paths]
+    axes = [line for line in lines if line and line[2] == line[4]]
+    lowest = max(float(line[2]) for line in axes)
+    return sorted({(float(line[1]), float(line[3])) for line in axes if float(line[2]) == lowest})
+
+
+def test_probes_that_no_axis_shows_are_not_drawn() -> None:
+    """A probe before the first step has no place on a logarithmic axis."""
+    report = sample_report()
+    report["approximations"]["moments"] = [{**report["approximations"]["moments"][0], "step": 0}]
+    figure = {figure.name: figure for figure in draw_figures(report)}["approximations"]
+    assert panel_borders(figure.svg["steps"])[0][0] > 20, "there is no room left for the axis's name"
+
+
+def test_every_colour_of_a_figure_has_one_for_dark_screens() -> None:
+    page = parsed({**sample_report(1, 2, len(COLOURS)), "held_out": None, "approximations": None})
+    used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
+    assert {colour[1:] for colour in (*COLOURS, INK, GRID)} <= used
+    defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))
+    assert used <= set(defined)
+    assert defined == {printed[1:]: shown for printed, shown in ON_DARK.items()}
+
+
 @pytest.mark.parametrize(("coarse", "sos"), [(1, 0), (0, 1), (1, 1), (0, 2), (3, 0)])
 def test_short_histories(coarse: int, sos: int) -> None:
     page = parsed(losses_alone(coarse, sos))
@@ -529,30 +468,6 @@ def test_long_history_stays_small() -> None:
     assert len(page.html.encode()) < 1_500_000  # leaves as much for the sheet
     points = [attributes["d"] or "" for tag, attributes in page.elements if tag == "path"]
     assert max(path.count("L") for path in points) < 2 * PLACES + 10
-
-
-def test_thinning_keeps_range_and_mean() -> None:
-    random = np.random.default_rng(1)
-    x = np.arange(1.0, 20_001.0)
-    values = np.exp(random.normal(size=len(x)))
-    line = thinned(x, values, 25, math.log(2e4) / PLACES)
-    assert len(line.x) <= PLACES + 1
-    assert (np.diff(line.x) > 0).all()
-    assert line.low.min() == values.min()
-    assert line.high.max() == values.max()
-    assert ((line.low <= line.high) & (line.x >= 1) & (line.x <= 2e4)).all()
-    places = np.floor(np.log(x) / (math.log(2e4) / PLACES))
-    smooth = running_mean(values, 25)
-    wanted = [math.exp(np.log(smooth[places == place]).mean()) for place in np.unique(places)]
-    np.testing.assert_allclose(line.mean, wanted, rtol=1e-10)
-
-
-def test_thinning_leaves_far_points_as_they_are() -> None:
-    x, values = np.array([1.0, 2.0, 4.0, 8.0]), np.array([4.0, math.nan, 2.0, 0.0])
-    line = thinned(x, values, 1, 0.01)
-    np.testing.assert_allclose(line.x, [1, 4])
-    for drawn in (line.mean, line.low, line.high):
-        np.testing.assert_allclose(drawn, [4, 2])
 
 
 def test_page_of_a_real_job(vgg16_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:

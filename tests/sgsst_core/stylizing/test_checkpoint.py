@@ -1,16 +1,18 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.loss.terms import LossTerms
+from sgsst_core.loss.terms import TERMS, LossTerms
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.settings import make_settings
@@ -30,7 +32,10 @@ from tests.small_scenes import cameras, style, wall
 @pytest.fixture
 def state() -> StylizerState:
     generator = torch.Generator().manual_seed(7)
-    terms = {0: LossTerms(1.5, 2.5e-30, 1 / 3, 0.0), 1: LossTerms(1e300, 0.1, 0.2, 0.3)}
+    terms = {
+        0: LossTerms(gram=1.5, mean=2.5e-30, std=1 / 3),
+        1: LossTerms(gram=1e300, mean=0.1, std=0.2, content=0.3),
+    }
     return StylizerState(
         sh_dc=torch.randn(5, 3, generator=generator),
         first_moment=torch.randn(5, 3, generator=generator),
@@ -68,7 +73,7 @@ def kept(state: StylizerState) -> Checkpoint:
         decisions=(Decision("item", "decision", "reason", seconds=0.1, bytes=3),),
         prediction=Prediction(0.1, 0.2, 3),
     )
-    before = {0: LossTerms(1.0, 2.0, 1 / 3, 0.0)}
+    before = {0: LossTerms(gram=1.0, mean=2.0, std=1 / 3)}
     return Checkpoint(state, plan, 3, before, "run", versions())
 
 
@@ -109,6 +114,39 @@ def test_a_checkpoint_of_a_version_before_that_is_refused(kept: Checkpoint, tmp_
     save_checkpoint(tmp_path / "c", kept, "job")
     (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"4"', b'"version":"2"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
+        load_checkpoint(tmp_path / "c", "job")
+
+
+def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", kept, "job")
+    with safe_open(tmp_path / "c", "pt") as file:
+        metadata = file.metadata()
+    history, before = json.loads(metadata["history"]), json.loads(metadata["before"])
+    stored = {"gram": 1.5, "mean": 2.5e-30, "std": 1 / 3, "content": 0.0}
+    assert stored.items() <= history[1].pop("terms")["0"].items()
+    assert history[1] == {
+        **{"step": 2, "stage": "sos", "view": 3, "seconds": 0.3, "loss": 4.0},
+        **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9},
+    }
+    assert {"gram": 1.0, "mean": 2.0, "std": 1 / 3, "content": 0.0}.items() <= before["0"].items()
+
+
+def test_a_term_that_the_loss_did_not_have_yet_is_0(
+    kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.delitem(TERMS, "content")
+        save_checkpoint(tmp_path / "c", replace(kept, before={0: LossTerms(gram=1.0, mean=2.0, std=3.0)}), "job")
+    assert load_checkpoint(tmp_path / "c", "job").before == {0: LossTerms(gram=1.0, mean=2.0, std=3.0, content=0.0)}
+
+
+def test_a_term_that_the_loss_does_not_have_is_refused_by_name(
+    kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setitem(TERMS, "later", "a term of a later version")
+        save_checkpoint(tmp_path / "c", replace(kept, before={0: LossTerms(gram=1.0, later=2.0)}), "job")
+    with pytest.raises(CheckpointError, match="the loss has no term later"):
         load_checkpoint(tmp_path / "c", "job")
 
 

@@ -243,8 +243,8 @@ def test_photos_are_the_content_where_they_are_given(vgg16_weights: BackboneWeig
     settings = make_settings()
     own = Stylizer.planned(scene, cameras(1), style(), settings, weights=vgg16_weights)
     given = Stylizer.planned(scene, cameras(1), style(), settings, weights=vgg16_weights, photos=lambda index: photo)
-    assert own.evaluate([0])[0].content == 0
-    assert given.evaluate([0])[0].content > 0
+    assert own.evaluate([0])[0]["content"] == 0
+    assert given.evaluate([0])[0]["content"] > 0
 
 
 def test_larger_views_are_brought_down_to_the_limit() -> None:

@@ -1,0 +1,331 @@
+"""GPU kernels of the `triton` rasterizer: projection, tile lists, compositing, its transpose.
+
+The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (TRITON_INTERPRET=1 before the first
+import). What is done about the numbers is what `projection` and `vectors` do about them: geometry in float64, down to
+the offset of a row of pixels from a Gaussian's axis; alpha and everything behind it in float32. Compositing and its
+transpose walk front to back, so no transmittance is ever recomputed by dividing by 1 - alpha of many Gaussians. Nothing
+is added atomically: results repeat to the bit.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+#: Gaussians that one program projects, and that it blends at a time.
+PROJECTED, BLENDED = tl.constexpr(128), tl.constexpr(32)
+_TILE: tl.constexpr = tl.constexpr(16)
+_PIXELS: tl.constexpr = tl.constexpr(256)
+_LN2: tl.constexpr = tl.constexpr(0.6931471805599453)
+
+
+@triton.jit
+def _is_finite(x):
+    return x - x == 0
+
+
+@triton.jit
+def _to_pixel(x, largest):
+    """Whole number in 0 .. largest of a float64 that may be anything but NaN."""
+    return tl.minimum(tl.maximum(x, 0.0), largest).to(tl.int32)
+
+
+@triton.jit
+def _tile_rows(value_y, extent_y, height):
+    """Pixel rows (first, last) of the image inside a Gaussian's extents; last < first where there are none."""
+    first = tl.maximum(tl.ceil(value_y - extent_y - 0.5), 0.0)
+    last = tl.minimum(tl.floor(value_y + extent_y - 0.5), height - 1.0)
+    empty = (last < first) | (first >= height)
+    return tl.where(empty, 0, _to_pixel(first, height)), tl.where(empty, -1, _to_pixel(last, height))
+
+
+@triton.jit
+def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first, last, width):
+    """Tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last: see `raster_lists._tile_span`."""
+    top, bottom = first.to(tl.float64) + 0.5 - y, last.to(tl.float64) + 0.5 - y
+    safe = tl.where(extent_x > 0, extent_x, 1.0)
+    widest = tl.where(extent_x > 0, skew * extent_y * (extent_y / safe), 0.0)
+    right = tl.minimum(tl.maximum(widest, top), bottom)
+    left = tl.minimum(tl.maximum(-widest, top), bottom)
+    half_right = tl.sqrt(tl.maximum(support - (right * w_scale) * (right * w_scale), 0.0)) / u_scale
+    half_left = tl.sqrt(tl.maximum(support - (left * w_scale) * (left * w_scale), 0.0)) / u_scale
+    begin = tl.maximum(tl.ceil(x + skew * left - half_left - 0.5), 0.0)
+    end = tl.minimum(tl.floor(x + skew * right + half_right - 0.5), width - 1.0)
+    empty = end < begin
+    first_tile = tl.where(empty, 0, _to_pixel(begin, width) // _TILE)
+    return first_tile, tl.where(empty, 0, _to_pixel(end, width) // _TILE + 1)
+
+
+@triton.jit
+def _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, extent_x, extent_y, width):
+    """Tiles (begin, end) that Gaussians reach in tile row `down`; none beyond their pixel rows first..last."""
+    top = tl.maximum(first, down * _TILE)
+    bottom = tl.minimum(last, down * _TILE + _TILE - 1)
+    begin, end = _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, top, bottom, width)
+    reached = top <= bottom
+    return tl.where(reached, begin, 0), tl.where(reached, end, 0)
+
+
+@triton.jit
+def project(
+    means, quats, scales, logits, camera, values, depths, counts, total,
+    EPS2D: tl.constexpr, MARGIN: tl.constexpr, SUPPORT: tl.constexpr, POWER: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """`projection.project` of BLOCK Gaussians a program, and how many raster tiles each touches.
+
+    Args:
+        camera: [19] float64: the upper three rows of world_to_camera, fx, fy, cx, cy, width, height, near.
+        values: [N, 8] float64, see `projection.Column`; rows of invisible Gaussians are not written.
+        depths: [N] float64, infinite for invisible Gaussians.
+        counts: [N] int32, 0 for invisible ones.
+    """
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = i < total
+    p = i.to(tl.int64)
+    mx = tl.load(means + 3 * p, mask=there, other=0.0).to(tl.float64)
+    my = tl.load(means + 3 * p + 1, mask=there, other=0.0).to(tl.float64)
+    mz = tl.load(means + 3 * p + 2, mask=there, other=0.0).to(tl.float64)
+    r00, r01, r02, t0 = tl.load(camera), tl.load(camera + 1), tl.load(camera + 2), tl.load(camera + 3)
+    r10, r11, r12, t1 = tl.load(camera + 4), tl.load(camera + 5), tl.load(camera + 6), tl.load(camera + 7)
+    r20, r21, r22, t2 = tl.load(camera + 8), tl.load(camera + 9), tl.load(camera + 10), tl.load(camera + 11)
+    fx, fy, cx, cy = tl.load(camera + 12), tl.load(camera + 13), tl.load(camera + 14), tl.load(camera + 15)
+    width, height, near = tl.load(camera + 16), tl.load(camera + 17), tl.load(camera + 18)
+    x = r00 * mx + r01 * my + r02 * mz + t0
+    y = r10 * mx + r11 * my + r12 * mz + t1
+    z = r20 * mx + r21 * my + r22 * mz + t2
+    visible = there & (z >= near)
+    z = tl.where(visible, z, 1.0)
+    logit = tl.load(logits + p, mask=there, other=0.0).to(tl.float64)
+    opacity = -tl.log(1 + tl.exp(-logit)) / _LN2
+    support = opacity + SUPPORT
+    visible = visible & (support >= 0)
+    margin_x, margin_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+    slope_x = tl.minimum((width - cx) / fx + margin_x, tl.maximum(-cx / fx - margin_x, x / z))
+    slope_y = tl.minimum((height - cy) / fy + margin_y, tl.maximum(-cy / fy - margin_y, y / z))
+    qw = tl.load(quats + 4 * p, mask=there, other=1.0).to(tl.float64)
+    qx = tl.load(quats + 4 * p + 1, mask=there, other=0.0).to(tl.float64)
+    qy = tl.load(quats + 4 * p + 2, mask=there, other=0.0).to(tl.float64)
+    qz = tl.load(quats + 4 * p + 3, mask=there, other=0.0).to(tl.float64)
+    norm = tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    qw, qx, qy, qz = qw / norm, qx / norm, qy / norm, qz / norm
+    g00, g01, g02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
+    g10, g11, g12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
+    g20, g21, g22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
+    s0 = tl.exp(tl.load(scales + 3 * p, mask=there, other=0.0).to(tl.float64))
+    s1 = tl.exp(tl.load(scales + 3 * p + 1, mask=there, other=0.0).to(tl.float64))
+    s2 = tl.exp(tl.load(scales + 3 * p + 2, mask=there, other=0.0).to(tl.float64))
+    ax, bx, cx_ = fx / z * (r00 - slope_x * r20), fx / z * (r01 - slope_x * r21), fx / z * (r02 - slope_x * r22)
+    ay, by, cy_ = fy / z * (r10 - slope_y * r20), fy / z * (r11 - slope_y * r21), fy / z * (r12 - slope_y * r22)
+    m00, m01 = (ax * g00 + bx * g10 + cx_ * g20) * s0, (ax * g01 + bx * g11 + cx_ * g21) * s1
+    m02 = (ax * g02 + bx * g12 + cx_ * g22) * s2
+    m10, m11 = (ay * g00 + by * g10 + cy_ * g20) * s0, (ay * g01 + by * g11 + cy_ * g21) * s1
+    m12 = (ay * g02 + by * g12 + cy_ * g22) * s2
+    vp = m00 * m00 + m01 * m01 + m02 * m02
+    q = m00 * m10 + m01 * m11 + m02 * m12
+    vr = m10 * m10 + m11 * m11 + m12 * m12
+    minor0, minor1, minor2 = m01 * m12 - m02 * m11, m02 * m10 - m00 * m12, m00 * m11 - m01 * m10
+    det = minor0 * minor0 + minor1 * minor1 + minor2 * minor2 + EPS2D * (vp + vr) + EPS2D * EPS2D
+    vp, vr = vp + EPS2D, vr + EPS2D
+    u_scale, w_scale = POWER * tl.sqrt(vr / det), POWER / tl.sqrt(vr)
+    reach = tl.sqrt(tl.maximum(support, 0.0)) / POWER
+    extent_x, extent_y = reach * tl.sqrt(vp), reach * tl.sqrt(vr)
+    u, v, skew = fx * (x / z) + cx, fy * (y / z) + cy, q / vr
+    visible = visible & _is_finite(u + v + skew + u_scale + extent_x + extent_y + det)
+    beside = tl.ceil(u - extent_x - 0.5) > tl.minimum(tl.floor(u + extent_x - 0.5), width - 1)
+    above = tl.ceil(v - extent_y - 0.5) > tl.minimum(tl.floor(v + extent_y - 0.5), height - 1)
+    visible = visible & ~(beside | above) & (u + extent_x >= 0.5) & (v + extent_y >= 0.5)
+    row = values + 8 * p
+    tl.store(row, u, mask=visible)
+    tl.store(row + 1, v, mask=visible)
+    tl.store(row + 2, skew, mask=visible)
+    tl.store(row + 3, u_scale, mask=visible)
+    tl.store(row + 4, w_scale, mask=visible)
+    tl.store(row + 5, opacity, mask=visible)
+    tl.store(row + 6, extent_x, mask=visible)
+    tl.store(row + 7, extent_y, mask=visible)
+    tl.store(depths + p, tl.where(visible, z, float("inf")), mask=there)
+    # What is not visible may hold NaN: plain numbers in its place, and no rows.
+    v, extent_y = tl.where(visible, v, 0.0), tl.where(visible, extent_y, 0.0)
+    u, extent_x = tl.where(visible, u, 0.0), tl.where(visible, extent_x, 1.0)
+    skew, u_scale, w_scale = (
+        tl.where(visible, skew, 0.0),
+        tl.where(visible, u_scale, 1.0),
+        tl.where(visible, w_scale, 1.0),
+    )
+    first, last = _tile_rows(v, extent_y, height)
+    last = tl.where(visible, last, -1)
+    first = tl.where(visible, first, 0)
+    touched = tl.zeros([BLOCK], tl.int32)
+    step = tl.zeros([], tl.int32)
+    rows = tl.max(tl.where(last >= first, last // _TILE - first // _TILE + 1, 0), 0)
+    while step < rows:
+        begin, end = _span_of_row(
+            first // _TILE + step, first, last, u, v, skew, u_scale, w_scale, support, extent_x, extent_y, width
+        )
+        touched += end - begin
+        step += 1
+    tl.store(counts + p, touched, mask=there)
+
+
+@triton.jit
+def list_tiles(
+    order, values, first_slots, camera, tiles, ranks, visible,
+    SUPPORT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The tile and the rank of every pair of Gaussian and raster tile, Gaussian by Gaussian.
+
+    Args:
+        order: [V] int64, rank -> Gaussian.
+        values: [N, 8] float64.
+        first_slots: [V + 1] int64.
+        tiles, ranks: [E] int32, written.
+        visible: V.
+    """
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = rank < visible
+    width, height = tl.load(camera + 16), tl.load(camera + 17)
+    across = (width.to(tl.int32) + _TILE - 1) // _TILE
+    row = values + 8 * tl.load(order + rank, mask=there, other=0)
+    x, y = tl.load(row, mask=there, other=0.0), tl.load(row + 1, mask=there, other=0.0)
+    skew, u_scale = tl.load(row + 2, mask=there, other=0.0), tl.load(row + 3, mask=there, other=1.0)
+    w_scale, support = tl.load(row + 4, mask=there, other=1.0), tl.load(row + 5, mask=there, other=0.0) + SUPPORT
+    extent_x, extent_y = tl.load(row + 6, mask=there, other=1.0), tl.load(row + 7, mask=there, other=0.0)
+    slot = tl.load(first_slots + rank, mask=there, other=0)
+    first, last = _tile_rows(y, extent_y, height)
+    last = tl.where(there, last, -1)
+    first = tl.where(there, first, 0)
+    step = tl.zeros([], tl.int32)
+    rows = tl.max(tl.where(last >= first, last // _TILE - first // _TILE + 1, 0), 0)
+    while step < rows:
+        down = first // _TILE + step
+        begin, end = _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, extent_x, extent_y, width)
+        place = tl.zeros([], tl.int32)
+        widest = tl.max(end - begin, 0)
+        while place < widest:
+            own = begin + place < end
+            tl.store(tiles + slot, down * across + begin + place, mask=own)
+            tl.store(ranks + slot, rank, mask=own)
+            slot += own.to(tl.int64)
+            place += 1
+        step += 1
+
+
+@triton.jit
+def _weights(
+    ranks, values, k, end, x0, y0, transmittance,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+):  # fmt: skip
+    """Blend weights [K, 256] of the next K entries of a tile, and the pixels' transmittance [256] behind them.
+
+    A finished pixel has transmittance 0 or less: minus what it ended with. Rows are ranks' places in the list.
+    """
+    j = k + tl.arange(0, K)
+    there = j < end
+    rank = tl.load(ranks + j, mask=there, other=0).to(tl.int64)
+    row = values + 8 * rank
+    dx = x0.to(tl.float64) + 0.5 - tl.load(row, mask=there, other=0.0)
+    dy = (y0 + tl.arange(0, _TILE)).to(tl.float64)[None, :] + 0.5 - tl.load(row + 1, mask=there, other=0.0)[:, None]
+    skew, u_scale = tl.load(row + 2, mask=there, other=0.0), tl.load(row + 3, mask=there, other=0.0)
+    w = dy * tl.load(row + 4, mask=there, other=0.0)[:, None]
+    top = (tl.load(row + 5, mask=there, other=0.0)[:, None] - w * w).to(tl.float32)  # [K, 16]
+    u0 = ((dx[:, None] - skew[:, None] * dy) * u_scale[:, None]).to(tl.float32)
+    columns = tl.arange(0, _TILE).to(tl.float32)[None, None, :]
+    u = u0[:, :, None] + columns * u_scale.to(tl.float32)[:, None, None]  # [K, 16, 16]
+    alpha = tl.reshape(tl.minimum(tl.exp2(top[:, :, None] - u * u), ALPHA_MAX), [K, _PIXELS])
+    alpha = tl.where(there[:, None] & (alpha >= ALPHA_MIN), alpha, 0.0)
+    going = tl.maximum(transmittance, 0.0)
+    after = going[None, :] * tl.cumprod(1 - alpha, 0)
+    blended = (alpha > 0) & (after > STOP)
+    weights = tl.where(blended, after / (1 - alpha) * alpha, 0.0)
+    left = tl.min(tl.where(blended, after, going[None, :]), 0)
+    ended = tl.min(after, 0) <= STOP
+    left = tl.where(transmittance > 0, tl.where(ended, -left, left), transmittance)
+    return weights, left
+
+
+@triton.jit
+def render(
+    ranks, starts, gaussians, values, colours, background, image, transmittances, width, first_row, last_row, across,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+):  # fmt: skip
+    """Image [h, width, 3] and final transmittance [h, width] of rows first_row..last_row; one program a raster tile."""
+    tile = first_row // _TILE * across + tl.program_id(0)
+    x0, y0 = tile % across * _TILE, tile // across * _TILE
+    pixel = tl.arange(0, _PIXELS)
+    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
+    inside = (x < width) & (y >= first_row) & (y < last_row)
+    left = tl.where(inside, 1.0, 0.0)
+    red, green, blue = tl.zeros([_PIXELS], tl.float32), tl.zeros([_PIXELS], tl.float32), tl.zeros([_PIXELS], tl.float32)
+    k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    going = tl.max(left, 0)
+    while (k < end) & (going > 0):
+        weights, left = _weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        j = k + tl.arange(0, K)
+        there = j < end
+        gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
+        # Three channels are too few for matrix units, which would take the products in less than float32 besides.
+        red += tl.sum(weights * tl.load(colours + 3 * gaussian, mask=there, other=0.0)[:, None], 0)
+        green += tl.sum(weights * tl.load(colours + 3 * gaussian + 1, mask=there, other=0.0)[:, None], 0)
+        blue += tl.sum(weights * tl.load(colours + 3 * gaussian + 2, mask=there, other=0.0)[:, None], 0)
+        going = tl.max(left, 0)
+        k += K
+    left = tl.abs(left)
+    place = (y - first_row).to(tl.int64) * width + x
+    tl.store(image + 3 * place, red + left * tl.load(background), mask=inside)
+    tl.store(image + 3 * place + 1, green + left * tl.load(background + 1), mask=inside)
+    tl.store(image + 3 * place + 2, blue + left * tl.load(background + 2), mask=inside)
+    tl.store(transmittances + place, left, mask=inside)
+
+
+@triton.jit
+def slot_gradients(
+    ranks, slots, starts, values, image_gradient, out, width, first_row, last_row, across,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+):  # fmt: skip
+    """dL/dcolour of every pair of Gaussian and tile in its own slot [E, 3], which holds zeros before."""
+    tile = first_row // _TILE * across + tl.program_id(0)
+    x0, y0 = tile % across * _TILE, tile // across * _TILE
+    pixel = tl.arange(0, _PIXELS)
+    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
+    inside = (x < width) & (y >= first_row) & (y < last_row)
+    place = (y - first_row).to(tl.int64) * width + x
+    red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
+    green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)
+    blue = tl.load(image_gradient + 3 * place + 2, mask=inside, other=0.0)
+    left = tl.where(inside, 1.0, 0.0)
+    k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    going = tl.max(left, 0)
+    while (k < end) & (going > 0):
+        weights, left = _weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        j = k + tl.arange(0, K)
+        there = j < end
+        slot = out + 3 * tl.load(slots + j, mask=there, other=0).to(tl.int64)
+        tl.store(slot, tl.sum(weights * red[None, :], 1), mask=there)
+        tl.store(slot + 1, tl.sum(weights * green[None, :], 1), mask=there)
+        tl.store(slot + 2, tl.sum(weights * blue[None, :], 1), mask=there)
+        going = tl.max(left, 0)
+        k += K
+
+
+@triton.jit
+def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr):
+    """Add up each Gaussian's slots [E, 3], in order and in float64, into its row of `out` [N, 3]."""
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = rank < visible
+    slot = tl.load(first_slots + rank, mask=there, other=0)
+    end = tl.load(first_slots + rank + 1, mask=there, other=0)
+    channel = tl.arange(0, 4)
+    sums = tl.zeros([BLOCK, 4], tl.float64)
+    while tl.max(end - slot, 0) > 0:
+        own = (slot < end)[:, None] & (channel < 3)[None, :]
+        sums += tl.load(slots + 3 * slot[:, None] + channel[None, :], mask=own, other=0.0).to(tl.float64)
+        slot += 1
+    gaussian = tl.load(gaussians + rank, mask=there, other=0)
+    tl.store(
+        out + 3 * gaussian[:, None] + channel[None, :],
+        sums.to(tl.float32),
+        mask=there[:, None] & (channel < 3)[None, :],
+    )

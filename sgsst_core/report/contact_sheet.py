@@ -1,0 +1,86 @@
+"""The contact sheet: the style, and some views before and after, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.report.palette import INK, PAPER
+from sgsst_core.scene.camera import Camera
+from sgsst_core.stylizing.stylizer import Stylizer
+
+#: Pixels of the sheet: height of a picture, the style's width at most, gaps, and the labels' text.
+_CELL_HEIGHT = 330
+_MAX_CELL_WIDTH = 520
+_GAP = 12
+_LABEL = 18
+
+
+def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
+    """Write a JPEG: the style image, then for each evaluation view the original above the stylized render.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    views = stylizer.views
+    device = views.rasterizer.device
+    pairs = []
+    with torch.no_grad():
+        for index in stylizer.evaluation_views:
+            dcs = (views.scene.sh_dc.to(device), stylizer.sh_dc.detach())
+            # The rasterizer's own render: one rank writes the sheet, and the others take no part in it.
+            camera = views.cameras[index]
+            renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]
+            pairs.append((camera, renders))
+    sheet = _sheet(_picture(stylizer.style), pairs)
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="JPEG", quality=88)
+
+
+def _picture(image: Tensor) -> Image.Image:
+    values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
+    return Image.fromarray(values.numpy())
+
+
+def _fitted(picture: Image.Image, width: int, height: int) -> Image.Image:
+    """The picture at the largest size that fits a box, enlarged at need."""
+    factor = min(width / picture.width, height / picture.height)
+    size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
+    return picture.resize(size, Image.Resampling.LANCZOS)
+
+
+def _sheet(style: Image.Image, pairs: Sequence[tuple[Camera, list[Image.Image]]]) -> Image.Image:
+    style = _fitted(style, _MAX_CELL_WIDTH, _CELL_HEIGHT)
+    columns = [
+        (camera.name, [_fitted(picture, _MAX_CELL_WIDTH, _CELL_HEIGHT) for picture in pictures])
+        for camera, pictures in pairs
+    ]
+    heights = [max(pictures[row].height for _, pictures in columns) for row in (0, 1)]
+    widths = [style.width, *(pictures[0].width for _, pictures in columns)]
+    line = _LABEL + _GAP
+    size = (sum(widths) + _GAP * (len(widths) + 1), max(sum(heights) + 2 * line, style.height + line) + _GAP)
+    sheet = Image.new("RGB", size, PAPER)
+    draw = ImageDraw.Draw(sheet)
+    _place(sheet, draw, style, _GAP, line, "style")
+    left = _GAP + style.width + _GAP
+    for name, pictures in columns:
+        short = name if len(name) <= 24 else "…" + name[-23:]
+        _place(sheet, draw, pictures[0], left, line, f"{short}: original")
+        _place(sheet, draw, pictures[1], left, line + heights[0] + line, "stylized")
+        left += pictures[0].width + _GAP
+    return sheet
+
+
+def _place(
+    sheet: Image.Image, draw: ImageDraw.ImageDraw, picture: Image.Image, left: int, top: int, label: str
+) -> None:
+    sheet.paste(picture, (left, top))
+    font = ImageFont.load_default(size=_LABEL - 4)
+    while label and draw.textlength(label, font) > picture.width:  # narrow portrait views
+        label = label[:-1]
+    draw.text((left, top - _LABEL), label, INK, font)

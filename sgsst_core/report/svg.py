@@ -1,0 +1,66 @@
+"""Figures as SVG that shares a page with others.
+
+Colours are written as CSS variables with the printed colour as fallback (`var(--c-222222, #222222)`), so that a page
+can give others to a dark screen; text takes the page's font.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import xml.etree.ElementTree as ElementTree
+
+from matplotlib.figure import Figure
+
+_NAMESPACE = re.compile(r"\{[^}]*\}")
+_COLOUR = re.compile(r"(fill|stroke): #([0-9a-f]{6})")
+_REFERENCE = re.compile(r"url\(#([^)]+)\)")
+_FAMILY = re.compile(r"font-family: [^;]*;?")
+_LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
+
+
+def inline(figure: Figure, name: str, label: str) -> str:
+    """A figure as an <svg> element that shares a page with others: identifiers are its own, styles do not leak."""
+    file = io.BytesIO()
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # of no use here, and it names other servers
+    figure.savefig(file, format="svg", transparent=True, metadata=metadata)
+    root = ElementTree.fromstring(file.getvalue())
+    for parent in root.iter():
+        for child in list(parent):
+            if _NAMESPACE.sub("", child.tag) == "style":  # it would hold for the whole page
+                parent.remove(child)
+    used = _references(root)
+    for element in root.iter():
+        element.tag = _NAMESPACE.sub("", element.tag)
+        element.attrib = {
+            key: value
+            for key, value in (_rewritten(*item, name) for item in element.attrib.items())
+            if key != "id" or value.removeprefix(f"{name}-") in used
+        }
+    root.attrib = {"viewBox": root.attrib["viewBox"], "role": "img", "aria-label": label}
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _references(root: ElementTree.Element) -> set[str]:
+    used = set()
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            if _NAMESPACE.sub("", key) == "href":
+                used.add(value.removeprefix("#"))
+            used.update(_REFERENCE.findall(value))
+    return used
+
+
+def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:
+    """An attribute without its namespace; identifiers with the figure's name, coordinates to hundredths of a point."""
+    key = _NAMESPACE.sub("", key)
+    if key == "id":
+        return key, f"{name}-{value}"
+    if key == "href":
+        return key, f"#{name}-{value.removeprefix('#')}"
+    value = _REFERENCE.sub(rf"url(#{name}-\1)", value)
+    if key == "style":
+        return key, _FAMILY.sub("", _COLOUR.sub(r"\1: var(--c-\2, #\2)", value))
+    if key in ("d", "points"):
+        value = " ".join(value.split())
+    return key, _LONG_DECIMAL.sub(r"\1", value) if key in ("d", "points", "x", "y", "transform") else value

@@ -1,0 +1,155 @@
+"""The tables of a report's page: rows of text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
+
+
+@dataclass(frozen=True)
+class Column:
+    """Of a table; numbers are set flush right."""
+
+    title: str
+    number: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text, one cell a column."""
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str]]
+
+
+def loss_table(report: dict[str, Any]) -> Table:
+    """The loss before and after, of the mean of the scales and of each."""
+    loss = report["loss"]
+    rows = [["mean of the scales", loss["before"]["total"], loss["after"]["total"], loss["relative"]]]
+    for scale, before in loss["before"]["scales"].items():
+        after = loss["after"]["scales"].get(scale, {})
+        rows.append([f"scale {scale}", before["total"], after.get("total"), loss["relative_by_scale"].get(scale)])
+    return Table(
+        [Column(""), Column("unstylized", True), Column("stylized", True), Column("relative", True)],
+        [[name, *(number(value) for value in values)] for name, *values in rows],
+    )
+
+
+def held_out_table(report: dict[str, Any]) -> Table | None:
+    """Every moment in numbers; columns that have none are left out."""
+    moments = (report.get("held_out") or {}).get("moments") or []
+    if not moments:
+        return None
+    scales = sorted({scale for moment in moments for scale in moment.get("gram") or {}}, key=int)
+    columns: dict[str, list[str]] = {
+        "step": [f"{moment['step']:,}" for moment in moments],
+        "time": [duration(moment["seconds"]) for moment in moments],
+        "Gram distance, relative": [number(moment.get("gram_relative")) for moment in moments],
+    }
+    for scale in scales:
+        columns[f"scale {scale}, absolute"] = [number((moment.get("gram") or {}).get(scale)) for moment in moments]
+    for reach in ("short", "long"):
+        found = [(moment.get("consistency") or {}).get(reach) or {} for moment in moments]
+        columns[f"RMSE, {reach} range"] = [number(entry.get("rmse")) for entry in found]
+        columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in found]
+        columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in found]
+    columns = {title: cells for title, cells in columns.items() if any(cell != NOTHING for cell in cells)}
+    return Table([Column(title, True) for title in columns], list(zip(*columns.values(), strict=True)))
+
+
+def decision_table(report: dict[str, Any]) -> Table:
+    """What the plan decided and why, what it saves and what it costs."""
+    columns = [
+        Column("item"),
+        Column("decision"),
+        Column("reason"),
+        Column("saves a step", True),
+        Column("saves memory", True),
+        Column("costs"),
+    ]
+    return Table(
+        columns,
+        [
+            [
+                entry["item"],
+                entry["decision"],
+                entry["reason"],
+                duration(entry["seconds"]),
+                byte_count(entry["bytes"]),
+                entry["error"],
+            ]
+            for entry in report["plan"]["decisions"]
+        ],
+    )
+
+
+def prediction_table(report: dict[str, Any]) -> Table:
+    """What the plan expected beside what happened."""
+    predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
+    rows = [
+        _beside("a step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
+        _beside("peak memory", predicted.get("peak_bytes"), measured.get("peak_bytes"), byte_count),
+    ]
+    one_rank, seconds = predicted.get("seconds_one_rank"), predicted.get("seconds")
+    if one_rank and seconds:
+        waiting = predicted["communication"], measured.get("communication")
+        rows.append(_beside("of it waiting for other ranks", *waiting, duration))
+        rows.append(_beside("speed-up over one rank", one_rank / seconds, measured.get("speed_up"), number))
+    columns = [Column(""), Column("predicted", True), Column("measured", True), Column("measured / predicted", True)]
+    return Table(columns, rows)
+
+
+def _beside(name: str, before: float | None, after: float | None, text: Callable[[float | None], str]) -> list[str]:
+    """A row of a prediction, its measurement and their ratio."""
+    return [name, text(before), text(after), number(after / before if before and after is not None else None)]
+
+
+def finding_table(report: dict[str, Any]) -> Table | None:
+    """What is extreme in scene, views and style; None where nothing is."""
+    findings = report.get("findings") or []
+    rows = [
+        [
+            entry["subject"],
+            entry["what"],
+            f"{entry['count']:,} of {entry['total']:,}",
+            entry["worst"] or NOTHING,
+            entry["done"],
+        ]
+        for entry in findings
+    ]
+    columns = [Column("in"), Column("what"), Column("how many", True), Column("worst"), Column("what is done")]
+    return Table(columns, rows) if rows else None
+
+
+def approximation_table(report: dict[str, Any]) -> Table | None:
+    """Every comparison with the exact gradient; None where there was none."""
+    moments = (report.get("approximations") or {}).get("moments") or []
+    names = report["cameras"]["names"]
+    rows = []
+    for entry in moments:
+        view = entry["view"]
+        taken, exact = entry.get("seconds"), entry.get("seconds_exact")
+        rows.append(
+            [
+                f"{entry['step']:,}",
+                names[view] if isinstance(view, int) and 0 <= view < len(names) else str(view),
+                number(entry.get("relative_error")),
+                number(entry.get("cosine"), 6),
+                duration(taken),
+                duration(exact),
+                number(exact / taken if taken and exact is not None else None),
+            ]
+        )
+    columns = [
+        Column("step", True),
+        Column("view"),
+        Column("relative error of the gradient", True),
+        Column("cosine to the exact one", True),
+        Column("time", True),
+        Column("time, exact", True),
+        Column("times faster", True),
+    ]
+    return Table(columns, rows) if rows else None

@@ -1,0 +1,195 @@
+"""`triton` against `reference` and the lists of `cpu`: on a GPU where there is one, else in Triton's interpreter.
+
+The interpreter runs the kernels' own source on CPU tensors; that they can be compiled is shown for real targets by
+`benchmarks.triton_targets`, which needs no GPU either.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.errors import SettingsError, TooManyIntersectionsError
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
+from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
+
+pytest.importorskip("triton")
+ROOT = Path(__file__).resolve().parents[3]
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+BACKGROUND = (1.0, 0.25, 0.5)
+#: Float32 moves a decision only within this relative distance of its cut.
+CLOSE = 2e-5
+
+
+def needles() -> Scene:
+    """A million times longer than wide, at all angles, some far longer than the view."""
+    scene = cloud(60, seed=9)
+    long = torch.linspace(-3, 7, 60)[:, None]
+    return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
+
+
+def opaque() -> Scene:
+    """Every pixel ends behind a few Gaussians: what a backward pass that divides by 1 - alpha gets wrong."""
+    return replace(cloud(300, seed=2, log_scale=-1.5), opacities=torch.full((300,), 7.0))
+
+
+def far_away() -> tuple[Scene, Camera]:
+    """A million units from the origin of the world, where float32 has steps of 1/16."""
+    scene, view = cloud(150, seed=12), camera(40, 33)
+    offset = torch.tensor([1e6, -2e6, 1.5e6])
+    means = scene.means.double().round(decimals=0) + offset.double()
+    pose = view.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset.double()
+    return replace(scene, means=means.float()), replace(view, world_to_camera=pose)
+
+
+CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
+    "turned": lambda: (cloud(150, seed=1), camera(40, 35, pose=turned_pose())),
+    "opaque": lambda: (opaque(), camera(33, 18)),
+    "needles": lambda: (needles(), camera(49, 31)),
+    "huge": lambda: (cloud(40, seed=3, log_scale=3.0), camera(33, 17)),
+    "tiny, most tiles empty": lambda: (cloud(60, seed=4, log_scale=-7.0), camera(80, 50)),
+    "faint": lambda: (replace(cloud(150, seed=5), opacities=torch.linspace(-5.6, -5.4, 150)), camera(33, 33)),
+    "one pixel": lambda: (cloud(100, seed=6), camera(1, 1)),
+    "one row": lambda: (cloud(100, seed=7), camera(133, 1)),
+    "close by": lambda: (cloud(100, seed=8, depth=0.3), camera(33, 20)),
+    "far from the origin": far_away,
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
+    return CASES[request.param]()
+
+
+def on_device(scene: Scene, **options: float) -> TritonRasterizer:
+    return TritonRasterizer(scene, background=BACKGROUND, device=DEVICE, **options)  # type: ignore[arg-type]
+
+
+def test_agrees_with_the_reference(case: tuple[Scene, Camera], one_thread: None) -> None:
+    scene, view = case
+    reference, fast = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
+    band = reference.near_cutoff(view, CLOSE)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    pixels[band] = 0
+    image, coverage = fast.render(colours, view).cpu(), fast.coverage(view).cpu()
+    assert_close_outside_band(image, reference.render(colours, view), band, tolerance=1e-5)
+    assert_close_outside_band(coverage, reference.coverage(view), band, tolerance=1e-5)
+    gradient = fast.colour_gradient(pixels, view).cpu()
+    assert relative_error(gradient, reference.colour_gradient(pixels, view)) < 5e-6
+
+
+def test_lists_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
+    scene, view = case
+    lists, expected = on_device(scene).lists(view), build_raster_lists(scene, view)
+    assert np.array_equal(lists.gaussians.cpu().numpy(), expected.projection.gaussians)
+    assert np.array_equal(lists.first_slots.cpu().numpy(), expected.first_slots)
+    assert np.array_equal(lists.starts.cpu().numpy(), expected.starts)
+    assert np.array_equal(lists.ranks.cpu().numpy(), expected.ranks)
+    assert np.array_equal(lists.slots.cpu().numpy(), expected.slots)
+    assert np.allclose(lists.values.cpu().numpy(), expected.projection.values, rtol=1e-9, atol=1e-9)
+
+
+def test_bands_put_together_are_the_same_bits() -> None:
+    scene, view = cloud(120, seed=14), camera(40, 45)
+    rasterizer, colours, pixels = on_device(scene), colours_of(scene), pixels_like(view)
+    whole, bands = rasterizer.render(colours, view), [(0, 16), (16, 21), (21, 45)]
+    assert torch.equal(torch.cat([rasterizer.render(colours, view, rows) for rows in bands]), whole)
+    parts = [rasterizer.colour_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
+    assert relative_error(sum(parts), rasterizer.colour_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
+
+
+def test_gradient_is_the_transpose_and_repeats_to_the_bit() -> None:
+    scene, view = cloud(120, seed=15), camera(40, 33)
+    rasterizer, colours, pixels = on_device(scene), colours_of(scene), pixels_like(view)
+    gradient = rasterizer.colour_gradient(pixels, view)
+    black = rasterizer.render(torch.zeros_like(colours), view).cpu().double()
+    image = rasterizer.render(colours, view).cpu().double() - black
+    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colours).sum()), rel=1e-5)
+    again = on_device(scene).colour_gradient(pixels, view)
+    assert torch.equal(gradient, again)
+
+
+@pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
+def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
+    rasterizer, view = on_device(scene), camera(20, 18)
+    assert torch.equal(rasterizer.render(colours_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert not rasterizer.coverage(view).any()
+    gradient = rasterizer.colour_gradient(pixels_like(view), view)
+    assert gradient.shape == (len(scene), 3)
+    assert not gradient.any()
+
+
+def test_invalid_gaussians_are_left_out_as_by_the_reference() -> None:
+    scene = cloud(80, seed=16)
+    quats, scales = scene.quats.clone(), scene.scales.clone()
+    quats[3] = 0
+    scales[5] = 800.0
+    broken, view = replace(scene, quats=quats, scales=scales), camera(33, 20)
+    expected = ReferenceRasterizer(broken, background=BACKGROUND).render(colours_of(scene), view)
+    assert float((on_device(broken).render(colours_of(scene), view).cpu() - expected).abs().max()) < 1e-5
+
+
+def test_lists_beyond_the_budget_are_held_for_the_last_view_only() -> None:
+    scene, views = cloud(50), [camera(33, 20), camera(20, 33)]
+    rasterizer = on_device(scene, max_list_bytes=0)
+    first = rasterizer.lists(views[0])
+    assert rasterizer.lists(views[0]) is first
+    rasterizer.lists(views[1])
+    assert rasterizer.lists(views[0]) is not first
+
+
+def test_too_many_intersections_are_refused_before_they_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sgsst_core.rasterizer.raster_lists.MAX_INTERSECTIONS", 10)
+    with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
+        on_device(cloud(200)).lists(camera())
+
+
+def test_made_by_its_name() -> None:
+    assert make_rasterizer("triton", cloud(10), device=DEVICE).name == "triton"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_the_error_says_what_to_do() -> None:
+    with pytest.raises(SettingsError, match="PyTorch sees no GPU"):
+        make_rasterizer("triton", cloud(10))
+    code = (
+        "import torch\nfrom tests.sgsst_core.splat_scenes import cloud\n"
+        "from sgsst_core.rasterizer import make_rasterizer\nmake_rasterizer('triton', cloud(3), device='cpu')\n"
+    )
+    environment = {**os.environ, "TRITON_INTERPRET": "0"}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True)
+    assert "set TRITON_INTERPRET=1" in ended.stderr
+
+
+@pytest.mark.slow
+def test_kernels_compile_for_real_targets_within_their_registers() -> None:
+    """Spilled registers cost memory traffic in the innermost loop: none on NVIDIA, few on AMD."""
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    command = [sys.executable, "-m", "benchmarks.triton_targets"]
+    ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    lines = re.findall(r"^(\w+) +(\w+) +registers (\d+) +spilled (\d+)", ended.stdout, flags=re.M)
+    assert len(lines) == 5 * 4
+    for kernel, target, registers, spilled in lines:
+        assert int(registers) <= 256, (kernel, target)
+        assert int(spilled) <= (128 if target.startswith("gfx") else 0), (kernel, target)

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageColor
+
+from sgsst_core.errors import OutputError
+from sgsst_core.report.charts import write_loss_chart
+from sgsst_core.report.palette import COLOURS, INK
+from tests.sgsst_core.report.sample import sample_report
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def colours_in(path: Path) -> set[tuple[int, ...]]:
+    with Image.open(path) as image:
+        assert image.format == "PNG"
+        return {tuple(pixel) for pixel in np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0).tolist()}
+
+
+@pytest.mark.parametrize(("coarse", "sos", "scales"), [(0, 1, 1), (1, 0, 2), (3, 0, 2), (2, 2, 2), (40, 60, 3)])
+def test_the_picture_has_a_line_for_each_scale_that_was_stepped_on(
+    coarse: int, sos: int, scales: int, tmp_path: Path
+) -> None:
+    write_loss_chart(tmp_path / "c.png", sample_report(coarse, sos, scales))
+    found = colours_in(tmp_path / "c.png")
+    there = range(scales) if sos else [scales - 1]
+    for place, colour in enumerate(COLOURS):
+        assert (ImageColor.getrgb(colour) in found) == (place in there), f"scale {place}"
+
+
+def test_the_picture_of_no_step_has_axes_alone(tmp_path: Path) -> None:
+    write_loss_chart(tmp_path / "c.png", sample_report(0, 0))
+    found = colours_in(tmp_path / "c.png")
+    assert ImageColor.getrgb(INK) in found
+    assert not found & {ImageColor.getrgb(colour) for colour in COLOURS}
+
+
+def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        write_loss_chart(tmp_path / "missing" / "c.png", sample_report())
+    assert list(tmp_path.iterdir()) == []
