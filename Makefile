@@ -5,17 +5,30 @@ DEMO ?= demo
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint docs clean
+# Tests run in processes of one thread each, which on small work get further than one process of several threads.
+# A file's tests share what they start, and so a process. The folders' order has the long files first.
+TEST_PROCESSES ?= 2
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
+
+.PHONY: demo test test-all test-slow lint docs clean
 
 # Stylize the built-in scene and say where the results are.
 demo: $(VENV)/installed
 	$(BIN)/sgsst weights fetch vgg16
 	$(BIN)/sgsst demo --out $(DEMO)
 
-# Layout, lint, types and all tests.
+# Layout, lint, types, and the tests that are not slow by nature.
 test: lint
 	$(BIN)/sgsst weights fetch vgg16
-	$(BIN)/pytest
+	$(PYTEST) -m "not slow"
+
+# What `test` leaves out: kills, chains of requests, whole runs, the wheel.
+test-slow: $(VENV)/installed-dev
+	$(BIN)/sgsst weights fetch vgg16
+	$(PYTEST) -m slow
+
+test-all: test
+	$(MAKE) test-slow
 
 # Layout, lint, types, and the directions of imports.
 lint: $(VENV)/installed-dev

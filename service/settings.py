@@ -101,6 +101,11 @@ class ServiceSettings(BaseSettings):
         return self.artifacts or f"file://{self.folder / 'artifacts'}"
 
     @property
+    def retention_seconds(self) -> float:
+        """`retention_days`, in seconds."""
+        return self.retention_days * 86_400.0
+
+    @property
     def on_loopback(self) -> bool:
         """Whether only programs of this machine can reach the API."""
         return self.host in ("localhost", "::1") or self.host.startswith("127.")

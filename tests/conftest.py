@@ -10,6 +10,7 @@ import torch
 
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import BackboneWeights, fetch_weights, load_weights
+from tests import networks
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -39,3 +40,23 @@ def vgg16_weights() -> BackboneWeights:
         return load_weights("vgg16")
     except WeightsError as error:
         pytest.fail(f"the tests need VGG16: {error}")
+
+
+@pytest.fixture(scope="session")
+def tiny_weights() -> BackboneWeights:
+    """A network of VGG16's layers with 16 channels each: where one computation is compared with another one."""
+    return networks.tiny_weights()
+
+
+@pytest.fixture(scope="session")
+def tiny_cache(vgg16_weights: BackboneWeights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache folder with the tiny network as vgg16, for `SGSST_CACHE` of other processes. Not to be changed."""
+    return networks.install_tiny_weights(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def tiny_installed(tiny_cache: Path) -> Iterator[Path]:
+    """The tiny network is what is installed: for the command in this process, and processes that it starts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SGSST_CACHE", str(tiny_cache))
+        yield tiny_cache

@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
-from api.cli import service_commands
+from api.cli import client_commands, operator_commands
 from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_options
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
@@ -57,7 +57,8 @@ weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_hel
 app.add_typer(weights_app, name="weights")
 bench_app = typer.Typer(help="Measurements to repeat on your own scene and machine.", no_args_is_help=True)
 app.add_typer(bench_app, name="bench")
-service_commands.add_to(app)
+operator_commands.add_to(app)
+client_commands.add_to(app)
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
@@ -249,7 +250,7 @@ def plan(
     options: StylizeOptions,
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
-    from api.cli.jobs import make_plan
+    from api.cli.scene_tools import make_plan
     from worker.request import SceneRequest
 
     settings = options.settings()
@@ -280,7 +281,7 @@ def check(
     options: ViewOptions,
 ) -> None:
     """Tell what is extreme in a scene, its views and its style, and what is done about it."""
-    from api.cli.jobs import look_for_extremes
+    from api.cli.scene_tools import look_for_extremes
     from worker.request import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
@@ -307,7 +308,7 @@ def render(
     chosen: StylizeOptions,
 ) -> None:
     """Render the views of a scene."""
-    from api.cli.jobs import render_views
+    from api.cli.scene_tools import render_views
     from worker.request import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)

@@ -28,56 +28,56 @@ class Connection(HttpToolsProtocol):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._in_head, self._head_bytes, self._turns = True, 0, 0
+        self._in_head, self._head_bytes, self._messages_seen = True, 0, 0
         self._head_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """The time of the first head begins."""
         super().connection_made(transport)
-        self._start()
+        self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Nothing is waited for any more."""
-        self._stop()
+        self._stop_timer()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Take bytes in, as long as a head that they belong to may still grow."""
-        turns = self._turns
+        seen = self._messages_seen
         super().data_received(data)
-        if not self._in_head or self._turns != turns or self.transport.is_closing():
+        if not self._in_head or self._messages_seen != seen or self.transport.is_closing():
             return  # all or some of it was no part of a head that is still open
         self._head_bytes += len(data)
         if self._head_bytes > MAX_HEAD_BYTES:
             self._refuse(HeadTooLargeError(f"The request's line and headers have more than {MAX_HEAD_BYTES:,} bytes."))
         elif self._head_timer is None:
-            self._start()
+            self._start_timer()
 
     def on_headers_complete(self) -> None:
         """The head is whole."""
         self._in_head, self._head_bytes = False, 0
-        self._turns += 1
-        self._stop()
+        self._messages_seen += 1
+        self._stop_timer()
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
         """What comes from now on is the next head."""
         self._in_head = True
-        self._turns += 1
+        self._messages_seen += 1
         super().on_message_complete()
 
-    def _start(self) -> None:
-        self._head_timer = self.loop.call_later(self.head_seconds, self._late)
+    def _start_timer(self) -> None:
+        self._head_timer = self.loop.call_later(self.head_seconds, self._close_late)
 
-    def _stop(self) -> None:
+    def _stop_timer(self) -> None:
         if self._head_timer is not None:
             self._head_timer.cancel()
             self._head_timer = None
 
-    def _late(self) -> None:
+    def _close_late(self) -> None:
         self._head_timer = None
         if self.cycle is not None and not self.cycle.response_complete:
-            self._start()  # an answer is still on its way to the same client
+            self._start_timer()  # an answer is still on its way to the same client
         elif not self.transport.is_closing():
             self.transport.close()
 

@@ -13,7 +13,7 @@ from pydantic_core import to_jsonable_python
 
 from api.http.schemas import utc
 from service.store import Store
-from service.store.jobs import FINISHED
+from service.store.states import ENDED
 from service.store.tables import EventRow
 
 #: Seconds between two looks into the store; a watcher learns of an event after half of it on average.
@@ -22,7 +22,6 @@ _POLL_SECONDS = 0.3
 _HEARTBEAT_SECONDS = 15.0
 #: Events of a watched job that are kept for its watchers; who is farther behind reads the store.
 _KEPT = 300
-_ENDED = (*FINISHED, "expired")
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +74,7 @@ class Hub:
         if last is None or last > after:
             return False
         rows = await asyncio.to_thread(self._store.jobs.events, job_id, last - 1, 1)
-        return bool(rows) and _item(rows[0]).ends
+        return bool(rows) and _to_item(rows[0]).ends
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
         """Events of a job after one, as text, until the job has ended."""
@@ -87,7 +86,7 @@ class Hub:
             yield b"retry: 2000\n\n"
             while not self._closing.is_set() and not channel.gone:
                 changed = channel.changed
-                items = await self._after(job_id, channel, after)
+                items = await self._events_after(job_id, channel, after)
                 for item in items:
                     yield item.text
                     after = item.id
@@ -104,11 +103,11 @@ class Hub:
             if not channel.watchers:
                 self._channels.pop(job_id, None)
 
-    async def _after(self, job_id: str, channel: _Channel, after: int) -> list[Item]:
+    async def _events_after(self, job_id: str, channel: _Channel, after: int) -> list[Item]:
         if channel.last and after >= channel.base:
             return [item for item in channel.items if item.id > after]
         rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
-        return [_item(row) for row in rows]
+        return [_to_item(row) for row in rows]
 
     async def _poll(self) -> None:
         while True:
@@ -116,39 +115,39 @@ class Hub:
             if not self._channels:
                 continue
             try:
-                await self._look()
+                await self._read_new_events()
             except Exception:  # the store is away: watchers wait, and hear of it when it is back
                 _log.exception("events could not be read")
 
-    async def _look(self) -> None:
+    async def _read_new_events(self) -> None:
         watched = dict(self._channels)
         newest = await asyncio.to_thread(self._store.jobs.last_events, list(watched))
         for job_id, channel in watched.items():
             number = newest.get(job_id)
             if number is None:  # the job was deleted
                 channel.gone = True
-                _wake(channel)
+                _wake_watchers(channel)
                 continue
             if not channel.last:
                 channel.base = channel.last = number
-                _wake(channel)
+                _wake_watchers(channel)
             elif number > channel.last:
                 rows = await asyncio.to_thread(self._store.jobs.events, job_id, channel.last)
-                channel.items.extend(_item(row) for row in rows)
+                channel.items.extend(_to_item(row) for row in rows)
                 channel.last = rows[-1].id if rows else channel.last
                 while len(channel.items) > _KEPT:
                     channel.base = channel.items.popleft().id
-                _wake(channel)
+                _wake_watchers(channel)
 
 
-def _wake(channel: _Channel) -> None:
+def _wake_watchers(channel: _Channel) -> None:
     changed, channel.changed = channel.changed, asyncio.Event()
     changed.set()
 
 
-def _item(row: EventRow) -> Item:
+def _to_item(row: EventRow) -> Item:
     data = row.data
     if row.kind == "progress":  # as the job's own view says it
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
     text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
-    return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in _ENDED)
+    return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in ENDED)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.files.artifacts import media_type
 from service.parameters import JobParameters
-from service.store.jobs import UNFINISHED
+from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 
-StatusName = Literal["queued", "starting", "running", "canceling", "succeeded", "failed", "canceled", "expired"]
-
+if TYPE_CHECKING:
+    StatusName = str
+    OutcomeName = str
+else:  # named where they stand in the OpenAPI document, which makes a schema of its own of every enumeration
+    StatusName = Literal[tuple(map(str, JobStatus))]
+    OutcomeName = Literal[tuple(map(str, AttemptOutcome))]
 
 #: Of the examples, which tell of one job.
 JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
@@ -22,12 +26,12 @@ SHA256 = "3158b524aebf9351a4de9039a6b9b799cfc0452d9cec424a9f867085d0a9a7b5"
 _CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
 
 
-def _shown(**example: Any) -> ConfigDict:
+def _with_example(**example: Any) -> ConfigDict:
     """An example for the OpenAPI document."""
     return ConfigDict(json_schema_extra={"examples": [example]})
 
 
-def _example(model: type[BaseModel]) -> dict[str, Any]:
+def _example_of(model: type[BaseModel]) -> dict[str, Any]:
     """The example of a model, as a part of another's."""
     extra = model.model_config["json_schema_extra"]
     assert isinstance(extra, dict)
@@ -51,7 +55,7 @@ class ErrorView(BaseModel):
 class ProgressView(BaseModel):
     """How far a job is."""
 
-    model_config = _shown(
+    model_config = _with_example(
         stage="sos",
         step=120,
         total=300,
@@ -77,7 +81,7 @@ class ProgressView(BaseModel):
 class InputView(BaseModel):
     """A file that a job was created from."""
 
-    model_config = _shown(role="scene", name="scene.ply", size=42301, sha256=SHA256)
+    model_config = _with_example(role="scene", name="scene.ply", size=42301, sha256=SHA256)
 
     role: Literal["scene", "style", "cameras", "photos"]
     name: str
@@ -88,12 +92,12 @@ class InputView(BaseModel):
 class AttemptView(BaseModel):
     """One attempt at a job."""
 
-    model_config = _shown(number=1, started_at=_STARTED, finished_at=None, outcome=None, error=None)
+    model_config = _with_example(number=1, started_at=_STARTED, finished_at=None, outcome=None, error=None)
 
     number: int
     started_at: datetime
     finished_at: datetime | None
-    outcome: Literal["succeeded", "failed", "canceled", "released", "lost"] | None = Field(
+    outcome: OutcomeName | None = Field(
         description="`lost`: its dispatcher was not heard of again; `released`: it shut down and put the job back."
     )
     error: ErrorView | None
@@ -102,7 +106,7 @@ class AttemptView(BaseModel):
 class Links(BaseModel):
     """Where to go on."""
 
-    model_config = _shown(
+    model_config = _with_example(
         self=f"/v1/jobs/{JOB_ID}",
         events=f"/v1/jobs/{JOB_ID}/events",
         artifacts=f"/v1/jobs/{JOB_ID}/artifacts",
@@ -118,7 +122,7 @@ class Links(BaseModel):
 class JobView(BaseModel):
     """A job."""
 
-    model_config = _shown(
+    model_config = _with_example(
         id=JOB_ID,
         name="plush",
         status="running",
@@ -128,15 +132,15 @@ class JobView(BaseModel):
         expires_at=None,
         attempt=1,
         queue_position=None,
-        progress=_example(ProgressView),
+        progress=_example_of(ProgressView),
         result=None,
         error=None,
         parameters={"name": "plush", "preset": "standard"},
         inputs=[
-            _example(InputView),
+            _example_of(InputView),
             {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]},
         ],
-        links=_example(Links),
+        links=_example_of(Links),
     )
 
     id: str
@@ -162,7 +166,7 @@ class JobView(BaseModel):
 class JobDetail(JobView):
     """A job with its attempts."""
 
-    model_config = _shown(**_example(JobView), attempts=[_example(AttemptView)])
+    model_config = _with_example(**_example_of(JobView), attempts=[_example_of(AttemptView)])
 
     attempts: list[AttemptView]
 
@@ -170,7 +174,7 @@ class JobDetail(JobView):
 class JobPage(BaseModel):
     """A page of jobs, the newest first."""
 
-    model_config = _shown(jobs=[_example(JobView)], next_cursor=JOB_ID)
+    model_config = _with_example(jobs=[_example_of(JobView)], next_cursor=JOB_ID)
 
     jobs: list[JobView]
     next_cursor: str | None = Field(description="For the next page; null on the last one.")
@@ -179,7 +183,7 @@ class JobPage(BaseModel):
 class ArtifactView(BaseModel):
     """A file that a job has made."""
 
-    model_config = _shown(
+    model_config = _with_example(
         name="stylized.ply",
         size=42301,
         sha256=SHA256,
@@ -199,7 +203,7 @@ class ArtifactView(BaseModel):
 class ArtifactList(BaseModel):
     """All files that a job has made so far."""
 
-    model_config = _shown(artifacts=[_example(ArtifactView)])
+    model_config = _with_example(artifacts=[_example_of(ArtifactView)])
 
     artifacts: list[ArtifactView]
 
@@ -207,7 +211,7 @@ class ArtifactList(BaseModel):
 class UploadView(BaseModel):
     """A file that arrives in parts."""
 
-    model_config = _shown(
+    model_config = _with_example(
         id=UPLOAD_ID,
         filename="scene.ply",
         length=42301,
@@ -229,7 +233,7 @@ class UploadView(BaseModel):
 class PlanView(BaseModel):
     """What a job would do; nothing was queued."""
 
-    model_config = _shown(
+    model_config = _with_example(
         gaussians=616,
         dropped=0,
         sh_degree=0,
@@ -271,7 +275,9 @@ class PlanView(BaseModel):
 class Health(BaseModel):
     """Whether the service can do its work."""
 
-    model_config = _shown(status="ok", checks={"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "1"})
+    model_config = _with_example(
+        status="ok", checks={"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "1"}
+    )
 
     status: Literal["ok", "waiting", "unavailable"] = Field(
         description="`waiting`: jobs are taken in, but nobody is there to run them yet."
@@ -287,7 +293,7 @@ def utc(seconds: float) -> datetime:
     return datetime.fromtimestamp(seconds, UTC)
 
 
-def _maybe(seconds: float | None) -> datetime | None:
+def _utc_or_none(seconds: float | None) -> datetime | None:
     return None if seconds is None else utc(seconds)
 
 
@@ -302,7 +308,7 @@ def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRo
         AttemptView(
             number=row.number,
             started_at=utc(row.started_at),
-            finished_at=_maybe(row.finished_at),
+            finished_at=_utc_or_none(row.finished_at),
             outcome=row.outcome,
             error=ErrorView(**row.error) if row.error else None,
         )
@@ -319,9 +325,9 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
         "name": job.name,
         "status": job.status,
         "created_at": utc(job.created_at),
-        "started_at": _maybe(job.started_at),
-        "finished_at": _maybe(job.finished_at),
-        "expires_at": _maybe(job.expires_at),
+        "started_at": _utc_or_none(job.started_at),
+        "finished_at": _utc_or_none(job.finished_at),
+        "expires_at": _utc_or_none(job.expires_at),
         "attempt": job.attempt,
         "queue_position": queue_position,
         "progress": ProgressView(**{**progress, "updated_at": utc(progress["updated_at"])}) if progress else None,
@@ -333,7 +339,7 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
             self=here,
             events=f"{here}/events",
             artifacts=f"{here}/artifacts",
-            result=f"{here}/artifacts/stylized.ply" if job.status == "succeeded" else None,
+            result=f"{here}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
         ),
     }
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from service.store.jobs import Published
+from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 
 _CHUNK = 1 << 20

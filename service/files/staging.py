@@ -33,7 +33,7 @@ def clean_name(role: str, name: str, number: int) -> str:
     Photos keep their folders, since cameras may name them; other files keep the last part only.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
-    plain = [_shortened(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
+    plain = [_last_bytes(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
     kept = [part if not part.startswith(".") else f"_{part[1:]}" for part in plain if part]
     if role != "photos":
         kept = kept[-1:]
@@ -41,7 +41,7 @@ def clean_name(role: str, name: str, number: int) -> str:
     return "/".join(kept[-_MAX_DEPTH:]) or fallback
 
 
-def _shortened(part: str) -> str:
+def _last_bytes(part: str) -> str:
     return part.encode()[-_MAX_NAME:].decode(errors="ignore")
 
 
@@ -72,13 +72,15 @@ def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool) -> None:
         )
     _check_camera_files([entry["name"] for entry in found["cameras"]])
     names = [(entry["role"], entry["name"].lower()) for entry in inputs]
-    twice = next((name for name in names if names.count(name) > 1), None) if len(names) < 50 else _twice(names)
+    twice = (
+        next((name for name in names if names.count(name) > 1), None) if len(names) < 50 else _first_duplicate(names)
+    )
     if twice:
         raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}.", "invalid-request")
     _check_folders(found["photos"])
 
 
-def _twice(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None:
+def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None:
     seen: set[tuple[str, str]] = set()
     for name in names:
         if name in seen:

@@ -22,7 +22,9 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
 
-#: Raised when checks change, so that what older ones found does not count.
+#: What is wanted of the inspecting process: prove that a job's inputs can be used, or plan the job as well.
+Work = Literal["validate", "plan"]
+#: Raised when validation changes, so that what older ones found does not count.
 _VERSION = "1"
 #: Requests that wait for the inspecting process at most; more are told to come back.
 _MAX_WAITING = 64
@@ -96,12 +98,12 @@ class InspectionProcess:
 
 
 class Inspector:
-    """Checks of whole jobs, each made once for the same files and parameters."""
+    """Validates and plans whole jobs, once for the same files and parameters."""
 
     def __init__(self, settings: ServiceSettings, store: Store) -> None:
         self._settings = settings
         self._store = store
-        self._checks, self._plans = InspectionProcess(), InspectionProcess()
+        self._validating, self._planning = InspectionProcess(), InspectionProcess()
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
         for left in self._folder.iterdir():  # by a process that was killed
@@ -115,7 +117,7 @@ class Inspector:
         }
 
     def recall(
-        self, work: Literal["check", "plan"], inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
+        self, work: Work, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
     ) -> dict[str, Any] | None:
         """What `inspect` found in the same files before; None where they are new.
 
@@ -123,11 +125,11 @@ class Inspector:
             RefusedInputError: they were found to be of no use.
         """
         known = self._store.inputs.inspection(self._key(work, inputs, parameters))
-        return None if known is None else _found(known)
+        return None if known is None else _found_or_refused(known)
 
     async def inspect(
         self,
-        work: Literal["check", "plan"],
+        work: Work,
         inputs: Sequence[Mapping[str, Any]],
         blobs: Mapping[str, Path],
         parameters: JobParameters,
@@ -141,22 +143,22 @@ class Inspector:
         recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
         if recalled is not None:
             return recalled
-        answer = await self._look(work, inputs, blobs, parameters)
+        answer = await self._ask_process(work, inputs, blobs, parameters)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
         if not passing:  # another day it may be otherwise
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
-        return _found(answer)
+        return _found_or_refused(answer)
 
-    async def _look(
+    async def _ask_process(
         self,
         work: str,
         inputs: Sequence[Mapping[str, Any]],
         blobs: Mapping[str, Path],
         parameters: JobParameters,
     ) -> dict[str, Any]:
-        seconds = self._settings.inspection_seconds if work == "check" else self._settings.dry_run_seconds
-        process = self._checks if work == "check" else self._plans
+        seconds = self._settings.inspection_seconds if work == "validate" else self._settings.dry_run_seconds
+        process = self._validating if work == "validate" else self._planning
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             staged = await asyncio.to_thread(stage, Path(folder), inputs, blobs)
             return await process.ask(
@@ -179,11 +181,11 @@ class Inspector:
 
     async def close(self) -> None:
         """End both processes."""
-        await self._checks.close()
-        await self._plans.close()
+        await self._validating.close()
+        await self._planning.close()
 
 
-def _found(answer: Mapping[str, Any]) -> dict[str, Any]:
+def _found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
     """What the process found; raises RefusedInputError where that is an error."""
     if "error" in answer:
         error = answer["error"]

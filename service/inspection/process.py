@@ -44,7 +44,7 @@ class RefusedError(Exception):
         self.code = code
 
 
-def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
+def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
     """Read every input of a job as the job would; nothing is rendered.
 
     Returns:
@@ -56,9 +56,9 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
     settings = parameters.settings()
     if not settings.steps_coarse + settings.steps_sos:
         raise RefusedError("invalid-settings", "Both numbers of steps are 0, so that nothing would change. Give some.")
-    _check_weights(parameters.backbone)
+    _check_network_weights(parameters.backbone)
     found: dict[str, Any] = {}
-    with _Part("scene"):
+    with _ErrorsOf("scene"):
         header = read_header(staged.scene)
         element_offsets(staged.scene, header)
         declared = header.vertex.count if "vertex" in header.names else 0
@@ -68,14 +68,14 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
             )
         file = read_scene(staged.scene, drop_invalid=parameters.drop_invalid)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
-    with _Part("style"):
-        _check_pixels(staged.style, limits)
+    with _ErrorsOf("style"):
+        _check_pixel_count(staged.style, limits)
         image = load_image(staged.style)
         found["style"] = [image.shape[1], image.shape[0]]
-    with _Part("cameras"):
+    with _ErrorsOf("cameras"):
         source = scene_request(staged, parameters)
         if source.cameras is not None:
-            _check_sizes(source.cameras)
+            _check_frames_have_sizes(source.cameras)
         cameras = fit_cameras(read_cameras_of(source, file.scene), settings)
         if len(cameras) > limits["views"]:
             raise RefusedError("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
@@ -84,18 +84,18 @@ def check(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> 
             raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
         _check_something_seen(file.scene, cameras, parameters.near)
         found |= {"views": len(cameras), "pixels": pixels}
-    with _Part("photos"):
+    with _ErrorsOf("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
         for path in paths:
-            _check_pixels(path, limits)
+            _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
     return found
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
-    """What a job would do: what `check` finds, and the plan of `sgsst plan`."""
-    found = check(staged, parameters, limits)
+    """What a job would do: what `validate` finds, and the plan of `sgsst plan`."""
+    found = validate(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     scene = read_scene(staged.scene, drop_invalid=parameters.drop_invalid).scene
     cameras = fit_cameras(read_cameras_of(request.source, scene), request.settings)
@@ -109,10 +109,13 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     return {**found, "plan": plan_json(made), "estimated_seconds": seconds, "memory_bytes": memory}
 
 
-WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {"check": check, "plan": plan}
+WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {
+    "validate": validate,
+    "plan": plan,
+}
 
 
-class _Part:
+class _ErrorsOf:
     """Marks errors with the part of the request that they are about."""
 
     def __init__(self, name: str) -> None:
@@ -126,14 +129,14 @@ class _Part:
             error.part = self._name  # type: ignore[attr-defined]
 
 
-def _check_weights(backbone: str) -> None:
+def _check_network_weights(backbone: str) -> None:
     installed = [entry.name for entry in list_weights() if entry.path]
     wanted = [name for name in ("vgg19", "vgg16") if backbone in ("auto", name)]
     if not any(name in installed for name in wanted):
         raise WeightsError(f"The service has no weights of {' or '.join(wanted)}: its operator has to fetch them.")
 
 
-def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
+def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
     width, height = image_size(path)
     if width * height > limits["image_pixels"]:
         raise RefusedError(
@@ -141,7 +144,7 @@ def _check_pixels(path: Path, limits: dict[str, Any]) -> None:
         )
 
 
-def _check_sizes(path: Path) -> None:
+def _check_frames_have_sizes(path: Path) -> None:
     """Refuse frames of a transforms.json that leave their size to an image: its path may lead anywhere on this machine,
     and the answer would tell what is there.
     """
@@ -179,7 +182,7 @@ def _check_something_seen(scene: Scene, cameras: Sequence[Camera], near: float) 
 # --- one request in a child ----------------------------------------------------------------------------------------
 
 
-def _answer(request: dict[str, Any]) -> dict[str, Any]:
+def _inspect(request: dict[str, Any]) -> dict[str, Any]:
     """What a child writes: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
@@ -203,7 +206,7 @@ def _refusal(code: str, message: str, part: str | None) -> dict[str, Any]:
     return {"error": {"code": code, "message": message.removeprefix(f"{part}/"), "input": part}}
 
 
-def _limit(seconds: float, size: int) -> None:
+def _limit_resources(seconds: float, size: int) -> None:
     own = psutil.Process().memory_info().vms
     resource.setrlimit(resource.RLIMIT_AS, (own + size, own + size))
     cpu = max(1, int(seconds))
@@ -211,7 +214,7 @@ def _limit(seconds: float, size: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _in_child(request: dict[str, Any]) -> bytes:
+def _inspect_in_child(request: dict[str, Any]) -> bytes:
     """Fork, limit, answer; what the child has to say comes through a pipe. A child that says nothing hit a limit."""
     reading, writing = os.pipe()
     child = os.fork()
@@ -219,26 +222,26 @@ def _in_child(request: dict[str, Any]) -> bytes:
         os.close(reading)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         try:
-            _limit(request["seconds"], request["bytes"])
+            _limit_resources(request["seconds"], request["bytes"])
             with os.fdopen(writing, "wb") as file:
-                file.write(json.dumps(_answer(request)).encode())
+                file.write(json.dumps(_inspect(request)).encode())
         finally:
             os._exit(0)
     os.close(writing)
-    said = _read(reading, time.monotonic() + 2 * request["seconds"])
+    answer = _read_to_end(reading, time.monotonic() + 2 * request["seconds"])
     os.close(reading)
-    if said is None:
+    if answer is None:
         os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     try:
-        json.loads(said or b"")
+        json.loads(answer or b"")
     except ValueError:
         limit = "Reading the files takes more time or memory than allowed, or breaks their reader."
         return json.dumps(_refusal("inspection-limit", limit, None)).encode()
-    return said or b""
+    return answer or b""
 
 
-def _read(descriptor: int, deadline: float) -> bytes | None:
+def _read_to_end(descriptor: int, deadline: float) -> bytes | None:
     """All that comes until the other end closes; None where it is still open at the deadline."""
     parts: list[bytes] = []
     while (left := deadline - time.monotonic()) > 0:
@@ -257,7 +260,7 @@ def main() -> None:
 
     die_with_parent()
     for line in sys.stdin.buffer:
-        sys.stdout.buffer.write(_in_child(json.loads(line)) + b"\n")
+        sys.stdout.buffer.write(_inspect_in_child(json.loads(line)) + b"\n")
         sys.stdout.buffer.flush()
 
 

@@ -8,12 +8,10 @@ so neither a job nor Ray can take the dispatcher along.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 import shutil
 import signal
-import socket
 import threading
 import time
 from types import FrameType
@@ -24,15 +22,17 @@ from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.logs import set_up
+from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
-from service.scheduling.running import RunningAttempt, sweep
+from service.scheduling.publishing import sweep
+from service.scheduling.running import RunningAttempt
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.jobs import DAY, Lease
+from service.store.leases import Lease
+from service.store.states import JobStatus
 from service.store.tables import JobRow
-from worker.processes import ProcessId, home
 
 #: Seconds between two looks for what has expired or was left behind.
 _HOUSEKEEPING_SECONDS = 60.0
@@ -61,7 +61,7 @@ class Dispatcher:
         self._stop = threading.Event()
         self.name = own_name()
         self._work = settings.folder / "work" / self.name
-        self._renewed_at = self._kept_at = self._beat_at = float("-inf")
+        self._renewed_at = self._housekeeping_at = self._announced_at = float("-inf")
         self._deliverer = Deliverer(settings, store)
 
     def stop(self) -> None:
@@ -77,7 +77,7 @@ class Dispatcher:
         _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
         while not self._stop.is_set():
             try:
-                self._round()
+                self._work_once()
             except (SQLAlchemyError, OSError):  # the database is away or locked; leases run out if it stays so
                 _log.exception("the store cannot be reached")
                 self._abandon_expired()
@@ -88,31 +88,31 @@ class Dispatcher:
     def _take_over_from_the_dead(self) -> None:
         """Of dispatchers that ran on this machine and are gone, nothing needs to be waited for."""
         known = {row.name for row in self._store.operations.dispatchers()}
-        for name in sorted(known.union(self._store.jobs.lease_owners())):
+        for name in sorted(known.union(self._store.leases.holders())):
             if is_dead(name):
                 _log.info("dispatcher %s is gone; its jobs are taken over", name)
-                self._store.jobs.end_leases(name)
+                self._store.leases.run_out(name)
                 self._store.operations.gone(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():
                 if is_dead(path.name):
                     shutil.rmtree(path, ignore_errors=True)
 
-    def _round(self) -> None:
+    def _work_once(self) -> None:
         for job_id, attempt in list(self._running.items()):
             if not attempt.alive:
                 del self._running[job_id]
-        self._renew()
-        self._beat()
-        while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
-            self._start(*found)
-        if time.monotonic() - self._kept_at > _HOUSEKEEPING_SECONDS:
-            self._kept_at = time.monotonic()
+        self._renew_leases()
+        self._announce_alive()
+        while not self._stop.is_set() and (found := self.next_job(self._grants())) is not None:
+            self._start_attempt(*found)
+        if time.monotonic() - self._housekeeping_at > _HOUSEKEEPING_SECONDS:
+            self._housekeeping_at = time.monotonic()
             self._keep_house()
 
     # --- room ------------------------------------------------------------------------------------------------------
 
-    def _held(self) -> list[Grant]:
+    def _grants(self) -> list[Grant]:
         return [attempt.grant for attempt in self._running.values()]
 
     def next_job(self, held: list[Grant]) -> tuple[Lease, Grant] | None:
@@ -121,7 +121,7 @@ class Dispatcher:
         Args:
             held: what running jobs have.
         """
-        if not (waiting := self._store.jobs.waiting()):
+        if not (waiting := self._store.leases.waiting()):
             return None
         share = -(-waiting // max(1, len(self._store.operations.dispatchers())))  # others take their part of the queue
         grant: Grant | None = None
@@ -131,10 +131,10 @@ class Dispatcher:
             grant = self._room.grant(job, held, share)
             return grant is not None
 
-        lease = self._store.jobs.lease(self.name, fits)
+        lease = self._store.leases.take(self.name, fits)
         return (lease, grant) if lease is not None and grant is not None else None
 
-    def _start(self, lease: Lease, grant: Grant) -> None:
+    def _start_attempt(self, lease: Lease, grant: Grant) -> None:
         folder = self._work / f"{lease.job_id}-{lease.epoch}"
         attempt = RunningAttempt(
             lease, grant, folder, self._store, self._blobs, self._artifacts, self._settings, self._machine.cluster
@@ -144,28 +144,28 @@ class Dispatcher:
 
     # --- leases ----------------------------------------------------------------------------------------------------
 
-    def _beat(self) -> None:
+    def _announce_alive(self) -> None:
         """Let everybody know that this dispatcher is alive."""
-        if time.monotonic() - self._beat_at >= _RENEW_SHARE * self._settings.lease_seconds:
-            self._store.operations.beat(self.name, self._room.size, self._room.free(self._held()))
-            self._beat_at = time.monotonic()
+        if time.monotonic() - self._announced_at >= _RENEW_SHARE * self._settings.lease_seconds:
+            self._store.operations.beat(self.name, self._room.size, self._room.free(self._grants()))
+            self._announced_at = time.monotonic()
 
-    def _renew(self) -> None:
+    def _renew_leases(self) -> None:
         """Hold the leases of all running attempts, and see which of their jobs are to be canceled or are lost."""
         if not self._running:
             self._renewed_at = time.monotonic()
             return
         leases = [attempt.lease for attempt in self._running.values()]
         if time.monotonic() - self._renewed_at >= _RENEW_SHARE * self._settings.lease_seconds:
-            found = self._store.jobs.renew(leases)
+            found = self._store.leases.renew(leases)
             self._renewed_at = time.monotonic()
         else:
-            found = self._store.jobs.look(leases)
+            found = self._store.leases.statuses(leases)
         for job_id, status in found.items():
             attempt = self._running[job_id]
             if status is None and attempt.alive:
                 attempt.abandon()
-            elif status == "canceling":
+            elif status == JobStatus.CANCELING:
                 attempt.cancel()
 
     def _abandon_expired(self) -> None:
@@ -182,7 +182,7 @@ class Dispatcher:
             self._store.operations.gone(self.name)
         while any(attempt.alive for attempt in self._running.values()):
             with contextlib.suppress(SQLAlchemyError, LeaseLostError):
-                self._renew()
+                self._renew_leases()
             time.sleep(0.2)
         self._deliverer.stop()
         shutil.rmtree(self._work, ignore_errors=True)
@@ -191,31 +191,13 @@ class Dispatcher:
 
     def _keep_house(self) -> None:
         try:
-            for job_id in self._store.jobs.expire(self._settings.retention_days * DAY):
+            for job_id in self._store.retention.expire():
                 self._artifacts.remove_job(job_id)
-            for job_id, epoch in self._store.jobs.unswept(_SWEEPS):
-                sweep(self._store.jobs, self._artifacts, job_id, epoch)
+            for job_id, epoch in self._store.retention.unswept(_SWEEPS):
+                sweep(self._store, self._artifacts, job_id, epoch)
             self._blobs.collect()
         except Exception:  # stores of files raise what they like; running jobs are not to suffer
             _log.exception("not everything that is no longer needed could be removed; this is tried again")
-
-
-def own_name() -> str:
-    """Names this process for good: where it runs, its number there, and when it started."""
-    own = ProcessId.of_this()
-    return f"{socket.gethostname()[:40]}-{_home()}-{own.number}-{int(own.started)}"
-
-
-def is_dead(name: str) -> bool:
-    """Whether a dispatcher of that name ran where this process can see it, and is gone."""
-    parts = name.rsplit("-", 3)
-    if len(parts) != 4 or parts[1] != _home() or not (parts[2] + parts[3]).isdigit():
-        return False
-    return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
-
-
-def _home() -> str:
-    return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]
 
 
 def main() -> None:

@@ -8,7 +8,11 @@ from service.settings import ServiceSettings
 from service.store.database import Clock, Database
 from service.store.inputs import Inputs
 from service.store.jobs import Jobs
-from service.store.keys import Keys, Operations
+from service.store.keys import Keys
+from service.store.leases import Leases
+from service.store.operations import Operations
+from service.store.retention import Retention
+from service.store.retries import RetryPolicy
 
 
 class Store:
@@ -16,7 +20,10 @@ class Store:
 
     def __init__(self, settings: ServiceSettings, clock: Clock = time.time) -> None:
         self.database = Database(settings.database_url, clock)
-        self.jobs = Jobs(self.database, settings.lease_seconds, settings.max_attempts, settings.retry_seconds)
+        self.jobs = Jobs(self.database, settings.retention_seconds)
+        policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
+        self.leases = Leases(self.database, settings.lease_seconds, policy, settings.retention_seconds)
+        self.retention = Retention(self.database, settings.retention_seconds)
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, text
+from sqlalchemy import Connection, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
@@ -26,7 +26,7 @@ SCHEMA = "0003"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Seconds that a writer waits for another one's transaction. All are short.
 _BUSY_SECONDS = 30
-#: An Idempotency-Key is remembered for so long.
+#: An Idempotency-Key is idempotency_row for so long.
 IDEMPOTENCY_SECONDS = 86_400.0
 #: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
 _LOCK = 7_347_758
@@ -57,12 +57,12 @@ class Database:
             event.listen(self.engine, "begin", _begin)
         self._writer = self.engine.execution_options(sgsst_writes=True)
         # SQLite's writers wait by sleeping and asking again; those of one process need not
-        self._turn: AbstractContextManager[Any] = threading.Lock() if self.sqlite else nullcontext()
+        self._writer_lock: AbstractContextManager[Any] = threading.Lock() if self.sqlite else nullcontext()
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
         """A transaction that is committed at the end of the block; on SQLite it is the only writer from the start."""
-        with self._turn, Session(self._writer, expire_on_commit=False) as session, session.begin():
+        with self._writer_lock, Session(self._writer, expire_on_commit=False) as session, session.begin():
             yield session
 
     @contextmanager
@@ -72,7 +72,7 @@ class Database:
             yield session
 
     @contextmanager
-    def looking(self) -> Iterator[Connection]:
+    def reading_rows(self) -> Iterator[Connection]:
         """As `reading`, for plain rows: a third of the work, for what is asked hundreds of times a second."""
         with self.engine.connect() as connection:
             yield connection
@@ -149,7 +149,7 @@ def new_id(prefix: str, now: float) -> str:
     return f"{prefix}_{int(now * 1000):011x}{secrets.token_hex(10)}"
 
 
-def remembered(session: Session, owner: str, key: str, fingerprint: str, now: float) -> IdempotencyRow:
+def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, now: float) -> IdempotencyRow:
     """The row of an Idempotency-Key: with a `created_id` where it was used before, for that request.
 
     Raises:
@@ -170,12 +170,12 @@ def remembered(session: Session, owner: str, key: str, fingerprint: str, now: fl
 
 def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:
     """Add to a counter, within the transaction of what is counted."""
-    statement = _counting(session.get_bind().dialect.name)
+    statement = _add_statement(session.get_bind().dialect.name)
     session.execute(statement, {"name": name, "labels": labels, "value": amount})
 
 
 @cache
-def _counting(dialect: str) -> Any:
+def _add_statement(dialect: str) -> Any:
     table = Base.metadata.tables[CounterRow.__tablename__]
     insert = (sqlite.insert if dialect == "sqlite" else postgresql.insert)(table)
     added = table.c.value + insert.excluded.value
@@ -185,8 +185,3 @@ def _counting(dialect: str) -> Any:
 def upsert(session: Session) -> Any:
     """The `insert` that knows ON CONFLICT, of the database that the session is on."""
     return sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
-
-
-def create_all(engine: Engine) -> None:
-    """All tables at once, for comparing with what the migrations make."""
-    Base.metadata.create_all(engine)

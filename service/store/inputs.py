@@ -8,8 +8,8 @@ from typing import Any
 
 from sqlalchemy import bindparam, delete, exists, select, update
 
-from service.errors import ConflictError, NotFoundError
-from service.store.database import Database, new_id, remembered, upsert
+from service.errors import NotFoundError
+from service.store.database import Database, idempotency_row, new_id, upsert
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
@@ -67,7 +67,7 @@ class Inputs:
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Blobs by their digest, for a job that holds them."""
         found: dict[str, BlobRow] = {}
-        with self._database.looking() as connection:
+        with self._database.reading_rows() as connection:
             for start in range(0, len(digests), 500):
                 rows = connection.execute(_BLOBS, {"digests": digests[start : start + 500]})
                 found |= {row.sha256: BlobRow(**row._mapping) for row in rows}
@@ -95,23 +95,23 @@ class Inputs:
         """Begin an upload that expires when nothing has been heard of it for so many seconds."""
         now = self._database.clock()
         with self._database.writing() as session:
-            memory = None
+            used_key = None
             if idempotency_key is not None:
-                memory = remembered(
+                used_key = idempotency_row(
                     session,
                     owner,
                     f"upload:{idempotency_key}",
                     hashlib.sha256(f"{length} {header}".encode()).hexdigest(),
                     now,
                 )
-                known = session.get(UploadRow, memory.created_id) if memory.created_id else None
+                known = session.get(UploadRow, used_key.created_id) if used_key.created_id else None
                 if known is not None:
                     return known
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
             session.add(row)
-            if memory is not None:
-                memory.created_id = row.id
+            if used_key is not None:
+                used_key.created_id = row.id
         return row
 
     def upload(self, upload_id: str, owner: str) -> UploadRow:
@@ -130,7 +130,7 @@ class Inputs:
         """Uploads of this owner by their id; those that are not there or have expired are left out."""
         now = self._database.clock()
         found: dict[str, UploadRow] = {}
-        with self._database.looking() as connection:
+        with self._database.reading_rows() as connection:
             for start in range(0, len(upload_ids), 500):
                 wanted = {"ids": upload_ids[start : start + 500], "owner": owner, "now": now}
                 found |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, wanted)}
@@ -183,7 +183,7 @@ class Inputs:
 
     def inspection(self, key: str) -> dict[str, Any] | None:
         """What an earlier check of the same content found."""
-        with self._database.looking() as connection:
+        with self._database.reading_rows() as connection:
             found: dict[str, Any] | None = connection.execute(_INSPECTION, {"key": key}).scalar()
             return found
 
@@ -194,9 +194,3 @@ class Inputs:
             insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
             session.execute(insert.on_conflict_do_nothing())
             session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
-
-
-def ensure_unfinished(upload: UploadRow) -> None:
-    """Raise ConflictError for an upload that has all its bytes."""
-    if upload.sha256 is not None:
-        raise ConflictError(f"Upload {upload.id} is complete already.")

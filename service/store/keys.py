@@ -1,22 +1,18 @@
-"""API keys, dispatchers, counters, secrets and webhook messages in the store."""
+"""API keys in the store."""
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import secrets
 
-from sqlalchemy import bindparam, delete, func, select
+from sqlalchemy import bindparam, select
 
 from service.errors import NotFoundError
-from service.store.database import Database, new_id, upsert
-from service.store.tables import Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, KeyRow, SecretRow
+from service.store.database import Database, new_id
+from service.store.tables import Base, KeyRow
 
 #: What every key starts with, so that secret scanners can find one that got lost.
 KEY_PREFIX = "sgsst_"
-#: A dispatcher that was not heard of for so long is not coming back.
-_FORGET_SECONDS = 86_400.0
-
 
 _KEY = select(Base.metadata.tables["api_keys"]).where(KeyRow.sha256 == bindparam("sha256"))
 
@@ -61,89 +57,6 @@ class Keys:
 
     def find(self, text: str) -> KeyRow | None:
         """The key of this text, unless it is unknown or revoked."""
-        with self._database.looking() as connection:
+        with self._database.reading_rows() as connection:
             row = connection.execute(_KEY, {"sha256": digest(text)}).one_or_none()
         return KeyRow(**row._mapping) if row is not None and row.revoked_at is None else None
-
-
-class Operations:
-    """What monitoring and webhooks need."""
-
-    def __init__(self, database: Database, lease_seconds: float) -> None:
-        self._database = database
-        self._lease_seconds = lease_seconds
-
-    def beat(self, name: str, places: int, free: int) -> None:
-        """A dispatcher is alive, and has so much room; those that were not heard of for long are forgotten."""
-        now = self._database.clock()
-        values = {"seen_at": now, "places": places, "free": free}
-        with self._database.writing() as session:
-            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
-            insert = upsert(session)(DispatcherRow).values(name=name, **values)
-            session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))
-
-    def gone(self, name: str) -> None:
-        """A dispatcher has ended."""
-        with self._database.writing() as session:
-            session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
-
-    def dispatchers(self) -> list[DispatcherRow]:
-        """Those that are alive: heard of within a lease's time."""
-        since = self._database.clock() - self._lease_seconds
-        with self._database.reading() as session:
-            query = select(DispatcherRow).where(DispatcherRow.seen_at >= since).order_by(DispatcherRow.name)
-            return list(session.scalars(query))
-
-    def counters(self) -> list[tuple[str, str, float]]:
-        """Name, labels and value of every counter."""
-        with self._database.reading() as session:
-            rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
-        return [(row.name, row.labels, row.value) for row in rows]
-
-    def depths(self) -> dict[str, int]:
-        """Jobs by status."""
-        query = select(JobRow.status, func.count()).group_by(JobRow.status)
-        with self._database.reading() as session:
-            return dict(session.execute(query).tuples().all())
-
-    def oldest_queued(self) -> float:
-        """Seconds that the oldest queued job has waited; 0 where none waits."""
-        with self._database.reading() as session:
-            oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == "queued"))
-        return 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
-
-    def steps_and_seconds(self) -> list[tuple[int, float]]:
-        """Steps that each running job has made, and the seconds that they took."""
-        with self._database.reading() as session:
-            found = session.scalars(select(JobRow.progress).where(JobRow.status == "running")).all()
-        return [(progress["step"], progress["seconds"]) for progress in found if progress and progress.get("seconds")]
-
-    def webhook_secret(self) -> str:
-        """The secret that signs webhooks, in the form of Standard Webhooks; made at first use."""
-        made = "whsec_" + base64.b64encode(secrets.token_bytes(32)).decode()
-        with self._database.writing() as session:
-            insert = upsert(session)(SecretRow).values(name="webhooks", value=made)
-            session.execute(insert.on_conflict_do_nothing())
-            return session.get_one(SecretRow, "webhooks").value
-
-    def due_deliveries(self, hold_seconds: float) -> list[DeliveryRow]:
-        """Messages to be sent now; nobody else gets them for so many seconds."""
-        now = self._database.clock()
-        with self._database.writing() as session:
-            query = select(DeliveryRow).where(DeliveryRow.next_at <= now).order_by(DeliveryRow.next_at).limit(20)
-            rows = session.scalars(query.with_for_update(skip_locked=True)).all()
-            for row in rows:
-                row.tries += 1
-                row.next_at = now + hold_seconds
-            return list(rows)
-
-    def settle_delivery(self, delivery_id: str, next_at: float | None) -> None:
-        """A message was delivered or given up (None), or is to be tried again later."""
-        with self._database.writing() as session:
-            row = session.get(DeliveryRow, delivery_id, with_for_update=True)
-            if row is None:
-                return
-            if next_at is None:
-                session.delete(row)
-            else:
-                row.next_at = next_at

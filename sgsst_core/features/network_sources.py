@@ -59,7 +59,7 @@ PIP_TIMEOUT = 1800
 
 
 def convolution_shapes(name: str) -> dict[str, tuple[int, int]]:
-    """Convolutions of "vgg16" or "vgg19" in order: "conv1_1" to (output, input channels)."""
+    """Convolutions of "vgg16" or "vgg19" as published, in order: "conv1_1" to (output, input channels)."""
     shapes = {}
     channels = 3
     for block, count in enumerate(BLOCKS[name], start=1):
@@ -70,12 +70,24 @@ def convolution_shapes(name: str) -> dict[str, tuple[int, int]]:
     return shapes
 
 
-def expected_shapes(name: str) -> dict[str, tuple[int, ...]]:
-    """Every tensor of a converted file and its shape; name is "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16"."""
+def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """Every tensor of a converted file and its shape.
+
+    A VGG network may have other numbers of channels than the published one, as pruned and distilled networks do: each
+    layer takes as many as the layer before it has biases.
+
+    Args:
+        name: "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16".
+        tensors: those found, whose biases give a VGG network's channels.
+    """
     if name in BLOCKS:
         shapes: dict[str, tuple[int, ...]] = {"input_scale": (3,), "input_shift": (3,)}
-        for layer, (width, channels) in convolution_shapes(name).items():
+        channels = 3
+        for layer, (published, _) in convolution_shapes(name).items():
+            width = tensors[f"{layer}.bias"].numel() if f"{layer}.bias" in tensors else 0
+            width = width or published
             shapes |= {f"{layer}.weight": (width, channels, 3, 3), f"{layer}.bias": (width,)}
+            channels = width
         return shapes
     if name == "lpips_vgg16":
         return {f"linear{i}.weight": (c,) for i, c in enumerate((64, 128, 256, 512, 512), start=1)}
@@ -89,7 +101,7 @@ def expected_shapes(name: str) -> dict[str, tuple[int, ...]]:
 
 def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
     """Raise WeightsError unless the tensors are exactly those of `name`: names, shapes, float32, finite."""
-    expected = expected_shapes(name)
+    expected = expected_shapes(name, tensors)
     if tensors.keys() != expected.keys():
         odd = sorted(tensors.keys() ^ expected.keys())
         raise WeightsError(f"{where}: not the tensors of {name} (missing or unknown: {', '.join(odd[:4])})")

@@ -96,6 +96,7 @@ class FeatureNetwork:
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
         self._steps = self._build(weights)
+        self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
 
     def _build(self, weights: BackboneWeights) -> list[_Step]:
         steps: list[_Step] = []
@@ -122,7 +123,7 @@ class FeatureNetwork:
 
     def channels(self, layer: str) -> int:
         """Number of channels of a layer."""
-        return min(64 << (int(layer[4]) - 1), 512)
+        return self._channels[layer]
 
     @torch.no_grad()
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
@@ -217,5 +218,5 @@ class FeatureNetwork:
         return held
 
     def working_bytes_per_pixel(self) -> float:
-        """Bytes a pixel that a forward or backward pass needs beside what is held: two full-size 64-channel tensors."""
-        return 2 * 64 * torch.finfo(self.dtype).bits / 8
+        """Bytes a pixel that a forward or backward pass needs beside what is held: two tensors of relu1_1's size."""
+        return 2 * self.channels("relu1_1") * torch.finfo(self.dtype).bits / 8

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.errors import SettingsError
+from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import list_weights, load_perceptual, load_weights
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 
@@ -62,7 +62,7 @@ class Lpips:
 
     Raises:
         SettingsError: no such network.
-        WeightsError: the weights are missing or corrupt.
+        WeightsError: the weights are missing, corrupt, or of a VGG16 with other channels than the published one.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Lpips:
         tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(network, folder).items()}
         self._heads = [tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
         self._features: Callable[[Tensor], list[Tensor]] = (
-            _alexnet(tensors) if network == "alex" else _vgg16(folder, dtype, self.device)
+            _alexnet(tensors) if network == "alex" else _vgg16(self._heads, folder, dtype, self.device)
         )
 
     @torch.no_grad()
@@ -145,9 +145,15 @@ def _alexnet(tensors: dict[str, Tensor]) -> Callable[[Tensor], list[Tensor]]:
     return features
 
 
-def _vgg16(folder: Path | None, dtype: torch.dtype, device: torch.device) -> Callable[[Tensor], list[Tensor]]:
+def _vgg16(
+    heads: list[Tensor], folder: Path | None, dtype: torch.dtype, device: torch.device
+) -> Callable[[Tensor], list[Tensor]]:
     """VGG16's last ReLU of each block [h, w, c] as a function of pixels [H, W, 3]."""
     network = FeatureNetwork(load_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
+    if [network.channels(layer) for layer in _VGG16_LAYERS] != [len(head) for head in heads]:
+        raise WeightsError(
+            "LPIPS weighs the channels of the published VGG16, and the installed one has others: measure with alex."
+        )
 
     def features(rgb: Tensor) -> list[Tensor]:
         found = network.forward(rgb, keep=False).features

@@ -18,13 +18,12 @@ import psutil
 import pytest
 
 from api.client.client import AsyncClient, Client
-from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.ply import read_scene
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files
 
 #: Long enough to be killed in, and short enough for a test.
-STEPS = 120
+STEPS = 600
 PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "early_stop": False, "seed": 3}
 
 
@@ -35,7 +34,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, vgg16_weights: BackboneWeights) -> Iterator[Service]:
+def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
     with Service(tmp_path_factory.mktemp("service") / "data") as running:
         yield running
 
@@ -206,6 +205,7 @@ def test_a_queued_job_is_canceled_at_once(service: Service, files: dict[str, Pat
         assert [entry["id"] for entry in following.json()["jobs"]] == [first]
 
 
+@pytest.mark.slow
 def test_killed_processes_cost_time_and_nothing_else(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files)
@@ -228,6 +228,7 @@ def test_killed_processes_cost_time_and_nothing_else(service: Service, files: di
         assert len(places) == 1, "published twice"
 
 
+@pytest.mark.slow
 def test_stopping_saves_running_jobs_and_starting_goes_on(
     files: dict[str, Path], expected: bytes, tmp_path: Path
 ) -> None:

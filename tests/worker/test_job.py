@@ -17,7 +17,7 @@ from tests.worker.ranks.faults import Fault, small_request
 from worker.job import Job, Result, execute, prepare
 from worker.request import Resume, StylizeRequest
 
-pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
 
 def go_on(

@@ -126,7 +126,7 @@ def get_artifact(
     sent = _headers(row, tag, job.name)
     if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
         return Response(status_code=304, headers=sent)
-    span = _span(range_, row.size) if range_ and if_range in (None, tag) else None
+    span = _parse_range(range_, row.size) if range_ and if_range in (None, tag) else None
     start, stop = span or (0, row.size)
     sent["Content-Length"] = str(stop - start)
     if span:
@@ -155,7 +155,7 @@ def _headers(row: ArtifactRow, tag: str, job_name: str) -> dict[str, str]:
     return sent
 
 
-def _span(text: str, size: int) -> tuple[int, int] | None:
+def _parse_range(text: str, size: int) -> tuple[int, int] | None:
     """First byte and the one behind the last; None where the header asks for several ranges or makes no sense.
 
     Raises:

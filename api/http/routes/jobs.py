@@ -60,7 +60,7 @@ JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 _NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
 #: What can be done with a job.
-_NEXT = ("get_job", "cancel_job", "retry_job", "delete_job", "watch_job", "list_artifacts")
+_FOLLOWING_OPERATIONS = ("get_job", "cancel_job", "retry_job", "delete_job", "watch_job", "list_artifacts")
 
 
 @router.post(
@@ -73,7 +73,7 @@ _NEXT = ("get_job", "cancel_job", "retry_job", "delete_job", "watch_job", "list_
         202: {
             "description": "The job was accepted: it will not be lost.",
             "headers": headers("Location", "Retry-After", maybe=("Idempotency-Replayed",)),
-            "links": links(*_NEXT, job_id="$response.body#/id"),
+            "links": links(*_FOLLOWING_OPERATIONS, job_id="$response.body#/id"),
         },
         **problems(*REFUSALS),
     },
@@ -91,16 +91,16 @@ async def create_job(
     """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     parts = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
-    wanted = await asyncio.to_thread(_gather, context, caller, parts)
+    wanted = await asyncio.to_thread(_find_files, context, caller, parts)
     if not wanted.checked:
-        await context.inspector.inspect("check", wanted.inputs, wanted.paths, wanted.parameters)
+        await context.inspector.inspect("validate", wanted.inputs, wanted.paths, wanted.parameters)
     if dry_run:
-        return await _plan(context, wanted.inputs, wanted.paths, wanted.parameters)
-    return await asyncio.to_thread(_queue, context, caller, wanted, idempotency_key)
+        return await _plan_job(context, wanted.inputs, wanted.paths, wanted.parameters)
+    return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key)
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _JobRequest:
     """A job that somebody wants.
 
     Attributes:
@@ -119,21 +119,21 @@ class _Wanted:
 Parts = tuple[Received, JobParameters, str | None]
 
 
-def _gather(context: Context, caller: Caller, parts: Parts) -> _Wanted:
+def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     """Find the files of a job, and prove what can be proved without the inspecting process."""
     received, parameters, webhook = parts
-    inputs, paths = _resolve(context, caller, received)
+    inputs, paths = _resolve_inputs(context, caller, received)
     check_roles(inputs, orbit=parameters.orbit is not None)
     if webhook:
         check_url(webhook, context.settings)
-    checked = context.inspector.recall("check", inputs, parameters) is not None
+    checked = context.inspector.recall("validate", inputs, parameters) is not None
     if not checked:
         for entry in inputs:
             check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
-    return _Wanted(inputs, paths, parameters, webhook, checked)
+    return _JobRequest(inputs, paths, parameters, webhook, checked)
 
 
-def _queue(context: Context, caller: Caller, wanted: _Wanted, idempotency_key: str | None) -> Response:
+def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None) -> Response:
     """Queue a job that has been checked, and answer."""
     parameters, webhook = wanted.parameters, wanted.webhook
     idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
@@ -176,7 +176,9 @@ async def _from_json(request: Request, context: Context) -> Parts:
     return Received(uploads=named), job.parameters, job.webhook
 
 
-def _resolve(context: Context, caller: Caller, received: Received) -> tuple[list[dict[str, Any]], dict[str, FilePath]]:
+def _resolve_inputs(
+    context: Context, caller: Caller, received: Received
+) -> tuple[list[dict[str, Any]], dict[str, FilePath]]:
     """All files of a job, those that came with it and those that were uploaded before, and where they are by digest.
     They stay for now.
     """
@@ -192,7 +194,7 @@ def _resolve(context: Context, caller: Caller, received: Received) -> tuple[list
                 "unknown-upload",
                 input=role,
             )
-        digests.append(_content(context, upload, role))
+        digests.append(_upload_digest(context, upload, role))
     rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
     for number, ((role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
         name = clean_name(role, uploads[upload_id].filename, number)
@@ -200,7 +202,7 @@ def _resolve(context: Context, caller: Caller, received: Received) -> tuple[list
     return inputs, {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
 
 
-def _content(context: Context, upload: UploadRow, role: str) -> str:
+def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
     """SHA-256 of an upload, which must be finished."""
     sha256 = upload.sha256
     if sha256 is None and upload.offset == upload.length:  # the service died before it could tell
@@ -214,7 +216,7 @@ def _content(context: Context, upload: UploadRow, role: str) -> str:
     return sha256
 
 
-async def _plan(
+async def _plan_job(
     context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, FilePath], parameters: JobParameters
 ) -> Response:
     found = await context.inspector.inspect("plan", inputs, paths, parameters)
@@ -236,7 +238,7 @@ def _idempotency(
     "",
     response_model=JobPage,
     responses={
-        200: {"links": links(*_NEXT, job_id="$response.body#/jobs/0/id")},
+        200: {"links": links(*_FOLLOWING_OPERATIONS, job_id="$response.body#/jobs/0/id")},
         **problems(invalid("query.limit", "Input should be less than or equal to 200")),
     },
     operation_id="list_jobs",
@@ -265,7 +267,7 @@ def list_jobs(
     "/{job_id}",
     response_model=JobDetail,
     responses={
-        200: {"headers": _SHOWN, "links": links(*_NEXT[1:], job_id="$response.body#/id")},
+        200: {"headers": _SHOWN, "links": links(*_FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
         304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
         **problems(_NOT_THERE),
     },
@@ -279,7 +281,7 @@ def get_job(
 ) -> Response:
     """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
     check_id(job_id)
-    return _shown(context, caller, job_id, if_none_match)
+    return _job_response(context, caller, job_id, if_none_match)
 
 
 @router.post(
@@ -298,7 +300,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
     """Cancel a job: at once where it waits, within seconds where it runs (`canceling` until then)."""
     check_id(job_id)
     context.store.jobs.cancel(job_id, caller.owner)
-    return _shown(context, caller, job_id)
+    return _job_response(context, caller, job_id)
 
 
 @router.post(
@@ -331,7 +333,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
     stored_parameters(find(context, caller, job_id).parameters)
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
-    return _shown(context, caller, job_id, status=202)
+    return _job_response(context, caller, job_id, status=202)
 
 
 @router.delete(
@@ -371,7 +373,7 @@ def check_id(job_id: str) -> None:
         raise NotFoundError(f"There is no job {job_id[:60]}.")
 
 
-def _shown(
+def _job_response(
     context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
 ) -> Response:
     job, position, attempts = context.store.jobs.detail(job_id, caller.owner)

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import contextlib
-import hashlib
-import os
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from typing import Annotated, Any
@@ -17,6 +13,7 @@ from fastapi import APIRouter, Header, Path, Request, Response
 from api.http.context import CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError, body_blocks
+from api.http.receiving import ALGORITHMS, ChecksumError, LockedError, append_body, only_writer, parse_checksum
 from api.http.routes.jobs import IdempotencyHeader
 from api.http.schemas import UPLOAD_ID, UploadView, upload_view
 from service.errors import (
@@ -27,7 +24,6 @@ from service.errors import (
     ServiceError,
     TooLargeError,
 )
-from service.files.blobs import write_all
 from service.files.staging import clean_name
 from service.store.tables import UploadRow
 
@@ -35,31 +31,14 @@ router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
 VERSION = "1.0.0"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
-_ALGORITHMS = ("sha256", "sha1", "md5")
 #: Unfinished uploads of one key.
 _MAX_OPEN = 1000
-#: Bytes after which an upload's state is saved, so that a crash costs no more than these.
-_SAVE_BYTES = 64 << 20
-#: Uploads that a request is writing to now: a second one has to wait for its turn.
-_busy: set[str] = set()
 
 
 class WrongVersionError(ServiceError):
     """Another version of the protocol."""
 
     code, status = "unsupported-tus-version", 412
-
-
-class ChecksumError(ServiceError):
-    """What arrived is not what was sent."""
-
-    code, status = "checksum-mismatch", 460
-
-
-class LockedError(ServiceError):
-    """Another request is writing to this upload."""
-
-    code, status = "upload-locked", 423
 
 
 UploadId = Annotated[str, Path(description="Of an upload.", examples=[UPLOAD_ID])]
@@ -92,7 +71,7 @@ def _wrong_version(version: str) -> WrongVersionError:
     return WrongVersionError(message, headers={"Tus-Version": VERSION})
 
 
-def _after(**parameters: str) -> dict[str, Any]:
+def _following_operations(**parameters: str) -> dict[str, Any]:
     """Where to go on with an upload."""
     found = links("get_upload", "head_upload", "delete_upload", **parameters)
     return found | links("append_upload", **parameters, **{"Upload-Offset": "0"})
@@ -118,7 +97,7 @@ def describe_uploads(context: ContextDep) -> Response:
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,expiration,checksum,termination",
-        "Tus-Checksum-Algorithm": ",".join(_ALGORITHMS),
+        "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
         "Tus-Max-Size": str(context.settings.max_upload_bytes),
     }
     return Response(status_code=204, headers=sent)
@@ -133,7 +112,7 @@ def describe_uploads(context: ContextDep) -> Response:
         201: {
             "description": "Its bytes can be sent to the `Location`.",
             "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
-            "links": _after(upload_id="$response.body#/id"),
+            "links": _following_operations(upload_id="$response.body#/id"),
         },
         **problems(
             BadRequestError("The file is empty. Give its size as Upload-Length."),
@@ -183,7 +162,7 @@ def create_upload(
 @router.get("/{upload_id}", response_model=UploadView, responses=problems(_NOT_THERE), operation_id="get_upload")
 def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
     """How far an upload is, as JSON."""
-    return upload_view(_find(context, caller.owner, upload_id))
+    return upload_view(_find_upload(context, caller.owner, upload_id))
 
 
 @router.head(
@@ -207,7 +186,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
 )
 def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """How far an upload is: `Upload-Offset` says where to go on."""
-    row = _find(context, caller.owner, upload_id)
+    row = _find_upload(context, caller.owner, upload_id)
     sent = {
         **_HEADERS,
         "Upload-Offset": str(row.offset),
@@ -278,23 +257,23 @@ async def append_upload(
     _check_version(tus)
     if request.headers.get("content-type", "").lower() != "application/offset+octet-stream":
         raise MediaTypeError("The Content-Type must be application/offset+octet-stream.")
-    wanted = _checksum(checksum) if checksum else None
-    row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
+    wanted = parse_checksum(checksum) if checksum else None
+    row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
         raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
-    with _turn(upload_id):
-        row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
+    with only_writer(upload_id):
+        row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
         if offset != row.offset:
             raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {row.offset}.", offset=row.offset)
         expires = row.expires_at
         if row.sha256 is None and row.offset == row.length:  # the service died before it could tell
             await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
         elif row.sha256 is None:
-            expires = await _append(request, context, row, wanted)
+            expires = await append_body(request, context, row, wanted)
         else:
             async for _ in body_blocks(request, context.settings):
                 raise TooLargeError(f"More bytes come than the {row.length:,} of Upload-Length.", limit=row.length)
-    row = await asyncio.to_thread(_find, context, caller.owner, upload_id)
+    row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
         status_code=204,
         headers={**_HEADERS, "Upload-Offset": str(row.offset), "Upload-Expires": _http_date(expires)},
@@ -312,93 +291,13 @@ async def append_upload(
 )
 def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Give an upload up, or let go of a finished one; jobs that use it keep their file."""
-    _find(context, caller.owner, upload_id)
+    _find_upload(context, caller.owner, upload_id)
     context.store.inputs.delete_upload(upload_id, caller.owner)
     context.blobs.upload_path(upload_id).unlink(missing_ok=True)
     return Response(status_code=204, headers=_HEADERS)
 
 
-@contextlib.contextmanager
-def _turn(upload_id: str) -> Iterator[None]:
-    if upload_id in _busy:
-        raise LockedError("Another request is writing to this upload. Ask for its offset, and go on from there.")
-    _busy.add(upload_id)
-    try:
-        yield
-    finally:
-        _busy.discard(upload_id)
-
-
-async def _append(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
-    """Write the request's body behind what is there; returns when the upload expires now."""
-    writer = _Writer(context, row, wanted)
-    try:
-        async for block in body_blocks(request, context.settings):
-            await asyncio.to_thread(writer.write, block)
-    except ServiceError:
-        if wanted is None:
-            await asyncio.to_thread(writer.save)  # what has come is good
-        writer.close()
-        raise
-    except BaseException:
-        writer.close()
-        raise
-    try:
-        return await asyncio.to_thread(writer.finish)
-    finally:
-        writer.close()
-
-
-class _Writer:
-    """The file of an unfinished upload, from the offset that the store knows on."""
-
-    def __init__(self, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> None:
-        self._context, self._row, self._wanted = context, row, wanted
-        path = context.blobs.upload_path(row.id)
-        there = path.stat().st_size if path.exists() else 0
-        if there < row.offset:  # zeros would take the place of what is missing
-            raise NotFoundError(f"The bytes of upload {row.id} are gone. Begin a new one.")
-        self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
-        self._file.truncate(row.offset)  # a crash may have left more, of which nothing is known
-        self._file.seek(row.offset)
-        self._digest = hashlib.new(wanted[0]) if wanted else None
-        self._offset = self._saved = row.offset
-        self._seconds = context.settings.upload_hours * 3600
-
-    def write(self, block: bytes) -> None:
-        if self._offset + len(block) > self._row.length:
-            raise TooLargeError(
-                f"More bytes come than the {self._row.length:,} of Upload-Length.", limit=self._row.length
-            )
-        self._context.blobs.ensure_room(len(block))
-        write_all(self._file, block)
-        self._offset += len(block)
-        if self._digest is not None:
-            self._digest.update(block)
-        elif self._offset - self._saved >= _SAVE_BYTES:
-            self.save()
-
-    def save(self) -> float:
-        """Make what has come durable, then tell the store."""
-        os.fsync(self._file.fileno())
-        self._saved = self._offset
-        return self._context.store.inputs.advance_upload(self._row.id, self._offset, self._seconds)
-
-    def finish(self) -> float:
-        """The request has ended: check it, save it, and where that was the last part make the file a blob."""
-        if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
-            self._file.truncate(self._row.offset)
-            raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
-        expires = self.save()
-        if self._offset == self._row.length:
-            self._context.blobs.finish_upload(self._row, self._seconds)
-        return expires
-
-    def close(self) -> None:
-        self._file.close()
-
-
-def _find(context: Context, owner: str, upload_id: str) -> UploadRow:
+def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
     if not is_id(upload_id):
         raise NotFoundError(f"There is no upload {upload_id[:60]}.")
     return context.store.inputs.upload(upload_id, owner)
@@ -414,16 +313,6 @@ def _file_name(metadata: str) -> str:
             except ValueError as error:  # also for letters that are not ASCII
                 raise BadRequestError(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
     return ""
-
-
-def _checksum(header: str) -> tuple[str, bytes]:
-    name, _, value = header.partition(" ")
-    if name not in _ALGORITHMS:
-        raise BadRequestError(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(_ALGORITHMS)}.")
-    try:
-        return name, base64.b64decode(value, validate=True)
-    except ValueError as error:  # also for letters that are not ASCII
-        raise BadRequestError("Upload-Checksum: the digest is not base64.") from error
 
 
 def _http_date(seconds: float) -> str:

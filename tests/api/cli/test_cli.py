@@ -21,13 +21,13 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from api.cli.jobs import view_file_names
 from api.cli.main import main
+from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.ply import read_scene, write_scene
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
-pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -255,7 +255,7 @@ def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytes
 
 
 def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
-    options = files.stylize("--steps-sos", "25", "--learning-rate", "0.1")
+    options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: time for a signal to arrive
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", *options]
     with subprocess.Popen(
@@ -643,12 +643,12 @@ def test_file_names_of_views_are_plain_and_sort_in_order() -> None:
 
 
 def test_weights_are_listed_and_fetched(
-    vgg16_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = {
         f"features.{index}.{kind}": tensor
         for index, pair in zip(
-            (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), vgg16_weights.convolutions.values(), strict=True
+            (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), tiny_weights.convolutions.values(), strict=True
         )
         for kind, tensor in zip(("weight", "bias"), pair, strict=True)
     }

@@ -20,7 +20,7 @@ from annotated_types import Ge, Gt
 
 from api.cli.main import main
 from api.cli.options import kind_of
-from api.cli.serve import ServeError, serve
+from api.cli.supervisor import ServeError, serve
 from service.files.blobs import BlobFolder
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
@@ -577,17 +577,17 @@ def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, b
             client.post("/v1/jobs", files=form(files))
         now = time.time()
         store = open_store(ServiceSettings(data=service.data), lambda: now)
-        held = store.jobs.lease("lost")
+        held = store.leases.take("lost")
         assert held is not None
         now += 1000
-        held = store.jobs.lease("one")
+        held = store.leases.take("one")
         assert held is not None
-        store.jobs.fail(held, {"code": "x", "message": "x"}, permanent=True, retention=1000.0)
+        store.leases.fail(held, {"code": "x", "message": "x"}, permanent=True)
         for step, seconds in ((30, 10.0), (8, 4.0)):
-            held = store.jobs.lease("one")
+            held = store.leases.take("one")
             assert held is not None
-            store.jobs.running(held)
-            store.jobs.progress(held, {"step": step, "seconds": seconds, "total": 100})
+            store.leases.begin(held)
+            store.leases.report_progress(held, {"step": step, "seconds": seconds, "total": 100})
         text = client.get("/metrics").text
         found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
         assert found["sgsst_lease_expirations_total"] == "1.0"

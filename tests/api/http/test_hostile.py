@@ -871,10 +871,10 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
         for queued in client.get("/v1/jobs", params={"status": "queued", "limit": 200}).json()["jobs"]:
             if queued["id"] != job_id:
                 client.post(f"/v1/jobs/{queued['id']}/cancel")
-    lease = store.jobs.lease("test")
+    lease = store.leases.take("test")
     while lease is not None and lease.job_id != job_id:
-        store.jobs.canceled(lease, 1000)
-        lease = store.jobs.lease("test")
+        store.leases.stop(lease)
+        lease = store.leases.take("test")
     assert lease is not None
     made = tmp_path_factory.mktemp("results")
     (made / "stylized.ply").write_bytes(files["scene"])
@@ -883,9 +883,9 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
     artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
     published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(made.iterdir())]
     published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", made / "log.txt"))
-    store.jobs.running(lease)
-    store.jobs.publish(lease, published)
-    store.jobs.succeed(lease, published[:-1], {}, 10_000)
+    store.leases.begin(lease)
+    store.leases.publish(lease, published)
+    store.leases.succeed(lease, published[:-1], {})
     return job_id
 
 

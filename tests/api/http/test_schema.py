@@ -33,9 +33,11 @@ load_all_checks()
 
 
 def refuses_what_is_wrong(ctx: Any, response: Response, case: schemathesis.Case) -> bool | None:
-    """As the library has it, but for headers that nobody knows, which HTTP has ignored, and for more refusals, such as
-    tus' 412 and 460."""
-    if "x-schemathesis-unknown-property" in case.headers or 400 <= response.status_code < 500:
+    """As the library has it, but for headers and queries that nobody knows, which HTTP has ignored, and for more
+    refusals, such as tus' 412 and 460."""
+    known = {parameter["name"] for parameter in case.operation.definition.raw.get("parameters", [])}
+    unknown = "x-schemathesis-unknown-property" in case.headers or not known.issuperset(case.query or {})
+    if unknown or 400 <= response.status_code < 500:
         return None
     return negative_data_rejection(ctx, response, case)
 
@@ -134,11 +136,11 @@ class Uploaded:
 
     def finish_jobs(self) -> None:
         """Every job that waits ends with results, as a dispatcher leaves it (`test_service` has a real one)."""
-        while (lease := self._store.jobs.lease("test")) is not None:
+        while (lease := self._store.leases.take("test")) is not None:
             result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
-            self._store.jobs.running(lease)
-            self._store.jobs.publish(lease, [result])
-            self._store.jobs.succeed(lease, [result], {"steps": 1}, 10_000)
+            self._store.leases.begin(lease)
+            self._store.leases.publish(lease, [result])
+            self._store.leases.succeed(lease, [result], {"steps": 1})
 
     def delete_jobs(self) -> None:
         """So that every chain finds the same: none."""
@@ -152,6 +154,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     return Uploaded(service, store, key, tmp_path_factory.mktemp("inputs"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "behind"),
     [

@@ -12,7 +12,6 @@ import httpx
 import pytest
 
 from service.files.artifacts import Artifacts
-from sgsst_core.features.network_weights import BackboneWeights
 from tests.api.service import Service, undisturbed, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -122,9 +121,7 @@ def test_a_bucket_that_is_not_there_is_not_ready(artifacts: Artifacts) -> None:
         Artifacts("s3://nowhere/x").ping()
 
 
-def test_a_job_whose_results_are_in_a_bucket(
-    environment: dict[str, str], tmp_path: Path, vgg16_weights: BackboneWeights
-) -> None:
+def test_a_job_whose_results_are_in_a_bucket(environment: dict[str, str], tmp_path: Path, tiny_installed: Path) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
     files = {"scene": ply, "cameras": cameras, "style": style}
     parameters = {"preset": "standard", "steps_sos": 4, "backbone": "vgg16", "early_stop": False, "seed": 1}

@@ -13,13 +13,15 @@ import pytest
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
-from service.scheduling.dispatcher import Dispatcher, is_dead, own_name
+from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
 from service.scheduling.running import RunningAttempt
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.jobs import Lease, NewJob
+from service.store.jobs import NewJob
+from service.store.leases import Lease
 from tests.api.service import wait_for
 
 SHA = "a" * 64
@@ -54,7 +56,7 @@ def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
 def leased(store: Store, dispatcher: str) -> Lease:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    found = store.jobs.lease(dispatcher)
+    found = store.leases.take(dispatcher)
     assert found is not None
     return found
 
@@ -75,7 +77,7 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     room = Room(Machine(grant.gpus, 2, 10**10), None)
     assert room.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
-        attempt._hear({"kind": "left-out", "gpus": [gpu]})
+        attempt._take_in({"kind": "left-out", "gpus": [gpu]})
     assert attempt.grant == Grant(1, ("6",))
     following = room.grant(held.job, [attempt.grant], 1)
     assert following == Grant(2, ("5", "7"))
@@ -97,7 +99,7 @@ def test_a_job_with_parameters_of_an_earlier_version_fails_with_a_sentence(
 
 
 def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
-    script = "from service.scheduling.dispatcher import own_name; print(own_name())"
+    script = "from service.scheduling.identity import own_name; print(own_name())"
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
     assert is_dead(dead)
     assert not is_dead(own_name())
@@ -120,11 +122,11 @@ def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings
     held = leased(store, "elsewhere")
     artifacts.put(held.job_id, held.epoch, "previews/cut_off.jpg", source)
     result = artifacts.put(held.job_id, held.epoch, "stylized.ply", source)
-    store.jobs.succeed(held, [result], {}, 1000.0)
+    store.leases.succeed(held, [result], {})
     running = leased(store, "elsewhere")
     published_next = artifacts.put(running.job_id, running.epoch, "stylized.ply", source)
     with at_work(settings, store):
-        wait_for(lambda: store.jobs.unswept(10) == [], "the job to be swept")
+        wait_for(lambda: store.retention.unswept(10) == [], "the job to be swept")
     left = {path.name for path in (settings.folder / "artifacts" / held.job_id).rglob("*.*")}
     assert left == {"stylized.ply"}
     assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"

@@ -14,13 +14,14 @@ import httpx
 import pytest
 import torch
 
-from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.ply import read_scene
 from tests.api.service import Service, undisturbed, wait_for
 from tests.small_scenes import wall, write_files
 
-STEPS = 100
+STEPS = 600
 PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "early_stop": False, "seed": 5}
+pytestmark = pytest.mark.slow
+
 ATTEMPT, API, DISPATCHER = "service.scheduling.attempt_process", "api.http.server", "service.scheduling.dispatcher"
 
 
@@ -31,7 +32,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, vgg16_weights: BackboneWeights) -> Iterator[Service]:
+def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
     folder = tmp_path_factory.mktemp("service")
     # attempts end by the test's hand here, which is no reason to give a job up
     with Service(folder / "data", SGSST_MAX_ATTEMPTS="50", SGSST_CHECKPOINT_SECONDS="0.5") as running:

@@ -201,19 +201,19 @@ def test_gpus_of_the_machine_and_of_a_cluster(monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_store_counts_what_could_be_started(eight: Queue) -> None:
     store: Store = eight.store
-    assert store.jobs.waiting() == 0
+    assert store.leases.waiting() == 0
     eight.add()
     second = eight.add()
-    assert store.jobs.waiting() == 2
-    found = store.jobs.lease("one")
+    assert store.leases.waiting() == 2
+    found = store.leases.take("one")
     assert found is not None
-    assert store.jobs.waiting() == 1
-    store.jobs.fail(found, {"code": "x", "message": "x"}, permanent=False, retention=1.0)
-    assert store.jobs.waiting() == 1, "the other one has to wait for its second attempt"
+    assert store.leases.waiting() == 1
+    store.leases.fail(found, {"code": "x", "message": "x"}, permanent=False)
+    assert store.leases.waiting() == 1, "the other one has to wait for its second attempt"
     store.jobs.cancel(second, "local")
-    assert store.jobs.waiting() == 0
+    assert store.leases.waiting() == 0
     eight.now += 100
-    assert store.jobs.lease("one") is not None
-    assert store.jobs.waiting() == 0
+    assert store.leases.take("one") is not None
+    assert store.leases.waiting() == 0
     eight.now += 100
-    assert store.jobs.waiting() == 1, "nobody renewed its lease"
+    assert store.leases.waiting() == 1, "nobody renewed its lease"

@@ -21,13 +21,16 @@ from sqlalchemy import inspect
 from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.database import MIGRATIONS, create_all
+from service.store.database import MIGRATIONS
 from service.store.inputs import GRACE_SECONDS
-from service.store.jobs import ACTIVE, FINISHED, KEPT_PROGRESS, Idempotency, Lease, NewJob, Published
+from service.store.jobs import Idempotency, NewJob
+from service.store.leases import KEPT_PROGRESS, Lease, Published
+from service.store.states import ACTIVE, FINISHED
 from service.store.tables import Base
 
 SHA = "a" * 64
 LEASE, RETRY, ATTEMPTS = 30.0, 5.0, 3
+RETENTION = 100.0
 
 
 class Clock:
@@ -84,7 +87,12 @@ def _fresh_database(server: str) -> str:
 
 def _settings(folder: Path, database: str | None) -> ServiceSettings:
     return ServiceSettings(
-        data=folder, database=database, lease_seconds=LEASE, retry_seconds=RETRY, max_attempts=ATTEMPTS
+        data=folder,
+        database=database,
+        lease_seconds=LEASE,
+        retry_seconds=RETRY,
+        max_attempts=ATTEMPTS,
+        retention_days=RETENTION / 86_400,
     )
 
 
@@ -116,7 +124,7 @@ def queue(store: Store, owner: str = "local", priority: int = 0) -> str:
 
 
 def lease(store: Store, dispatcher: str = "one") -> Lease:
-    found = store.jobs.lease(dispatcher)
+    found = store.leases.take(dispatcher)
     assert found is not None
     return found
 
@@ -128,7 +136,7 @@ def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tm
         assert columns == {column.name: column.nullable for column in table.columns}, table.name
         indexes = {index["name"] for index in found.get_indexes(table.name) if not index["unique"]}
         assert indexes == {index.name for index in table.indexes}, table.name
-    create_all(store.database.engine)  # finds them all there
+    Base.metadata.create_all(store.database.engine)  # finds them all there
 
 
 def test_sqlite_is_safe_against_power_cuts(tmp_path: Path) -> None:
@@ -181,12 +189,12 @@ def test_many_dispatchers_lease_every_job_once(store: Store) -> None:
     found: list[str] = []
 
     def work() -> None:
-        while (held := store.jobs.lease(threading.current_thread().name)) is not None:
+        while (held := store.leases.take(threading.current_thread().name)) is not None:
             found.append(held.job_id)
 
     _at_once(work, 4)
     # with PostgreSQL a dispatcher may find nothing while another one holds the row that is next
-    while (held := store.jobs.lease("last")) is not None:
+    while (held := store.leases.take("last")) is not None:
         found.append(held.job_id)
     assert sorted(found) == sorted(expected)
 
@@ -213,7 +221,7 @@ def test_a_big_job_is_not_overtaken_for_ever(store: Store, clock: Clock) -> None
     big = queue(store)
     clock.now += 1
     queue(store)
-    assert store.jobs.lease("one", lambda job: job.id != big) is None
+    assert store.leases.take("one", lambda job: job.id != big) is None
     assert lease(store).job_id == big
 
 
@@ -225,23 +233,23 @@ def test_who_lost_the_lease_cannot_write(store: Store, clock: Clock) -> None:
     assert new.job_id == late.job_id
     file = Published("stylized.ply", "x/1", 1, SHA)
     for write in (
-        lambda: store.jobs.running(late),
-        lambda: store.jobs.progress(late, {"step": 1}),
-        lambda: store.jobs.publish(late, [file]),
-        lambda: store.jobs.succeed(late, [file], {}, 1.0),
-        lambda: store.jobs.fail(late, {"code": "x", "message": "x"}, permanent=False, retention=1.0),
-        lambda: store.jobs.release(late),
-        lambda: store.jobs.canceled(late, 1.0),
+        lambda: store.leases.begin(late),
+        lambda: store.leases.report_progress(late, {"step": 1}),
+        lambda: store.leases.publish(late, [file]),
+        lambda: store.leases.succeed(late, [file], {}),
+        lambda: store.leases.fail(late, {"code": "x", "message": "x"}, permanent=False),
+        lambda: store.leases.release(late),
+        lambda: store.leases.stop(late),
     ):
         with pytest.raises(LeaseLostError):
             write()
-    assert store.jobs.renew([late]) == store.jobs.look([late]) == {late.job_id: None}
-    assert store.jobs.renew([new]) == store.jobs.look([new]) == {new.job_id: "starting"}
+    assert store.leases.renew([late]) == store.leases.statuses([late]) == {late.job_id: None}
+    assert store.leases.renew([new]) == store.leases.statuses([new]) == {new.job_id: "starting"}
     assert not store.jobs.artifacts(new.job_id)
-    store.jobs.succeed(new, [file], {"steps": 1}, 1.0)
+    store.leases.succeed(new, [file], {"steps": 1})
     assert [row.name for row in store.jobs.artifacts(new.job_id)] == ["stylized.ply"]
     with pytest.raises(LeaseLostError):
-        store.jobs.succeed(new, [file], {}, 1.0)
+        store.leases.succeed(new, [file], {})
 
 
 def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
@@ -249,21 +257,33 @@ def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
     for attempt in range(1, ATTEMPTS + 1):
         assert lease(store).job.attempt == attempt
         clock.now += LEASE + 1  # the dispatcher died with it
-    assert store.jobs.lease("one") is None
+    assert store.leases.take("one") is None
     job = store.jobs.get(job_id, "local")
     assert (job.status, (job.error or {})["code"]) == ("failed", "dispatcher-lost")
-    assert [row.outcome for row in store.jobs.attempts(job_id)] == ["lost"] * ATTEMPTS
+    assert [row.outcome for row in store.jobs.detail(job_id, None)[2]] == ["lost"] * ATTEMPTS
+
+
+def test_a_lost_job_that_finds_no_room_is_lost_once(store: Store, clock: Clock) -> None:
+    """However often a dispatcher that is full looks at it."""
+    job_id = queue(store)
+    lease(store, "late")
+    clock.now += LEASE + 1
+    for _ in range(2 * ATTEMPTS):
+        assert store.leases.take("full", lambda job: False) is None
+    assert (store.jobs.get(job_id, None).status, store.jobs.get(job_id, None).failures) == ("queued", 1)
+    assert lease(store, "free").job.attempt == 2
+    assert [row.outcome for row in store.jobs.detail(job_id, None)[2]] == ["lost", None]
 
 
 def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     error = {"code": "x", "message": "x"}
     for wait in (RETRY, 2 * RETRY):
-        assert store.jobs.fail(lease(store), error, permanent=False, retention=1.0)
+        assert store.leases.fail(lease(store), error, permanent=False)
         clock.now += wait - 0.1
-        assert store.jobs.lease("one") is None
+        assert store.leases.take("one") is None
         clock.now += 0.2
-    assert not store.jobs.fail(lease(store), error, permanent=False, retention=1.0)
+    assert not store.leases.fail(lease(store), error, permanent=False)
     assert store.jobs.get(job_id, "local").status == "failed"
 
 
@@ -272,13 +292,13 @@ def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False
     clock.now += 1000
     held = lease(store)
     if saved is not None:
-        store.jobs.publish(held, [Published(".checkpoint", f"x/{held.epoch}", 1, SHA, step=saved)])
+        store.leases.publish(held, [Published(".checkpoint", f"x/{held.epoch}", 1, SHA, step=saved)])
     if not lost:
-        return store.jobs.fail(held, {"code": "x", "message": "x"}, permanent=False, retention=1.0)
+        return store.leases.fail(held, {"code": "x", "message": "x"}, permanent=False)
     clock.now += LEASE + 1
-    again = store.jobs.lease("two")
+    again = store.leases.take("two")
     if again is not None:
-        store.jobs.release(again)
+        store.leases.release(again)
     return again is not None
 
 
@@ -308,8 +328,8 @@ def test_what_was_saved_before_a_shutdown_is_progress_too(store: Store, clock: C
     assert [fail_at(store, clock, None) for _ in range(ATTEMPTS - 1)] == [True, True]
     clock.now += 1000
     held = lease(store)
-    store.jobs.publish(held, [Published(".checkpoint", "x", 1, SHA, step=5)])
-    store.jobs.release(held)
+    store.leases.publish(held, [Published(".checkpoint", "x", 1, SHA, step=5)])
+    store.leases.release(held)
     assert [fail_at(store, clock, None) for _ in range(ATTEMPTS + 1)] == [True, True, True, False]
 
 
@@ -320,26 +340,26 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
         jobs.append(queue(store))
         clock.now += 1
     first, second, third = jobs
-    store.jobs.succeed(lease(store), [], {}, 1000.0)
-    store.jobs.fail(lease(store), error, permanent=True, retention=1000.0)
-    assert sorted(store.jobs.unswept(10)) == [(first, 1), (second, 1)]
-    assert len(store.jobs.unswept(1)) == 1
-    store.jobs.swept(first, 1)
-    store.jobs.swept(third, 0)
-    assert store.jobs.unswept(10) == [(second, 1)]
+    store.leases.succeed(lease(store), [], {})
+    store.leases.fail(lease(store), error, permanent=True)
+    assert sorted(store.retention.unswept(10)) == [(first, 1), (second, 1)]
+    assert len(store.retention.unswept(1)) == 1
+    store.retention.mark_swept(first, 1)
+    store.retention.mark_swept(third, 0)
+    assert store.retention.unswept(10) == [(second, 1)]
     store.jobs.retry(second, "local", limit=10)
-    store.jobs.swept(second, 1)  # too late: it is not at its end any more
+    store.retention.mark_swept(second, 1)  # too late: it is not at its end any more
     store.jobs.cancel(third, "local")
-    store.jobs.succeed(lease(store), [], {}, 1000.0)
-    assert sorted(store.jobs.unswept(10)) == [(second, 2), (third, 0)]
-    store.jobs.swept(second, 1)  # of an earlier lease
-    assert sorted(store.jobs.unswept(10)) == [(second, 2), (third, 0)]
-    store.jobs.swept(second, 2)
-    store.jobs.swept(third, 0)
-    assert store.jobs.unswept(10) == []
+    store.leases.succeed(lease(store), [], {})
+    assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
+    store.retention.mark_swept(second, 1)  # of an earlier lease
+    assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
+    store.retention.mark_swept(second, 2)
+    store.retention.mark_swept(third, 0)
+    assert store.retention.unswept(10) == []
     store.jobs.retry(third, "local", limit=10)
-    store.jobs.succeed(lease(store), [], {}, 1000.0)
-    assert store.jobs.unswept(10) == [(third, 1)], "it has run again since"
+    store.leases.succeed(lease(store), [], {})
+    assert store.retention.unswept(10) == [(third, 1)], "it has run again since"
 
 
 def test_dispatchers_are_alive_as_long_as_they_are_heard_of(store: Store, clock: Clock) -> None:
@@ -377,14 +397,14 @@ def test_the_migrations_keep_what_is_there(database: str | None, tmp_path: Path)
     store = open_store(settings)
     job = store.jobs.get("job_1", "me")
     assert (job.failures, job.saved_step, job.failed_step, job.swept) == (3, None, None, False)
-    assert store.jobs.unswept(10) == [("job_1", 4)]
+    assert store.retention.unswept(10) == [("job_1", 4)]
     store.close()
 
 
 def test_release_does_not_count_as_failure(store: Store) -> None:
     queue(store)
     for _ in range(2 * ATTEMPTS):
-        store.jobs.release(lease(store))
+        store.leases.release(lease(store))
     assert lease(store).job.failures == 0
 
 
@@ -410,7 +430,7 @@ def test_old_progress_is_forgotten_but_no_status(store: Store) -> None:
     queue(store)
     held = lease(store)
     for step in range(KEPT_PROGRESS + 20):
-        store.jobs.progress(held, {"step": step})
+        store.leases.report_progress(held, {"step": step})
     events = store.jobs.events(held.job_id, 0, limit=1000)
     assert [event.data["step"] for event in events if event.kind == "progress"] == list(range(20, KEPT_PROGRESS + 20))
     assert [event.data["status"] for event in events if event.kind == "status"] == ["queued", "starting"]
@@ -442,15 +462,28 @@ def test_held_blobs_stay(store: Store, clock: Clock) -> None:
 
 def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Clock) -> None:
     job_id = queue(store)
-    store.jobs.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {}, 100.0)
-    clock.now += 101
-    assert store.jobs.expire(100.0) == [job_id]
+    store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {})
+    clock.now += RETENTION + 1
+    assert store.retention.expire() == [job_id]
     assert store.jobs.get(job_id, "local").status == "expired"
     assert store.jobs.artifacts(job_id) == []
-    clock.now += 101
-    store.jobs.expire(100.0)
+    clock.now += RETENTION + 1
+    store.retention.expire()
     with pytest.raises(NotFoundError):
         store.jobs.get(job_id, "local")
+
+
+def test_however_a_job_ends_it_is_kept_as_long(store: Store, clock: Clock) -> None:
+    ends = {
+        "succeeded": lambda: store.leases.succeed(lease(store), [], {}),
+        "failed": lambda: store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True),
+        "canceled": lambda: store.jobs.cancel(job_id, "local"),
+    }
+    for status, end in ends.items():
+        job_id = queue(store)
+        end()
+        job = store.jobs.get(job_id, "local")
+        assert (job.status, job.expires_at) == (status, pytest.approx(clock.now + RETENTION))
 
 
 def test_revoked_keys_are_unknown(store: Store) -> None:
@@ -505,7 +538,7 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(dispatcher=st.sampled_from(["one", "two"]))
     def take(self, dispatcher: str) -> None:
         live = {job_id for job_id, (_, until) in self.held.items() if until >= self.clock.now}
-        found = self.store.jobs.lease(dispatcher)
+        found = self.store.leases.take(dispatcher)
         self._see_settled()
         if found is None:
             return
@@ -528,32 +561,32 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(data=st.data())
     def renew(self, data: st.DataObject) -> None:
         held, _ = self._some(data)
-        assert self.store.jobs.renew([held]) == {held.job_id: self.status[held.job_id]}
+        assert self.store.leases.renew([held]) == {held.job_id: self.status[held.job_id]}
         self.held[held.job_id] = (held, self.clock.now + LEASE)
 
     @precondition(lambda self: self.held)
     @rule(data=st.data(), how=st.sampled_from(["running", "succeed", "fail", "break", "release", "canceled"]))
     def write(self, data: st.DataObject, how: str) -> None:
         held, _ = self._some(data)
-        job_id, jobs = held.job_id, self.store.jobs
+        job_id, leases = held.job_id, self.store.leases
         canceling = self.status[job_id] == "canceling"
         if how == "running":
-            jobs.running(held)
+            leases.begin(held)
             self.status[job_id] = "canceling" if canceling else "running"
             return
         if how == "succeed":
-            jobs.succeed(held, [Published("stylized.ply", f"{held.epoch}", 1, SHA)], {}, 1e6)
+            leases.succeed(held, [Published("stylized.ply", f"{held.epoch}", 1, SHA)], {})
             self.published[job_id] = self.published.get(job_id, 0) + 1
             self.status[job_id] = "succeeded"
         elif how in ("fail", "break"):
-            again = jobs.fail(held, {"code": "x", "message": "x"}, permanent=how == "break", retention=1e6)
+            again = leases.fail(held, {"code": "x", "message": "x"}, permanent=how == "break")
             assert not (again and (how == "break" or canceling))
             self.status[job_id] = "canceled" if canceling else "queued" if again else "failed"
         elif how == "release":
-            jobs.release(held)
+            leases.release(held)
             self.status[job_id] = "canceled" if canceling else "queued"
         else:
-            jobs.canceled(held, 1e6)
+            leases.stop(held)
             self.status[job_id] = "canceled"
         self.old.append(self.held.pop(job_id)[0])
 
@@ -565,7 +598,7 @@ class StoreMachine(RuleBasedStateMachine):
     def late_write(self, data: st.DataObject) -> None:
         late = data.draw(st.sampled_from(self.old))
         with pytest.raises(LeaseLostError):
-            self.store.jobs.succeed(late, [Published("stylized.ply", "late", 1, SHA)], {}, 1e6)
+            self.store.leases.succeed(late, [Published("stylized.ply", "late", 1, SHA)], {})
 
     @precondition(lambda self: self.status)
     @rule(data=st.data(), what=st.sampled_from(["cancel", "retry", "delete"]))

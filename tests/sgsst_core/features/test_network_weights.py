@@ -25,6 +25,7 @@ from sgsst_core.features.network_weights import (
     load_perceptual,
     load_weights,
 )
+from sgsst_core.features.vgg import FeatureNetwork
 
 TORCHVISION_VGG19 = [0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30, 32, 34]
 TORCHVISION_VGG16 = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
@@ -147,6 +148,18 @@ def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
         assert torch.equal(weight, layers[layer][0])
 
 
+def test_a_network_of_other_channels_keeps_them(tiny_weights: BackboneWeights, tiny_cache: Path) -> None:
+    found = load_weights("vgg16", tiny_cache)
+    for layer, (weight, bias) in tiny_weights.convolutions.items():
+        assert torch.equal(found.convolutions[layer][0], weight)
+        assert torch.equal(found.convolutions[layer][1], bias)
+    network = FeatureNetwork(found, ("relu1_1", "relu5_1"))
+    assert [network.channels(layer) for layer in network.layers] == [16, 16]
+    for pixels in (16, 8):  # the second is too small for relu5_1
+        features = network.forward(torch.zeros(pixels, pixels, 3)).features
+        assert features["relu5_1"].shape == (pixels // 16, pixels // 16, 16)
+
+
 def test_auto_prefers_vgg19(vgg19_folder: Path, vgg16_folder: Path) -> None:
     assert load_weights("auto", vgg16_folder).name == "vgg16"
     shutil.copy(vgg19_folder / "vgg19.safetensors", vgg16_folder)
@@ -241,6 +254,11 @@ def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
         ({key: value for key, value in good.items() if key != "features.28.bias"}, r"features\.28\.bias is missing"),
         (good | {"features.5.weight": torch.zeros(128, 64, 1, 1)}, "conv2_1.weight"),
         (good | {"features.5.bias": torch.full((128,), float("nan"))}, "conv2_1.bias holds NaN"),
+        (good | {"features.5.bias": torch.zeros(0)}, "conv2_1.bias"),
+        (
+            good | {"features.5.weight": torch.zeros(100, 64, 3, 3), "features.5.bias": torch.zeros(100)},
+            r"conv2_2\.weight is torch\.float32 \[128, 128, 3, 3\], not float32 \[128, 100, 3, 3\]",
+        ),
     ]
     for state, message in cases:
         torch.save(state, tmp_path / "bad.pth")

@@ -47,9 +47,9 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_what_is_left_out_changes_nothing(vgg16_weights: BackboneWeights, name: str) -> None:
+def test_what_is_left_out_changes_nothing(tiny_weights: BackboneWeights, name: str) -> None:
     scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
-    lean, full = (make(scene, views, vgg16_weights, keep=keep) for keep in ((), EVERYTHING))
+    lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     first = [stylizer.run_step() for stylizer in (lean, full)]
     # The first step's loss comes from equal colours: nothing but rounding may differ.
     assert first[0].loss == pytest.approx(first[1].loss, rel=1e-5)
@@ -61,10 +61,10 @@ def test_what_is_left_out_changes_nothing(vgg16_weights: BackboneWeights, name: 
 
 
 @pytest.mark.parametrize("item", EVERYTHING)
-def test_each_item_alone_changes_nothing(vgg16_weights: BackboneWeights, item: Item) -> None:
+def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: Item) -> None:
     """Enough steps for blend weights to be kept, on a scene in which every item has something to leave out."""
     scene, views = higher_bands_of_zeros(behind(ball())), cameras(1)
-    lean, other = (make(scene, views, vgg16_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
+    lean, other = (make(scene, views, tiny_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
     losses = [stylizer.run_step().loss for stylizer in (lean, other)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     gradients = [stylizer.gradient(0, [0])[0] for stylizer in (lean, other)]
@@ -75,24 +75,24 @@ def test_each_item_alone_changes_nothing(vgg16_weights: BackboneWeights, item: I
     assert (other.plan.kept_weights == "none") == (item == "blend-weights")
 
 
-def test_blend_weights_are_kept_as_memory_and_visits_allow(vgg16_weights: BackboneWeights) -> None:
+def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
     scene, views = wall(), cameras(3)
-    assert make(scene, views, vgg16_weights, steps_sos=14).plan.kept_weights == "none"  # fewer than 5 visits a view
-    lean = make(scene, views, vgg16_weights, steps_sos=30)
+    assert make(scene, views, tiny_weights, steps_sos=14).plan.kept_weights == "none"  # fewer than 5 visits a view
+    lean = make(scene, views, tiny_weights, steps_sos=30)
     assert lean.plan.kept_weights == "float32"
-    little = make(scene, views, vgg16_weights, steps_sos=30, memory_limit=400_000)
+    little = make(scene, views, tiny_weights, steps_sos=30, memory_limit=400_000)
     assert little.plan.kept_weights == "half"
-    assert make(scene, views, vgg16_weights, steps_sos=30, kept_weights="none").views.rasterizer.name == "cpu"
+    assert make(scene, views, tiny_weights, steps_sos=30, kept_weights="none").views.rasterizer.name == "cpu"
     decision = next(d for d in little.plan.decisions if d.item == "blend weights")
     assert "half precision" in decision.decision
     assert "1/4096" in decision.error
 
 
-def test_pruning_stays_within_its_bound_and_is_made_up_for(vgg16_weights: BackboneWeights) -> None:
+def test_pruning_stays_within_its_bound_and_is_made_up_for(tiny_weights: BackboneWeights) -> None:
     scene, views = behind(ball(600)), cameras(3)
-    whole = make(scene, views, vgg16_weights)
+    whole = make(scene, views, tiny_weights)
     threshold = float(whole.plan.survey.total_weights.quantile(0.5))
-    pruned = make(scene, views, vgg16_weights, prune_weight=threshold)
+    pruned = make(scene, views, tiny_weights, prune_weight=threshold)
     left_out = ~pruned.plan.seen
     assert 0.4 < float(left_out.double().mean()) < 0.6
     bound = pruned_image_error(left_out, views, [0, 1, 2], make_rasterizer("cpu", scene))
@@ -106,16 +106,16 @@ def test_pruning_stays_within_its_bound_and_is_made_up_for(vgg16_weights: Backbo
     assert any(decision.item == "pruned Gaussians" for decision in pruned.plan.decisions)
 
 
-def test_pruning_everything_is_refused(vgg16_weights: BackboneWeights) -> None:
+def test_pruning_everything_is_refused(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(SettingsError, match="largest total blend weight"):
-        make(wall(), cameras(1), vgg16_weights, prune_weight=1e9)
+        make(wall(), cameras(1), tiny_weights, prune_weight=1e9)
 
 
-def test_similar_views_are_left_out_only_when_asked(vgg16_weights: BackboneWeights) -> None:
+def test_similar_views_are_left_out_only_when_asked(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     views = [camera for camera in cameras(3) for _ in range(2)]  # every view twice
-    assert make(scene, views, vgg16_weights).plan.covered == (0, 1, 2, 3, 4, 5)
-    plan = make(scene, views, vgg16_weights, similar_views=1e-4).plan
+    assert make(scene, views, tiny_weights).plan.covered == (0, 1, 2, 3, 4, 5)
+    plan = make(scene, views, tiny_weights, similar_views=1e-4).plan
     assert plan.covered == (0, 2, 4)
     assert any(decision.item == "similar views" for decision in plan.decisions)
 
@@ -132,20 +132,20 @@ def test_distinct_views_by_their_shift() -> None:
     assert distinct_views(scene, turned, [0, 1, 2], weights, 0.11) == [0, 2]
 
 
-def test_rendering_without_unseen_gaussians_is_bitwise_the_same(vgg16_weights: BackboneWeights) -> None:
+def test_rendering_without_unseen_gaussians_is_bitwise_the_same(tiny_weights: BackboneWeights) -> None:
     scene, views = behind(wall(sh_degree=2), 100), cameras(3)
-    lean, full = (make(scene, views, vgg16_weights, keep=keep) for keep in ((), EVERYTHING))
+    lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
     for index in range(3):
         images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (lean, full)]
         assert torch.equal(*images)
 
 
-def test_decisions_name_what_is_left_out(vgg16_weights: BackboneWeights) -> None:
+def test_decisions_name_what_is_left_out(tiny_weights: BackboneWeights) -> None:
     near = ball()
     scene = higher_bands_of_zeros(behind(replace(near, means=near.means + torch.tensor([0.0, 0, 4]))))
     views = [resized(camera, 320) for camera in cameras(2)]
-    plan = make(scene, views, vgg16_weights, content_weight=0, steps_coarse=3).plan
+    plan = make(scene, views, tiny_weights, content_weight=0, steps_coarse=3).plan
     decisions = {decision.item: decision for decision in plan.decisions}
     assert set(decisions) >= {
         "unseen Gaussians",
@@ -188,10 +188,10 @@ def test_unseen_gaussians_follow_their_seen_neighbours() -> None:
     assert neighbours_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
 
 
-def test_unseen_gaussians_keep_their_colour_in_paper(vgg16_weights: BackboneWeights) -> None:
+def test_unseen_gaussians_keep_their_colour_in_paper(tiny_weights: BackboneWeights) -> None:
     scene = behind(wall())
     for preset, moved in (("paper", False), ("standard", True)):
         settings = make_settings(preset, steps_coarse=0, steps_sos=2)
-        stylizer = Stylizer.planned(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=vgg16_weights)
+        stylizer = Stylizer.planned(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=tiny_weights)
         run(stylizer)
         assert bool((stylizer.stylized()[-10:] != scene.sh_dc[-10:]).any()) == moved

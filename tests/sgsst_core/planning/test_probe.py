@@ -33,15 +33,18 @@ def equipped(weights: BackboneWeights, scene: Scene, **values: Any) -> Workshop:
     return equip(scene, cameras(3), make_settings(**values), weights, ALONE)
 
 
-def test_a_probe_holds_what_there_is(vgg16_weights: BackboneWeights) -> None:
+def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     scene = replace(wall(), sh_rest=torch.zeros(len(wall()), 15, 3))
-    workshop = equipped(vgg16_weights, scene, memory_limit=10**9)
+    workshop = equipped(tiny_weights, scene, memory_limit=10**9)
     probe = measure(workshop, survey(scene, workshop.cameras, workshop.rasterizer), FREE)
     assert (probe.scene.gaussians, probe.scene.sh_degree, probe.scene.used_degree) == (len(scene), 3, 0)
     assert probe.sizes == tuple((camera.height, camera.width) for camera in cameras(3))
     assert probe.distinct == (0, 1, 2)
     assert probe.pruned_error is None
-    assert (probe.network.halo, probe.network.held_bytes) == (64, workshop.network.held_bytes_per_pixel())
+    assert (probe.network.halo, probe.network.held_bytes) == (
+        workshop.network.halo,
+        workshop.network.held_bytes_per_pixel(),
+    )
     assert 0 < probe.network.rate.forward < 10 * probe.network.rate.both
     assert probe.network.precision_ratio is None
     assert probe.raster.bytes is not None
@@ -52,11 +55,11 @@ def test_a_probe_holds_what_there_is(vgg16_weights: BackboneWeights) -> None:
     assert probe.process_bytes > 10**7
 
 
-def test_the_error_of_pruning_is_measured_where_something_is_pruned(vgg16_weights: BackboneWeights) -> None:
+def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     looked = survey(scene, cameras(3), make_rasterizer("cpu", scene))
     threshold = float(looked.total_weights.quantile(0.5))
-    probe = measure(equipped(vgg16_weights, scene, prune_weight=threshold), looked, FREE)
+    probe = measure(equipped(tiny_weights, scene, prune_weight=threshold), looked, FREE)
     left_out = looked.total_weights <= threshold
     assert probe.pruned_error == pruned_image_error(left_out, cameras(3), [0, 1, 2], make_rasterizer("cpu", scene))
 
@@ -78,29 +81,29 @@ def test_the_other_ranks_are_taken_to_be_as_far() -> None:
     assert _progress(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
 
 
-def test_a_plan_needs_cameras_that_see_something(vgg16_weights: BackboneWeights) -> None:
+def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) -> None:
     for views, message in (([], "There are no cameras"), ([blind_camera()], "None of the 1 cameras sees")):
         with pytest.raises(CameraError, match=message):
-            make_plan(wall(), views, make_settings(), weights=vgg16_weights)
+            make_plan(wall(), views, make_settings(), weights=tiny_weights)
 
 
-def test_an_earlier_survey_takes_the_place_of_a_look(vgg16_weights: BackboneWeights) -> None:
+def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeights) -> None:
     scene, settings, told = wall(), make_settings(), list[PlanningProgress]()
-    first, _ = make_plan(scene, cameras(2), settings, weights=vgg16_weights)
-    second, _ = make_plan(scene, cameras(2), settings, weights=vgg16_weights, looked=first.survey, show=told.append)
+    first, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+    second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, looked=first.survey, show=told.append)
     assert not told
     assert second.survey is first.survey
     assert torch.equal(second.seen, first.seen)
 
 
 @pytest.mark.parametrize("kept", ["none", "float32"])
-def test_what_was_built_for_the_whole_scene_is_handed_on(vgg16_weights: BackboneWeights, kept: str) -> None:
+def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneWeights, kept: str) -> None:
     """Network and lists of views; but not where Gaussians are left out, whose places in the lists would be others."""
     for scene, handed_on in ((ball(), True), (wall(), False)):
         settings = make_settings(kept_weights=kept)
-        plan, workshop = make_plan(scene, cameras(2), settings, weights=vgg16_weights)
+        plan, workshop = make_plan(scene, cameras(2), settings, weights=tiny_weights)
         inputs = (plan, scene, cameras(2), style(), settings)
-        used, fresh = (Stylizer(*inputs, weights=vgg16_weights, workshop=shop) for shop in (workshop, None))
+        used, fresh = (Stylizer(*inputs, weights=tiny_weights, workshop=shop) for shop in (workshop, None))
         assert bool(plan.seen.all()) is handed_on
         assert used.network is workshop.network
         rasterizer = used.views.rasterizer
@@ -110,9 +113,9 @@ def test_what_was_built_for_the_whole_scene_is_handed_on(vgg16_weights: Backbone
         assert torch.equal(used.sh_dc, fresh.sh_dc)
 
 
-def test_a_rasterizer_that_is_named_is_measured_and_used(vgg16_weights: BackboneWeights) -> None:
+def test_a_rasterizer_that_is_named_is_measured_and_used(tiny_weights: BackboneWeights) -> None:
     settings = make_settings(kept_weights="none")
-    stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=vgg16_weights, rasterizer="reference")
+    stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
     assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"
 
 

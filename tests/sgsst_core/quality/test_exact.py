@@ -23,8 +23,8 @@ def make(weights: BackboneWeights, scene: object = None, **values: object) -> St
     return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
 
 
-def test_an_exact_job_agrees_with_its_twin(vgg16_weights: BackboneWeights) -> None:
-    stylizer = make(vgg16_weights, wall(sh_degree=2))
+def test_an_exact_job_agrees_with_its_twin(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, wall(sh_degree=2))
     stylizer.run_step()
     twin = ExactTwin(stylizer)
     error = twin.gradient_error()
@@ -35,8 +35,8 @@ def test_an_exact_job_agrees_with_its_twin(vgg16_weights: BackboneWeights) -> No
     assert mean_loss(twin.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
 
 
-def test_half_precision_weights_have_a_small_error(vgg16_weights: BackboneWeights) -> None:
-    stylizer = make(vgg16_weights, kept_weights="half")
+def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, kept_weights="half")
     run(stylizer)
     assert approximations(stylizer) == ["half-precision blend weights"]
     error = ExactTwin(stylizer).gradient_error()
@@ -45,23 +45,23 @@ def test_half_precision_weights_have_a_small_error(vgg16_weights: BackboneWeight
     assert error.seconds_exact > 0
 
 
-def test_pruning_has_an_error_that_grows_with_what_is_pruned(vgg16_weights: BackboneWeights) -> None:
-    weights = make(vgg16_weights).plan.survey.total_weights
+def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: BackboneWeights) -> None:
+    weights = make(tiny_weights).plan.survey.total_weights
     errors = []
     for share in (0.2, 0.7):
-        stylizer = make(vgg16_weights, prune_weight=float(weights.quantile(share)))
+        stylizer = make(tiny_weights, prune_weight=float(weights.quantile(share)))
         stylizer.run_step()
         assert approximations(stylizer) == ["pruned Gaussians"]
         errors.append(ExactTwin(stylizer).gradient_error().relative_error)
     assert 0 < errors[0] < errors[1]
 
 
-def test_bfloat16_has_an_error_between_rounding_and_nonsense(vgg16_weights: BackboneWeights) -> None:
+def test_bfloat16_has_an_error_between_rounding_and_nonsense(tiny_weights: BackboneWeights) -> None:
     """Planned by hand: which processor computes it faster is not the question."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
-    plan, _ = make_plan(scene, cameras(2), settings, weights=vgg16_weights)
+    plan, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     plan = replace(plan, precision="bfloat16")
-    stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=vgg16_weights)
+    stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights)
     assert approximations(stylizer) == ["bfloat16 features"]
     error = ExactTwin(stylizer).gradient_error()
     assert 1e-3 < error.relative_error < 0.8

@@ -172,8 +172,8 @@ def test_moments_are_geometric_and_hold_both_ends(total: int, expected: list[int
 
 
 @pytest.fixture(scope="module")
-def network(vgg16_weights) -> FeatureNetwork:
-    return FeatureNetwork(vgg16_weights)
+def network(tiny_weights) -> FeatureNetwork:
+    return FeatureNetwork(tiny_weights)
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | 
 
 
 @pytest.mark.parametrize(("scene", "weighted"), [(wall(sh_degree=1), False), (ball(), True)], ids=["wall", "ball"])
-def test_gram_distance_is_that_of_float64(vgg16_weights, network, scene: Scene, weighted: bool):
+def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, weighted: bool):
     views = cameras(6)
     measured = held_out(scene, views, network, coarsest=COARSEST, weighted=weighted)
     assert measured.views == [0, 1, 2, 3]
@@ -241,7 +241,7 @@ def test_gram_distance_is_that_of_float64(vgg16_weights, network, scene: Scene, 
         image = reference.render(view_colours(sh_dc, rest_colours(scene.sh_rest, scene.means, camera)), camera)
         assert float(image.max()) > 1.2
         coverage = reference.coverage(camera) if weighted else None
-        for scale, value in gram_reference(vgg16_weights, image.clamp(0, 1), painting, coverage).items():
+        for scale, value in gram_reference(tiny_weights, image.clamp(0, 1), painting, coverage).items():
             expected[scale] += value / 4
     assert measured.measure(sh_dc).gram == pytest.approx(expected, rel=1e-4)
 
@@ -356,6 +356,7 @@ def test_a_moment_is_plain_json(network, lpips):
     assert without["long"] is None
 
 
+@pytest.mark.slow
 def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, vgg16_weights, lpips):
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene = read_scene(folder / "point_cloud.ply").scene

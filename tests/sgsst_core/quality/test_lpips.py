@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 
 import numpy as np
@@ -14,7 +15,7 @@ from skimage import data
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError, WeightsError
-from sgsst_core.features.network_weights import load_perceptual
+from sgsst_core.features.network_weights import cache_folder, load_perceptual
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from tests.sgsst_core.pictures import picture
 
@@ -190,6 +191,13 @@ def test_wrong_arguments_are_named(alex: Lpips, tmp_path):
         Lpips("squeeze")  # type: ignore[arg-type]
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
         Lpips("alex", folder=tmp_path)
+
+
+def test_a_vgg16_of_other_channels_is_refused(vgg16_weights, tiny_cache, tmp_path):
+    shutil.copy(tiny_cache / "vgg16.safetensors", tmp_path)
+    shutil.copy(cache_folder() / "lpips_vgg16.safetensors", tmp_path)
+    with pytest.raises(WeightsError, match="channels of the published VGG16"):
+        Lpips("vgg16", folder=tmp_path)
 
 
 def test_lpips_is_left_out_where_its_weights_are_not_installed(vgg16_weights, tmp_path):

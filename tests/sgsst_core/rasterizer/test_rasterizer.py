@@ -413,6 +413,7 @@ def one_thread() -> Iterator[None]:
 REAL = [("snowmiku_plush", 160), ("biker", 120), ("playbot_synthetic_sh2", 120)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "side"), REAL, ids=[name for name, _ in REAL])
 @pytest.mark.usefixtures("one_thread")
 def test_real_scenes_agree_with_the_reference(shared_data: Path, name: str, side: int) -> None:

@@ -24,19 +24,19 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def finished(vgg16_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evaluation]:
+def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evaluation]:
     """Six views of a ball of which one sees nothing, after seven steps; the loss before and after."""
     views = [*cameras(3), blind_camera(), *cameras(2)]
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3)
-    stylizer = Stylizer.planned(ball(), views, style(), settings, weights=vgg16_weights)
+    stylizer = Stylizer.planned(ball(), views, style(), settings, weights=tiny_weights)
     before = stylizer.evaluate(stylizer.evaluation_views)
     run(stylizer)
     return stylizer, before, stylizer.evaluate(stylizer.evaluation_views)
 
 
 @pytest.fixture(scope="module")
-def sources(vgg16_weights: BackboneWeights) -> Sources:
-    return Sources(Path("a/scene.ply"), 2, Path("style.png"), Path("cameras.json"), None, vgg16_weights)
+def sources(tiny_weights: BackboneWeights) -> Sources:
+    return Sources(Path("a/scene.ply"), 2, Path("style.png"), Path("cameras.json"), None, tiny_weights)
 
 
 def test_evaluation_views_are_spread_over_those_that_see_anything(

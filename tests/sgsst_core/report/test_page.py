@@ -470,13 +470,13 @@ def test_long_history_stays_small() -> None:
     assert max(path.count("L") for path in points) < 2 * PLACES + 10
 
 
-def test_page_of_a_real_job(vgg16_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
+def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
     stylizer = Stylizer.planned(
-        ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=vgg16_weights
+        ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=tiny_weights
     )
     before = stylizer.evaluate(stylizer.evaluation_views)
     stopped = run(stylizer)
-    sources = Sources(tmp_path / "ball.ply", 0, Path("style.png"), Path("cameras.json"), None, vgg16_weights)
+    sources = Sources(tmp_path / "ball.ply", 0, Path("style.png"), Path("cameras.json"), None, tiny_weights)
     after = stylizer.evaluate(stylizer.evaluation_views)
     report = json.loads(json.dumps(build_report(stylizer, sources, stopped, before, after)))
     (tmp_path / "sheet.jpg").write_bytes(sample_sheet())

@@ -17,6 +17,7 @@ def cameras_of(folder, scene, count):
     return orbit(scene, count, width=150, height=SIDE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["biker", "snowmiku_plush"])
 def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data, vgg16_weights, name):
     folder = shared_data / "scenes" / name

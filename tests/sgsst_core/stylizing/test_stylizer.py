@@ -1,4 +1,4 @@
-"""The optimiser loop with the real VGG16, on scenes so small that a step is quick."""
+"""The optimiser loop, on scenes so small that a step is quick."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def make(
 
 
 def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
-    vgg16_weights: BackboneWeights, scene: Scene
+    tiny_weights: BackboneWeights, scene: Scene
 ) -> None:
-    runs = [make(vgg16_weights, scene, views=4, seed=seed) for seed in (3, 3, 4)]
+    runs = [make(tiny_weights, scene, views=4, seed=seed) for seed in (3, 3, 4)]
     for stylizer in runs:
         assert run(stylizer) == "finished"
     first, second, other = runs
@@ -48,17 +48,17 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
     assert not torch.equal(first.sh_dc, other.sh_dc)
 
 
-def test_a_resumed_run_ends_with_the_same_bits(vgg16_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
+def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
     """Stopped in the middle of a round of views: the queue, the random generator and Adam's moments must come back."""
-    whole = make(vgg16_weights, scene, steps_sos=8)
+    whole = make(tiny_weights, scene, steps_sos=8)
     run(whole)
-    stopped = make(vgg16_weights, scene, steps_sos=8)
+    stopped = make(tiny_weights, scene, steps_sos=8)
     for _ in range(4):
         stopped.run_step()
     assert stopped.state().queue
     kept = Checkpoint(stopped.state(), stopped.plan, 1, stopped.start(), "run", versions())
     save_checkpoint(tmp_path / "c.safetensors", kept, "job")
-    resumed = make(vgg16_weights, scene, steps_sos=8)
+    resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
     assert run(resumed) == "finished"
     expected, found = whole.state(), resumed.state()
@@ -72,14 +72,12 @@ def test_a_resumed_run_ends_with_the_same_bits(vgg16_weights: BackboneWeights, s
     assert found.seconds_by_part["vgg_forward"] > stopped.seconds_by_part["vgg_forward"]
 
 
-def test_phase_1_at_its_own_scale_has_the_same_gradient(vgg16_weights: BackboneWeights, scene: Scene) -> None:
+def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """With little memory phase 1 keeps the weights of the coarsest scale only; nothing else may change."""
     options = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
     views = [resized(camera, 100) for camera in cameras(2)]
-    lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=vgg16_weights)
-    plain = Stylizer.planned(
-        scene, views, style(), make_settings(**options, kept_weights="none"), weights=vgg16_weights
-    )
+    lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=tiny_weights)
+    plain = Stylizer.planned(scene, views, style(), make_settings(**options, kept_weights="none"), weights=tiny_weights)
     assert lean.plan.coarse_weights
     assert not plain.plan.coarse_weights
     for scales in ([2], [0, 1, 2]):
@@ -88,8 +86,8 @@ def test_phase_1_at_its_own_scale_has_the_same_gradient(vgg16_weights: BackboneW
     assert run(lean) == "finished"
 
 
-def test_every_view_comes_once_a_round(vgg16_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(vgg16_weights, scene, views=4, steps_sos=12)
+def test_every_view_comes_once_a_round(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    stylizer = make(tiny_weights, scene, views=4, steps_sos=12)
     run(stylizer)
     rounds = [[record.view for record in stylizer.history[i : i + 4]] for i in (0, 4, 8)]
     assert [sorted(views) for views in rounds] == [[0, 1, 2, 3]] * 3
@@ -97,11 +95,11 @@ def test_every_view_comes_once_a_round(vgg16_weights: BackboneWeights, scene: Sc
 
 
 def test_the_first_step_moves_every_seen_value_by_the_learning_rate(
-    vgg16_weights: BackboneWeights, scene: Scene
+    tiny_weights: BackboneWeights, scene: Scene
 ) -> None:
     """Adam's first update is lr * sign(gradient), whatever the gradient's size."""
     hidden = replace(scene, means=torch.cat([scene.means[:-10], scene.means[-10:] * torch.tensor([1.0, 1.0, -1.0])]))
-    stylizer = make(vgg16_weights, hidden, views=1, learning_rate=0.05)
+    stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05)
     stylizer.run_step()
     assert not stylizer.plan.seen[-10:].any()
     moved = (stylizer.sh_dc.detach() - hidden.sh_dc[stylizer.plan.seen]).abs()
@@ -110,8 +108,8 @@ def test_the_first_step_moves_every_seen_value_by_the_learning_rate(
     torch.testing.assert_close(moved, torch.full_like(moved, 0.05), rtol=1e-3, atol=0)
 
 
-def test_learning_rate_falls_exponentially_to_its_end(vgg16_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(vgg16_weights, scene, steps_sos=5, learning_rate=0.1, learning_rate_end=0.001)
+def test_learning_rate_falls_exponentially_to_its_end(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    stylizer = make(tiny_weights, scene, steps_sos=5, learning_rate=0.1, learning_rate_end=0.001)
     rates = []
     while stylizer.step < stylizer.total:
         stylizer.run_step()
@@ -120,11 +118,11 @@ def test_learning_rate_falls_exponentially_to_its_end(vgg16_weights: BackboneWei
 
 
 def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
-    vgg16_weights: BackboneWeights, scene: Scene
+    tiny_weights: BackboneWeights, scene: Scene
 ) -> None:
-    left_out = Stylizer.planned(scene, [cameras(4)[1]], style(), make_settings(), weights=vgg16_weights)
+    left_out = Stylizer.planned(scene, [cameras(4)[1]], style(), make_settings(), weights=tiny_weights)
     start = left_out.evaluate([0])[0].total
-    stylizer = make(vgg16_weights, scene, steps_sos=20, learning_rate=0.1)
+    stylizer = make(tiny_weights, scene, steps_sos=20, learning_rate=0.1)
     before = stylizer.evaluate([0, 1, 2])[0].total
     run(stylizer)
     assert stylizer.evaluate([0, 1, 2])[0].total < 0.5 * before
@@ -132,8 +130,8 @@ def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
     assert left_out.evaluate([0])[0].total < 0.6 * start
 
 
-def test_evaluating_changes_nothing(vgg16_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(vgg16_weights, scene)
+def test_evaluating_changes_nothing(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    stylizer = make(tiny_weights, scene)
     stylizer.run_step()
     before = stylizer.state()
     stylizer.evaluate([0, 1])
@@ -145,16 +143,16 @@ def test_evaluating_changes_nothing(vgg16_weights: BackboneWeights, scene: Scene
     assert torch.equal(before.sh_dc, after.sh_dc)
 
 
-def test_time_budget_ends_the_run_with_a_checkpoint(vgg16_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(vgg16_weights, scene, max_seconds=1e-6)
+def test_time_budget_ends_the_run_with_a_checkpoint(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    stylizer = make(tiny_weights, scene, max_seconds=1e-6)
     saved: list[int] = []
     assert run(stylizer, Callbacks(checkpoint=lambda s: saved.append(s.step))) == "max-seconds"
     assert stylizer.step == 1  # the budget is looked at between steps
     assert saved == [1]
 
 
-def test_stop_ends_the_run_between_steps(vgg16_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(vgg16_weights, scene)
+def test_stop_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    stylizer = make(tiny_weights, scene)
     saved: list[int] = []
     seen: list[Progress] = []
     callbacks = Callbacks(
@@ -166,7 +164,7 @@ def test_stop_ends_the_run_between_steps(vgg16_weights: BackboneWeights, scene: 
     assert all(p.seconds_left > 0 for p in seen)
 
 
-def test_previews_and_checkpoints_come_as_often_as_asked(vgg16_weights: BackboneWeights, scene: Scene) -> None:
+def test_previews_and_checkpoints_come_as_often_as_asked(tiny_weights: BackboneWeights, scene: Scene) -> None:
     saved: list[int] = []
     shown: list[int] = []
     callbacks = Callbacks(
@@ -175,7 +173,7 @@ def test_previews_and_checkpoints_come_as_often_as_asked(vgg16_weights: Backbone
         preview=lambda s: shown.append(s.step),
         preview_seconds=1e6,
     )
-    stylizer = make(vgg16_weights, scene, steps_sos=3)
+    stylizer = make(tiny_weights, scene, steps_sos=3)
     run(stylizer, callbacks)
     assert saved == [1, 2, 3]
     assert stylizer.seconds_by_part["checkpoint"] > 0
@@ -184,16 +182,16 @@ def test_previews_and_checkpoints_come_as_often_as_asked(vgg16_weights: Backbone
 
 @pytest.mark.parametrize(("preset", "phase_1"), [("standard", 0), ("paper", 5)])
 def test_phase_1_is_left_out_where_there_is_one_scale(
-    vgg16_weights: BackboneWeights, scene: Scene, preset: PresetName, phase_1: int
+    tiny_weights: BackboneWeights, scene: Scene, preset: PresetName, phase_1: int
 ) -> None:
-    stylizer = make(vgg16_weights, scene, preset=preset)
+    stylizer = make(tiny_weights, scene, preset=preset)
     assert stylizer.plan.steps_coarse == phase_1
     assert stylizer.total == phase_1 + 5
 
 
-def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(vgg16_weights: BackboneWeights) -> None:
+def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: BackboneWeights) -> None:
     settings = make_settings(steps_coarse=1, steps_sos=1)
-    stylizer = Stylizer.planned(wall(), cameras(1, width=512, height=512), style(), settings, weights=vgg16_weights)
+    stylizer = Stylizer.planned(wall(), cameras(1, width=512, height=512), style(), settings, weights=tiny_weights)
     run(stylizer)
     first, second = stylizer.history
     assert (first.stage, list(first.terms)) == ("coarse", [1])
@@ -214,35 +212,35 @@ def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(vgg16_weights: B
     ],
 )
 def test_position_weights_are_for_views_with_an_empty_surround(
-    vgg16_weights: BackboneWeights, thing: Any, preset: PresetName, values: dict[str, Any], weighted: bool
+    tiny_weights: BackboneWeights, thing: Any, preset: PresetName, values: dict[str, Any], weighted: bool
 ) -> None:
-    stylizer = make(vgg16_weights, thing(), preset=preset, **values)
+    stylizer = make(tiny_weights, thing(), preset=preset, **values)
     assert stylizer.views.weighted is weighted
     uncovered = stylizer.plan.survey.uncovered_share
     assert uncovered > 0.3 if thing is ball else uncovered < 0.01
     assert (stylizer.views.target(0, [0]).coverage is not None) is weighted
 
 
-def test_views_that_see_nothing_are_left_out(vgg16_weights: BackboneWeights, scene: Scene) -> None:
+def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scene: Scene) -> None:
     settings = make_settings(steps_sos=3)
-    stylizer = Stylizer.planned(scene, [blind_camera(), *cameras(2)], style(), settings, weights=vgg16_weights)
+    stylizer = Stylizer.planned(scene, [blind_camera(), *cameras(2)], style(), settings, weights=tiny_weights)
     run(stylizer)
     assert stylizer.views.covered == [1, 2]
     assert {record.view for record in stylizer.history} == {1, 2}
 
 
-def test_cameras_without_any_sight_of_the_scene_are_refused(vgg16_weights: BackboneWeights, scene: Scene) -> None:
+def test_cameras_without_any_sight_of_the_scene_are_refused(tiny_weights: BackboneWeights, scene: Scene) -> None:
     with pytest.raises(CameraError, match="None of the 1 cameras sees a Gaussian"):
-        Stylizer.planned(scene, [blind_camera()], style(), make_settings(), weights=vgg16_weights)
+        Stylizer.planned(scene, [blind_camera()], style(), make_settings(), weights=tiny_weights)
     with pytest.raises(CameraError, match="no cameras"):
-        Stylizer.planned(scene, [], style(), make_settings(), weights=vgg16_weights)
+        Stylizer.planned(scene, [], style(), make_settings(), weights=tiny_weights)
 
 
-def test_photos_are_the_content_where_they_are_given(vgg16_weights: BackboneWeights, scene: Scene) -> None:
+def test_photos_are_the_content_where_they_are_given(tiny_weights: BackboneWeights, scene: Scene) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings()
-    own = Stylizer.planned(scene, cameras(1), style(), settings, weights=vgg16_weights)
-    given = Stylizer.planned(scene, cameras(1), style(), settings, weights=vgg16_weights, photos=lambda index: photo)
+    own = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights)
+    given = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
     assert own.evaluate([0])[0]["content"] == 0
     assert given.evaluate([0])[0]["content"] > 0
 
@@ -255,10 +253,10 @@ def test_larger_views_are_brought_down_to_the_limit() -> None:
     assert fit_cameras(views, make_settings()) == views
 
 
-def test_stylize_leaves_the_scene_as_it_is(vgg16_weights: BackboneWeights, scene: Scene) -> None:
+def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene: Scene) -> None:
     before = scene.sh_dc.clone()
     settings = make_settings(steps_sos=2)
-    colours = stylize(scene, cameras(2), style(), settings, weights=vgg16_weights)
+    colours = stylize(scene, cameras(2), style(), settings, weights=tiny_weights)
     assert torch.equal(scene.sh_dc, before)
     assert colours.shape == before.shape
     assert not torch.equal(colours, before)

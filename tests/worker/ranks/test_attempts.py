@@ -123,8 +123,8 @@ def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path
     ("fault", "reason"),
     [
         (Fault(1, "all_gather_rows", 30, "SIGKILL", 0.001), "was killed"),
-        (Fault(0, "checkpoint", 4, "SIGKILL"), "was killed"),
-        (Fault(1, "render", 25, "SIGSTOP"), "not answered"),
+        pytest.param(Fault(0, "checkpoint", 4, "SIGKILL"), "was killed", marks=pytest.mark.slow),
+        pytest.param(Fault(1, "render", 25, "SIGSTOP"), "not answered", marks=pytest.mark.slow),
     ],
 )
 def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
@@ -148,6 +148,7 @@ def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
     assert {path.suffix for path in request.out.parent.iterdir()} & {".safetensors", ".part"} == set()
 
 
+@pytest.mark.slow
 def test_ray_itself_may_be_killed(undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path) -> None:
     request, heard = small_request(tmp_path, STEPS), Heard()
     killed: list[int] = []
@@ -227,6 +228,7 @@ def left_of(process: psutil.Process) -> list[psutil.Process]:
     return [child for child in process.children(recursive=True) if child.is_running()]
 
 
+@pytest.mark.slow
 def test_a_killed_driver_leaves_nothing_behind(tmp_path: Path) -> None:
     process = start(command(small_request(tmp_path, STEPS)))
     family = left_of(psutil.Process(process.pid))
@@ -247,6 +249,7 @@ def test_a_killed_driver_leaves_nothing_behind(tmp_path: Path) -> None:
     assert not any(path.exists() for path in shared)
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_the_command_that_it_prints_goes_on(tmp_path: Path) -> None:
     request = small_request(tmp_path, STEPS)
     arguments = command(request, "--max-seconds", "3")

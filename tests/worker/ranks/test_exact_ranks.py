@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.features.network_weights import BackboneWeights, load_weights
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -21,11 +20,12 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
+from tests.networks import tiny_weights
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import ball, cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 
-pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 #: Largest relative error of the colour gradient against one rank's.
 BOUNDS = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -41,7 +41,7 @@ def gradient(
     memory: int = 1 << 34,
 ) -> tuple[Tensor, float, list[bool]]:
     """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
-    network = FeatureNetwork(load_weights("vgg16"), (*STYLE_LAYERS, CONTENT_LAYER), dtype)
+    network = FeatureNetwork(tiny_weights(), (*STYLE_LAYERS, CONTENT_LAYER), dtype)
     loss = SosLoss(network, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives)
     loss.speeds = speeds or loss.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
@@ -103,7 +103,8 @@ def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() ->
 def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
-    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, 70 << 20)
+    memory = int(30_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
+    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, memory)
     assert set(results[0][2]) == {True, False}
     for found, found_loss, _ in results:
         assert relative_error(found, expected) < 1e-9
@@ -114,7 +115,7 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
     """A whole run."""
     settings = make_settings("standard", keep=("ranks",), coarsest_side=40, **values)
     stylizer = Stylizer.planned(
-        scene, cameras(views), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+        scene, cameras(views), style(), settings, weights=tiny_weights(), collectives=collectives
     )
     stopped = run(stylizer)
     return {
@@ -127,10 +128,11 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
     }
 
 
-@pytest.mark.parametrize("scene", [wall(sh_degree=1), ball()], ids=["wall", "ball"])
-def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(
-    scene: Scene, vgg16_weights: BackboneWeights
-) -> None:
+@pytest.mark.parametrize(
+    "scene",
+    [pytest.param(wall(sh_degree=1), id="wall"), pytest.param(ball(), id="ball", marks=pytest.mark.slow)],
+)
+def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(scene: Scene) -> None:
     values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False}
     alone = stylize(ALONE, scene, 3, values)
     first, second = on_ranks(2, stylize, scene, 3, values)
@@ -160,7 +162,7 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
 def one_view_a_step_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
-    stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=load_weights("vgg16"))
+    stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     gradients = [stylizer.gradient(view, range(stylizer.scale_count(view)))[0] for view in views]
     return torch.stack(gradients).mean(dim=0)
 
@@ -168,8 +170,8 @@ def one_view_a_step_by_hand(views: list[int]) -> Tensor:
 def test_gradients_of_a_steps_views_are_averaged() -> None:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3)
-    stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=load_weights("vgg16"))
-    order = Stylizer.planned(scene, cameras(5), style(), settings, weights=load_weights("vgg16"))
+    stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
+    order = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     views = [order._next_view() for _ in range(3)]
     stylizer.run_step()
     assert stylizer.sh_dc.grad is not None
@@ -179,7 +181,7 @@ def test_gradients_of_a_steps_views_are_averaged() -> None:
 def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
     settings = make_settings("standard", steps_coarse=0, steps_sos=20, keep=("ranks",), rebalance=rebalance)
     stylizer = Stylizer.planned(
-        wall(), cameras(2, 192, 144), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+        wall(), cameras(2, 192, 144), style(), settings, weights=tiny_weights(), collectives=collectives
     )
     forward = stylizer.network.forward
 

@@ -17,7 +17,7 @@ from worker.ranks import cluster
 from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
 
 pytestmark = [
-    pytest.mark.usefixtures("one_thread", "vgg16_weights"),
+    pytest.mark.usefixtures("one_thread", "tiny_installed"),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent"),
 ]
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import RanksDriftedError, SceneError
-from sgsst_core.features.network_weights import BackboneWeights, load_weights
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
 from sgsst_core.parallel.division import divide_rows
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import tiny_weights
 from tests.sgsst_core.pictures import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
@@ -128,9 +128,7 @@ def test_an_error_of_the_first_rank_is_raised_on_all() -> None:
 
 def drift(collectives: Collectives) -> str:
     settings = make_settings("standard", steps_coarse=0, steps_sos=60, keep=("ranks",), early_stop=False)
-    stylizer = Stylizer.planned(
-        wall(), cameras(1), style(), settings, weights=load_weights("vgg16"), collectives=collectives
-    )
+    stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights(), collectives=collectives)
     if collectives.rank == 1:
         stylizer.sh_dc.data[3, 1] += 1e-6
     try:
@@ -141,7 +139,7 @@ def drift(collectives: Collectives) -> str:
     return ""
 
 
-def test_ranks_that_drift_apart_are_found(vgg16_weights: BackboneWeights) -> None:
+def test_ranks_that_drift_apart_are_found() -> None:
     for message in on_ranks(2, drift):
         assert message.startswith("Step 50: the ranks' colours are no longer the same.")
 
@@ -150,7 +148,7 @@ def leave_out(collectives: Collectives) -> str | int:
     settings = make_settings("standard", steps_coarse=0, steps_sos=4)
     try:
         stylizer = Stylizer.planned(
-            wall(), cameras(1, 32, 24), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+            wall(), cameras(1, 32, 24), style(), settings, weights=tiny_weights(), collectives=collectives
         )
     except RankLeftOut:
         return "left out"
@@ -161,7 +159,7 @@ def leave_out(collectives: Collectives) -> str | int:
     return stylizer.collectives.size
 
 
-def test_ranks_that_would_only_add_communication_are_left_out(vgg16_weights: BackboneWeights) -> None:
+def test_ranks_that_would_only_add_communication_are_left_out() -> None:
     """A view of 32 x 24 pixels: every tile is all halo."""
     results = on_ranks(4, leave_out)
     taking_part = [result for result in results if result != "left out"]

@@ -1,4 +1,4 @@
-"""What `plan`, `check` and `render` do: read and check every input, work, write every output. Prints nothing.
+"""What `plan`, `check` and `render` do with a scene: read and check every input, work, write outputs. Prints nothing.
 
 `stylize` is `worker.job`, on one rank or several.
 """

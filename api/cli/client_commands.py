@@ -1,9 +1,8 @@
-"""Commands of the service: `serve`, `keys`, and those of its clients. They import no PyTorch."""
+"""Commands for those who use a service: `submit`, `status`, `watch`, `download` and so on. They import no PyTorch."""
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -20,7 +19,10 @@ from api.cli.options import with_options
 from service.parameters import JobParameters
 
 if TYPE_CHECKING:
-    from api.client.client import Client, Job
+    from stamina.instrumentation import RetryDetails
+
+    from api.client.answers import Job
+    from api.client.client import Client
 
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
@@ -34,31 +36,12 @@ UrlOption = Annotated[
 KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [SGSST_KEY]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.", show_default=False)]
-DataOption = Annotated[Path | None, typer.Option(help="Folder of the service. [SGSST_DATA, else ./sgsst-data]")]
 
 
 def add_to(app: typer.Typer) -> None:
     """Add all commands of this module."""
-    for command in (serve, submit, status, watch, download, cancel, retry, delete, jobs):
+    for command in (submit, status, watch, download, cancel, retry, delete, jobs):
         app.command()(command)
-    keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
-    keys_app.command("create")(create_key)
-    keys_app.command("list")(list_keys)
-    keys_app.command("revoke")(revoke_key)
-    app.add_typer(keys_app, name="keys")
-
-
-def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on. [127.0.0.1: this machine only]")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="[8000]")] = None,
-    data: DataOption = None,
-) -> None:
-    """Run the service on this machine: HTTP API and dispatcher. Settings are environment variables, SGSST_..."""
-    chosen = {"SGSST_HOST": host, "SGSST_PORT": port, "SGSST_DATA": data.absolute() if data else None}
-    os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
-    from api.cli.serve import serve as run
-
-    run(_service_settings(), error_console.print)
 
 
 @with_options(JobParameters)
@@ -79,7 +62,7 @@ def submit(
 ) -> None:
     """Send a job to a service. Options are those of stylize; with --out, wait for the result."""
     told = options.model_dump(mode="json", exclude_unset=True)
-    chosen = {"name": scene.stem, **told, **_further(parameters)}
+    chosen = {"name": scene.stem, **told, **_parse_parameters(parameters)}
     with _client(url, key) as client:
         if dry_run:
             plan = client.plan(scene, style, cameras=cameras, photos=images, **chosen)
@@ -178,80 +161,24 @@ def jobs(
     Console(width=None if out_console.is_terminal else 140, highlight=False, markup=False).print(table)
 
 
-# --- keys ----------------------------------------------------------------------------------------------------------
-
-
-def create_key(
-    name: Annotated[str, typer.Argument(help="Whose it is, for people.", show_default=False)],
-    priority: Annotated[int, typer.Option(help="Jobs of a higher one go first.")] = 0,
-    data: DataOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Make an API key and print it; it is stored as a digest only, and cannot be shown again."""
-    row, text = _store(data).keys.create(name, priority)
-    if as_json:
-        out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
-        return
-    error_console.print(f"Key {row.id} of {row.name!r}. It is shown only now:")
-    out_console.print(text)
-
-
-def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
-    """List API keys, without the keys themselves."""
-    rows = _store(data).keys.all()
-    if as_json:
-        shown = [
-            {"id": row.id, "name": row.name, "priority": row.priority, "revoked": bool(row.revoked_at)} for row in rows
-        ]
-        out_console.print(json.dumps(shown))
-        return
-    table = Table("id", "name", "priority", "state")
-    for row in rows:
-        table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
-    Console(highlight=False, markup=False).print(table)
-
-
-def revoke_key(
-    key_id: Annotated[str, typer.Argument(metavar="ID", help="As shown by keys list.", show_default=False)],
-    data: DataOption = None,
-) -> None:
-    """Make an API key useless from now on."""
-    row = _store(data).keys.revoke(key_id)
-    error_console.print(f"Key {row.id} of {row.name!r} is revoked.")
-
-
 # --- shared --------------------------------------------------------------------------------------------------------
 
 
-def _service_settings() -> Any:
-    from pydantic import ValidationError
-
-    from service.settings import ServiceSettings
-    from sgsst_core.errors import SettingsError
-
-    try:
-        return ServiceSettings()
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = "SGSST_" + ".".join(str(part) for part in first["loc"]).upper()
-        raise SettingsError(f"Environment variable {name} = {first['input']!r}: {first['msg']}.") from error
-
-
-def _store(data: Path | None) -> Any:
-    if data is not None:
-        os.environ["SGSST_DATA"] = str(data.absolute())
-    from service.store import open_store
-
-    return open_store(_service_settings())
-
-
 def _client(url: str | None, key: str | None) -> Client:
+    import stamina.instrumentation
+
     from api.client.client import Client
 
+    stamina.instrumentation.set_on_retry_hooks([_tell_of_retry])
     return Client(url, key)
 
 
-def _further(text: str) -> dict[str, Any]:
+def _tell_of_retry(details: RetryDetails) -> None:
+    what = str(details.caused_by) or type(details.caused_by).__name__
+    error_console.print(f"{what}: trying again in {details.wait_for:.0f} s")
+
+
+def _parse_parameters(text: str) -> dict[str, Any]:
     try:
         values = json.loads(text)
     except ValueError as error:

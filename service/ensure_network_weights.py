@@ -1,4 +1,4 @@
-"""`python -m service.ensure_weights`: fetch the smallest network where none is installed, and say so."""
+"""`python -m service.ensure_network_weights`: fetch the smallest network where none is installed, and say so."""
 
 from __future__ import annotations
 

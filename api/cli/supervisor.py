@@ -53,20 +53,20 @@ class _Child:
         )
         self.started = time.monotonic()
 
-    def look(self, say: Callable[[str], None]) -> None:
+    def restart_if_dead(self, announce: Callable[[str], None]) -> None:
         """Start it again where it has died."""
         now = time.monotonic()
         if self.process is not None and self.process.poll() is not None:
             lived = now - self.started
             self.wait = 0.0 if lived > _SHORT_LIFE else min(_LONGEST_WAIT, max(0.5, 2 * self.wait))
             self.not_before = now + self.wait
-            say(f"The {self.name} ended with code {self.process.returncode}; it is started again.")
+            announce(f"The {self.name} ended with code {self.process.returncode}; it is started again.")
             self.process = None
         if self.process is None and now >= self.not_before:
             self.start()
 
 
-def serve(settings: ServiceSettings, say: Callable[[str], None]) -> None:
+def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
     """Run API and dispatcher until SIGTERM or Ctrl-C; running jobs save their state then. A second one ends at once.
 
     The listening socket is this process': while the API is started again, connections wait instead of being refused.
@@ -87,9 +87,9 @@ def serve(settings: ServiceSettings, say: Callable[[str], None]) -> None:
             "API", [sys.executable, "-m", "api.http.server", "--fd", str(listener.fileno())], (listener.fileno(),)
         )
         dispatcher = _Child("dispatcher", [sys.executable, "-m", "service.scheduling.dispatcher"])
-        if subprocess.run([sys.executable, "-m", "service.ensure_weights"], check=False).returncode:
+        if subprocess.run([sys.executable, "-m", "service.ensure_network_weights"], check=False).returncode:
             raise ServeError("Without a feature network no job can run. `sgsst weights list` shows where to get one.")
-        _run([api, dispatcher], settings, say, _address(settings, listener))
+        _run([api, dispatcher], settings, announce, _address(settings, listener))
 
 
 def _listen(settings: ServiceSettings) -> socket.socket:
@@ -112,7 +112,7 @@ def _address(settings: ServiceSettings, listener: socket.socket) -> str:
     return f"http://{host}:{listener.getsockname()[1]}"
 
 
-def _run(children: list[_Child], settings: ServiceSettings, say: Callable[[str], None], address: str) -> None:
+def _run(children: list[_Child], settings: ServiceSettings, announce: Callable[[str], None], address: str) -> None:
     signals: list[int] = []
 
     def handle(number: int, _frame: FrameType | None) -> None:
@@ -122,12 +122,12 @@ def _run(children: list[_Child], settings: ServiceSettings, say: Callable[[str],
         signal.signal(number, handle)
     for child in children:
         child.start()
-    say(f"Serving at {address} (documentation: {address}/docs). Data: {settings.folder}. Ctrl-C stops.")
+    announce(f"Serving at {address} (documentation: {address}/docs). Data: {settings.folder}. Ctrl-C stops.")
     while not signals:
         for child in children:
-            child.look(say)
+            child.restart_if_dead(announce)
         time.sleep(_LOOK_SECONDS)
-    say("Stopping; running jobs save their state. Ctrl-C again ends at once.")
+    announce("Stopping; running jobs save their state. Ctrl-C again ends at once.")
     processes = [child.process for child in children if child.process is not None]
     for process in processes:
         process.send_signal(signal.SIGTERM)

@@ -1,0 +1,104 @@
+"""Commands for those who run a service on this machine: `serve` and `keys`. They import no PyTorch."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from api.cli.client_commands import JsonOption, error_console, out_console
+
+if TYPE_CHECKING:
+    from service.settings import ServiceSettings
+    from service.store import Store
+
+DataOption = Annotated[Path | None, typer.Option(help="Folder of the service. [SGSST_DATA, else ./sgsst-data]")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add all commands of this module."""
+    app.command()(serve)
+    keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
+    keys_app.command("create")(create_key)
+    keys_app.command("list")(list_keys)
+    keys_app.command("revoke")(revoke_key)
+    app.add_typer(keys_app, name="keys")
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on. [127.0.0.1: this machine only]")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="[8000]")] = None,
+    data: DataOption = None,
+) -> None:
+    """Run the service on this machine: HTTP API and dispatcher. Settings are environment variables, SGSST_..."""
+    chosen = {"SGSST_HOST": host, "SGSST_PORT": port, "SGSST_DATA": data.absolute() if data else None}
+    os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
+    from api.cli.supervisor import serve as run
+
+    run(_service_settings(), error_console.print)
+
+
+def create_key(
+    name: Annotated[str, typer.Argument(help="Whose it is, for people.", show_default=False)],
+    priority: Annotated[int, typer.Option(help="Jobs of a higher one go first.")] = 0,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make an API key and print it; it is stored as a digest only, and cannot be shown again."""
+    row, text = _open_store(data).keys.create(name, priority)
+    if as_json:
+        out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
+        return
+    error_console.print(f"Key {row.id} of {row.name!r}. It is shown only now:")
+    out_console.print(text)
+
+
+def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
+    """List API keys, without the keys themselves."""
+    rows = _open_store(data).keys.all()
+    if as_json:
+        shown = [
+            {"id": row.id, "name": row.name, "priority": row.priority, "revoked": bool(row.revoked_at)} for row in rows
+        ]
+        out_console.print(json.dumps(shown))
+        return
+    table = Table("id", "name", "priority", "state")
+    for row in rows:
+        table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
+    Console(highlight=False, markup=False).print(table)
+
+
+def revoke_key(
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="As shown by keys list.", show_default=False)],
+    data: DataOption = None,
+) -> None:
+    """Make an API key useless from now on."""
+    row = _open_store(data).keys.revoke(key_id)
+    error_console.print(f"Key {row.id} of {row.name!r} is revoked.")
+
+
+def _service_settings() -> ServiceSettings:
+    from pydantic import ValidationError
+
+    from service.settings import ServiceSettings
+    from sgsst_core.errors import SettingsError
+
+    try:
+        return ServiceSettings()
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "SGSST_" + ".".join(str(part) for part in first["loc"]).upper()
+        raise SettingsError(f"Environment variable {name} = {first['input']!r}: {first['msg']}.") from error
+
+
+def _open_store(data: Path | None) -> Store:
+    if data is not None:
+        os.environ["SGSST_DATA"] = str(data.absolute())
+    from service.store import open_store
+
+    return open_store(_service_settings())

@@ -1,0 +1,83 @@
+"""One download: what is asked for, and what becomes of the answer. Sends nothing itself."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+
+from api.client.answers import ApiError
+
+Progress = Callable[[int, int], None]
+
+#: Bytes that are read from the disk or written to it at a time.
+BLOCK = 1 << 20
+
+
+class Download:
+    """A file on its way to a target: a part that is there goes on, and the whole is checked by its SHA-256.
+
+    Attributes:
+        path: of the file on the service.
+    """
+
+    def __init__(self, path: str, target: Path, progress: Progress) -> None:
+        self.path = path
+        self._target, self._progress = target, progress
+        self._part = target.with_name(target.name + ".part")
+        self._stamp = target.with_name(target.name + ".part.etag")
+        self._tag = ""
+        self._done = self._size = 0
+
+    def headers(self) -> dict[str, str]:
+        """Of the request: where to go on."""
+        self._done = self._part.stat().st_size if self._part.exists() else 0
+        if not self._done or not self._stamp.exists():
+            return {}
+        return {"Range": f"bytes={self._done}-", "If-Range": self._stamp.read_text()}
+
+    def begin(self, response: httpx.Response) -> bool:
+        """Take the head of a good answer, or of 416, which says that there is nothing behind what is there.
+
+        Returns:
+            Whether its body is to be written.
+        """
+        self._tag = response.headers.get("etag", "")
+        if response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+            return False
+        if response.status_code != httpx.codes.PARTIAL_CONTENT:
+            self._done = 0
+            self._stamp.write_text(self._tag)
+            self._part.write_bytes(b"")
+        self._size = self._done + int(response.headers.get("content-length", 0))
+        return True
+
+    def write(self, block: bytes) -> None:
+        """Put a block behind what is there."""
+        with self._part.open("ab") as file:
+            file.write(block)
+        self._done += len(block)
+
+    def report(self) -> None:
+        """Tell how far it is."""
+        self._progress(self._done, self._size)
+
+    def finish(self) -> None:
+        """Check the whole, and give it its name.
+
+        Raises:
+            ApiError: it is not what was sent; it was removed.
+        """
+        expected = self._stamp.read_text() if self._stamp.exists() else self._tag
+        self._stamp.unlink(missing_ok=True)
+        if _sha256(self._part) != expected.strip('"'):
+            self._part.unlink()
+            raise ApiError(f"{self.path}: what arrived is not what was sent. Try again.", 460)
+        self._part.replace(self._target)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,68 @@
+"""The files of a job on the client's side: which are sent, and under which names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from api.client.answers import RequestError
+
+_PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """A file to send: the role that it has in the job, where it is, its bytes, and the name that the service sees."""
+
+    role: str
+    path: Path
+    name: str
+    size: int
+
+
+def input_files(scene: Path, style: Path, cameras: Path | None, photos: Path | None) -> list[InputFile]:
+    """Everything that a job needs.
+
+    Raises:
+        RequestError: something is not there.
+    """
+    found = [("scene", scene, scene.name), ("style", style, style.name)]
+    found += [("cameras", path, path.name) for path in (camera_files(cameras) if cameras else [])]
+    found += [("photos", path, name) for path, name in (photo_files(photos) if photos else [])]
+    for _, path, _ in found:
+        if not path.is_file():
+            raise RequestError(f"{path}: is not a file. Check the path.")
+    return [InputFile(role, path, name, path.stat().st_size) for role, path, name in found]
+
+
+def camera_files(path: Path) -> list[Path]:
+    """The files to send for what `sgsst stylize --cameras` takes: a JSON file, a COLMAP model or a folder with either.
+
+    Raises:
+        RequestError: there are none.
+    """
+    if path.is_file() and path.suffix == ".json":
+        companion = path.with_name("dataparser_transforms.json")
+        return [path, companion] if companion.is_file() and companion != path else [path]
+    folder = path if path.is_dir() else path.parent
+    for model in (folder, folder / "sparse" / "0", folder / "sparse"):
+        for suffix in (".bin", ".txt"):
+            if (model / f"cameras{suffix}").is_file():
+                names = ("cameras", "images", "points3D", "rigs", "frames")
+                return [file for name in names if (file := model / f"{name}{suffix}").is_file()]
+    for name in ("transforms.json", "cameras.json"):
+        if (folder / name).is_file() and path.is_dir():
+            return camera_files(folder / name)
+    raise RequestError(f"{path}: holds no cameras. Give a cameras.json, a COLMAP model or a transforms.json.")
+
+
+def photo_files(folder: Path) -> list[tuple[Path, str]]:
+    """All photos below a folder, with the names under which they are sent.
+
+    Raises:
+        RequestError: there are none.
+    """
+    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
+    if not found:
+        raise RequestError(f"{folder}: holds no photos.")
+    return [(path, path.relative_to(folder).as_posix()) for path in found]

@@ -1,0 +1,108 @@
+"""Sending files: large ones in parts that go on after a lost connection, a job's small ones in its own request."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import secrets
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from api.client.answers import ApiError, RequestError
+from api.client.downloads import Progress
+from api.client.inputs import InputFile, input_files
+from api.client.transport import Call, FileWork, Steps
+
+#: Files from this size on are uploaded in parts.
+PART_BYTES = 16 << 20
+
+
+def upload(path: Path, name: str, progress: Progress) -> Steps[str]:
+    """Send a file in parts; returns the upload's id."""
+    size = path.stat().st_size
+    created = (yield Call("POST", "/v1/uploads", {"headers": _creation_headers(name, size)})).json()
+    where = f"/v1/uploads/{created['id']}"
+    offset = int(created["offset"])
+    while offset < size:
+        part, headers = yield FileWork(partial(_read_part, path, offset))
+        try:
+            yield Call("PATCH", where, {"content": part, "headers": headers})
+            offset += len(part)
+        except ApiError as error:
+            if error.status != 409:
+                raise
+            offset = int((yield Call("HEAD", where)).headers["Upload-Offset"])
+        progress(offset, size)
+    return str(created["id"])
+
+
+def _creation_headers(name: str, size: int) -> dict[str, str]:
+    return {
+        "Tus-Resumable": "1.0.0",
+        "Upload-Length": str(size),
+        "Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}",
+        "Idempotency-Key": secrets.token_hex(16),
+    }
+
+
+def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
+    """A part of a file, and the headers to send it with."""
+    with path.open("rb") as file:
+        file.seek(offset)
+        part = file.read(PART_BYTES)
+    if not part:
+        raise RequestError(f"{path}: has become shorter while it was sent. Send it again.")
+    digest = base64.b64encode(hashlib.sha256(part).digest()).decode()
+    return part, {
+        "Tus-Resumable": "1.0.0",
+        "Upload-Offset": str(offset),
+        "Upload-Checksum": f"sha256 {digest}",
+        "Content-Type": "application/offset+octet-stream",
+    }
+
+
+def create_job(
+    files: tuple[Path, Path, Path | None, Path | None],
+    parameters: Mapping[str, Any],
+    *,
+    webhook: str | None = None,
+    progress: Progress,
+    dry_run: bool,
+) -> Steps[dict[str, Any]]:
+    """Send a job; returns what the service answers.
+
+    Args:
+        files: scene, style, cameras and photos.
+        parameters: of the job; None leaves one out.
+        webhook: URL that is told when the job has ended.
+        progress: called with the bytes that are up and those of all large files.
+        dry_run: plan the job instead of queueing it.
+    """
+    inputs: list[InputFile] = yield FileWork(partial(input_files, *files))
+    total = sum(file.size for file in inputs if file.size > PART_BYTES)
+    done = 0
+    fields: list[tuple[str, Any]] = []
+    for file in inputs:
+        if file.size > PART_BYTES:
+            upload_id = yield from upload(file.path, file.name, partial(_report_sum, progress, done, total))
+            fields.append((file.role, (None, upload_id)))
+            done += file.size
+        else:
+            content = yield FileWork(file.path.read_bytes)
+            fields.append((file.role, (file.name, content, "application/octet-stream")))
+    told = {name: value for name, value in parameters.items() if value is not None}
+    fields.append(("parameters", (None, json.dumps(told))))
+    if webhook:
+        fields.append(("webhook", (None, webhook)))
+    headers = {} if dry_run else {"Idempotency-Key": secrets.token_hex(16)}
+    options = {"params": {"dry_run": dry_run}, "files": fields, "headers": headers}
+    answer: dict[str, Any] = (yield Call("POST", "/v1/jobs", options)).json()
+    return answer
+
+
+def _report_sum(progress: Progress, before: int, total: int, done: int, _size: int) -> None:
+    """Tell of one file as a part of all of them."""
+    progress(before + done, total)

@@ -1,0 +1,137 @@
+"""The bytes of an upload in parts: written behind what is there, by one request at a time, and saved as they come."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator
+
+from fastapi import Request
+
+from api.http.context import Context
+from api.http.multipart import BadRequestError, body_blocks
+from service.errors import NotFoundError, ServiceError, TooLargeError
+from service.files.blobs import write_all
+from service.store.tables import UploadRow
+
+#: Of digests that a part may be announced with.
+ALGORITHMS = ("sha256", "sha1", "md5")
+#: Bytes after which an upload's state is saved, so that a crash costs no more than these.
+_SAVE_BYTES = 64 << 20
+#: Uploads that a request is writing to now: a second one has to wait for its turn.
+_written_now: set[str] = set()
+
+
+class ChecksumError(ServiceError):
+    """What arrived is not what was sent."""
+
+    code, status = "checksum-mismatch", 460
+
+
+class LockedError(ServiceError):
+    """Another request is writing to this upload."""
+
+    code, status = "upload-locked", 423
+
+
+@contextlib.contextmanager
+def only_writer(upload_id: str) -> Iterator[None]:
+    """Keep other requests from writing to an upload.
+
+    Raises:
+        LockedError: one does already.
+    """
+    if upload_id in _written_now:
+        raise LockedError("Another request is writing to this upload. Ask for its offset, and go on from there.")
+    _written_now.add(upload_id)
+    try:
+        yield
+    finally:
+        _written_now.discard(upload_id)
+
+
+async def append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
+    """Write the request's body behind what is there; returns when the upload expires now."""
+    writer = _Writer(context, row, wanted)
+    try:
+        async for block in body_blocks(request, context.settings):
+            await asyncio.to_thread(writer.write, block)
+    except ServiceError:
+        if wanted is None:
+            await asyncio.to_thread(writer.save)  # what has come is good
+        writer.close()
+        raise
+    except BaseException:
+        writer.close()
+        raise
+    try:
+        return await asyncio.to_thread(writer.finish)
+    finally:
+        writer.close()
+
+
+class _Writer:
+    """The file of an unfinished upload, from the offset that the store knows on."""
+
+    def __init__(self, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> None:
+        self._context, self._row, self._wanted = context, row, wanted
+        path = context.blobs.upload_path(row.id)
+        there = path.stat().st_size if path.exists() else 0
+        if there < row.offset:  # zeros would take the place of what is missing
+            raise NotFoundError(f"The bytes of upload {row.id} are gone. Begin a new one.")
+        self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
+        self._file.truncate(row.offset)  # a crash may have left more, of which nothing is known
+        self._file.seek(row.offset)
+        self._digest = hashlib.new(wanted[0]) if wanted else None
+        self._offset = self._saved = row.offset
+        self._seconds = context.settings.upload_hours * 3600
+
+    def write(self, block: bytes) -> None:
+        if self._offset + len(block) > self._row.length:
+            raise TooLargeError(
+                f"More bytes come than the {self._row.length:,} of Upload-Length.", limit=self._row.length
+            )
+        self._context.blobs.ensure_room(len(block))
+        write_all(self._file, block)
+        self._offset += len(block)
+        if self._digest is not None:
+            self._digest.update(block)
+        elif self._offset - self._saved >= _SAVE_BYTES:
+            self.save()
+
+    def save(self) -> float:
+        """Make what has come durable, then tell the store."""
+        os.fsync(self._file.fileno())
+        self._saved = self._offset
+        return self._context.store.inputs.advance_upload(self._row.id, self._offset, self._seconds)
+
+    def finish(self) -> float:
+        """The request has ended: check it, save it, and where that was the last part make the file a blob."""
+        if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
+            self._file.truncate(self._row.offset)
+            raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
+        expires = self.save()
+        if self._offset == self._row.length:
+            self._context.blobs.finish_upload(self._row, self._seconds)
+        return expires
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def parse_checksum(header: str) -> tuple[str, bytes]:
+    """Algorithm and digest of an Upload-Checksum.
+
+    Raises:
+        BadRequestError: it is none.
+    """
+    name, _, value = header.partition(" ")
+    if name not in ALGORITHMS:
+        raise BadRequestError(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(ALGORITHMS)}.")
+    try:
+        return name, base64.b64decode(value, validate=True)
+    except ValueError as error:  # also for letters that are not ASCII
+        raise BadRequestError("Upload-Checksum: the digest is not base64.") from error

@@ -1,0 +1,26 @@
+"""Names of dispatchers, by which others tell whether one still runs."""
+
+from __future__ import annotations
+
+import hashlib
+import socket
+
+from worker.processes import ProcessId, home
+
+
+def own_name() -> str:
+    """Names this process for good: where it runs, its number there, and when it started."""
+    own = ProcessId.of_this()
+    return f"{socket.gethostname()[:40]}-{_home_digest()}-{own.number}-{int(own.started)}"
+
+
+def is_dead(name: str) -> bool:
+    """Whether a dispatcher of that name ran where this process can see it, and is gone."""
+    parts = name.rsplit("-", 3)
+    if len(parts) != 4 or parts[1] != _home_digest() or not (parts[2] + parts[3]).isdigit():
+        return False
+    return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
+
+
+def _home_digest() -> str:
+    return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]

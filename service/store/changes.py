@@ -1,0 +1,75 @@
+"""Changes of a job's rows that users and dispatchers share: its state, its events, its end. Within a transaction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import delete, insert
+from sqlalchemy.orm import Session
+
+from service.store.database import count, new_id
+from service.store.states import JobStatus, Transition, next_status
+from service.store.tables import Base, BlobUseRow, DeliveryRow, EventRow, JobRow
+
+_EVENTS = Base.metadata.tables[EventRow.__tablename__]
+
+
+def move(session: Session, job: JobRow, transition: Transition, now: float) -> None:
+    """Bring a job to another state, and let its watchers know.
+
+    Raises:
+        TransitionError: there is no such way out of its state.
+    """
+    job.status = next_status(job.status, transition)
+    add_status_event(session, job, now)
+
+
+def end(session: Session, job: JobRow, transition: Transition, now: float, retention: float) -> None:
+    """Bring a job to its end.
+
+    Args:
+        retention: seconds that its results are kept.
+    """
+    status = next_status(job.status, transition)
+    job.finished_at, job.expires_at = now, now + retention
+    job.lease_owner = job.lease_expires_at = None
+    move(session, job, transition, now)
+    count(session, "sgsst_jobs_finished_total", f'status="{status}"')
+    if job.webhook:
+        session.add(_delivery(job, job.webhook, status, now))
+
+
+def _delivery(job: JobRow, url: str, status: JobStatus, now: float) -> DeliveryRow:
+    """The message that tells a job's webhook of its end."""
+    data = {"id": job.id, "name": job.name, "status": status, "error": job.error}
+    body = {"type": f"job.{status}", "timestamp": now, "data": data}
+    return DeliveryRow(id=new_id("msg", now), job_id=job.id, url=url, body=body, tries=0, next_at=now)
+
+
+def add_status_event(session: Session, job: JobRow, now: float) -> None:
+    """Let watchers know of a job's state."""
+    data: dict[str, Any] = {"status": job.status, "attempt": job.attempt}
+    if job.error:
+        data["error"] = job.error
+    add_event(session, job.id, "status", data, now)
+
+
+def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
+    """Let watchers know of something that happened to a job."""
+    session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
+
+
+def release_inputs(session: Session, job_id: str) -> None:
+    """Let go of a job's inputs; blobs that nobody else holds are collected later."""
+    session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job_id)))
+
+
+def holder_name(job_id: str) -> str:
+    """The name under which a job holds its inputs."""
+    return f"job:{job_id}"
+
+
+def forget(session: Session, job: JobRow) -> None:
+    """Remove a job's rows."""
+    release_inputs(session, job.id)
+    session.delete(job)  # its attempts, events and artifacts go with it

@@ -1,0 +1,340 @@
+"""Leases of jobs: what a dispatcher does with a job, from taking it to its end.
+
+A job is leased for a few seconds at a time by the dispatcher that runs it. Each lease of a job has a number, its epoch;
+every write of a dispatcher names the epoch that it holds and does nothing but raise `LeaseLostError` where the job has
+been leased again since. So two dispatchers may both believe that they run a job, and still only one can write.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Select, and_, case, delete, func, or_, select, update
+from sqlalchemy.orm import Session
+
+from service.errors import LeaseLostError
+from service.store.changes import add_event, end, move
+from service.store.database import Database, count, upsert
+from service.store.retries import FailureCount, RetryPolicy, Verdict
+from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
+from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, TurnRow
+
+#: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
+KEPT_PROGRESS = 200
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to write to a job, until somebody else has a higher epoch."""
+
+    job: JobRow
+    dispatcher: str
+    epoch: int
+
+    @property
+    def job_id(self) -> str:
+        """The job's id."""
+        return self.job.id
+
+
+@dataclass(frozen=True)
+class Published:
+    """A file that was put to its place, for the row that makes it visible; `step` is a checkpoint's."""
+
+    name: str
+    location: str
+    size: int
+    sha256: str
+    step: int | None = None
+
+
+class Leases:
+    """The dispatchers' part of the store.
+
+    Args:
+        seconds: after which a lease that was not renewed runs out.
+        policy: what becomes of a job whose attempt failed.
+        retention: seconds that the results of a job that has ended are kept.
+    """
+
+    def __init__(self, database: Database, seconds: float, policy: RetryPolicy, retention: float) -> None:
+        self._database = database
+        self._seconds = seconds
+        self._policy = policy
+        self._retention = retention
+
+    # --- taking and holding ----------------------------------------------------------------------------------------
+
+    def take(self, dispatcher: str, fits: Callable[[JobRow], bool] = lambda job: True) -> Lease | None:
+        """Take the next job: the highest priority, then the owner who has waited longest, then the oldest job.
+
+        Jobs whose lease has run out come with the queued ones. One that has used up its attempts ends as failed
+        here, one that was being canceled as canceled, and the next is looked at.
+
+        Args:
+            dispatcher: its name.
+            fits: whether there is room for the job. It is asked for the next one only: smaller jobs do not
+                overtake a big one for ever.
+        """
+        while True:
+            now = self._database.clock()
+            with self._database.writing() as session:
+                job = session.scalar(self._next(now))
+                if job is None:
+                    return None
+                lost = job.status in ACTIVE
+                if lost and self._close_lost(session, job, now):
+                    continue
+                if fits(job):
+                    return self._lease(session, job, dispatcher, now)
+                if lost:  # else the same loss would count again the next time that somebody looks
+                    self._requeue(session, job, now, now)
+                return None
+
+    def waiting(self) -> int:
+        """How many jobs could be leased now."""
+        with self._database.reading() as session:
+            query = select(func.count()).select_from(JobRow).where(_ready(self._database.clock()))
+            return session.scalar(query) or 0
+
+    @staticmethod
+    def _next(now: float) -> Select[JobRow]:
+        turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
+        query = select(JobRow).outerjoin(TurnRow, TurnRow.owner == JobRow.owner).where(_ready(now))
+        order = (JobRow.priority.desc(), turn, JobRow.queued_at, JobRow.id)
+        return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
+
+    def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
+        job.attempt += 1
+        job.lease_epoch += 1
+        job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
+        job.started_at = job.started_at or now
+        attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
+        attempt.started_at = now
+        session.add(attempt)
+        served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
+        turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
+        session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
+        move(session, job, Transition.TAKE, now)
+        count(session, "sgsst_attempts_total")
+        count(session, "sgsst_queue_wait_seconds_sum", amount=max(0.0, now - job.queued_at))
+        count(session, "sgsst_queue_wait_seconds_count")
+        return Lease(job, dispatcher, job.lease_epoch)
+
+    def renew(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
+        """Hold leases for another term; a job's status where it is still held, None where the lease is lost."""
+        until = self._database.clock() + self._seconds
+        found: dict[str, JobStatus | None] = {}
+        with self._database.writing() as session:
+            for lease in leases:
+                job = self._held(session, lease)
+                if job is not None:
+                    job.lease_expires_at = until
+                found[lease.job_id] = JobStatus(job.status) if job is not None else None
+        return found
+
+    def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
+        """As `renew`, without renewing: what has become of leased jobs."""
+        ids = [lease.job_id for lease in leases]
+        with self._database.reading() as session:
+            rows = {row.id: row for row in session.scalars(select(JobRow).where(JobRow.id.in_(ids)))}
+        return {
+            lease.job_id: JobStatus(job.status) if (job := rows.get(lease.job_id)) and _is_held(job, lease) else None
+            for lease in leases
+        }
+
+    def holders(self) -> list[str]:
+        """Names of all dispatchers that hold a lease."""
+        with self._database.reading() as session:
+            query = select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
+            return sorted({str(owner) for owner in session.scalars(query)})
+
+    def run_out(self, dispatcher: str) -> None:
+        """Let the leases of a dispatcher run out now: it is known to be dead."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
+            session.execute(update(JobRow).where(held).values(lease_expires_at=now - 1e-3))
+
+    # --- while the job runs ----------------------------------------------------------------------------------------
+
+    def begin(self, lease: Lease) -> None:
+        """Tell that the job's inputs are read and its steps begin; a job that is being canceled stays so."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            if job.status == JobStatus.STARTING:
+                move(session, job, Transition.BEGIN, now)
+
+    def report_progress(self, lease: Lease, progress: dict[str, Any]) -> None:
+        """Replace the job's progress."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            job.progress = {**progress, "updated_at": now}
+            add_event(session, job.id, "progress", job.progress, now)
+            mine = and_(EventRow.job_id == job.id, EventRow.kind == "progress")
+            oldest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(KEPT_PROGRESS).limit(1)
+            found = session.scalar(oldest)
+            if found is not None:
+                session.execute(delete(EventRow).where(mine, EventRow.id <= found))
+
+    def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
+        """Make files visible; those of the same names are replaced. Returns locations that nothing refers to now."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            return _publish(session, job, files, now)
+
+    # --- the end of an attempt -------------------------------------------------------------------------------------
+
+    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
+        """End a job with its results, all in one transaction; as `publish` otherwise.
+
+        A job whose cancellation came too late has succeeded.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            unused = _publish(session, job, files, now)
+            hidden = ArtifactRow.name.startswith(".")  # what an unfinished job would go on from
+            session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, hidden))
+            job.result, job.error = result, None
+            _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
+            count(session, "sgsst_job_seconds_sum", amount=max(0.0, now - (job.started_at or now)))
+            count(session, "sgsst_job_seconds_count")
+            end(session, job, Transition.SUCCEED, now, self._retention)
+            return unused
+
+    def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
+        """End an attempt that failed: the job is queued again after a wait, or has failed for good (`retries`).
+
+        Args:
+            lease: of the job.
+            error: `code` and `message`.
+            permanent: another attempt would fail the same way.
+
+        Returns:
+            Whether the job will be tried again.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            verdict = self._close(session, job, AttemptOutcome.FAILED, error, now, permanent=permanent)
+            if verdict.transition != Transition.STOP:
+                job.error = error
+            if verdict.transition != Transition.REQUEUE:
+                end(session, job, verdict.transition, now, self._retention)
+                return False
+            self._requeue(session, job, now, now + verdict.wait)
+            return True
+
+    def release(self, lease: Lease) -> None:
+        """Give a job back unfinished, without counting the attempt as failed: the dispatcher is shutting down."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            verdict = self._close(session, job, AttemptOutcome.RELEASED, None, now)
+            if verdict.transition == Transition.REQUEUE:
+                self._requeue(session, job, now, now)
+            else:
+                end(session, job, verdict.transition, now, self._retention)
+
+    def stop(self, lease: Lease) -> None:
+        """End a job that was being canceled."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
+            end(session, job, Transition.STOP, now, self._retention)
+
+    def _close_lost(self, session: Session, job: JobRow, now: float) -> bool:
+        """Close the attempt of a dispatcher that was not heard of again; True if the job has ended with it."""
+        error = {"code": "dispatcher-lost", "message": "The process that ran the job was not heard of again."}
+        verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
+        count(session, "sgsst_lease_expirations_total")
+        if verdict.transition == Transition.REQUEUE:
+            return False
+        if verdict.transition == Transition.FAIL:
+            job.error = error | {"message": f"{error['message']} This was attempt {job.attempt}."}
+        end(session, job, verdict.transition, now, self._retention)
+        return True
+
+    def _close(
+        self,
+        session: Session,
+        job: JobRow,
+        outcome: AttemptOutcome,
+        error: dict[str, Any] | None,
+        now: float,
+        *,
+        permanent: bool = False,
+    ) -> Verdict:
+        """Close an attempt, and count it where it failed; returns what is to become of the job."""
+        _close_attempt(session, job, outcome, error, now)
+        before = FailureCount(job.failures, job.failed_step)
+        verdict = self._policy.after_attempt(
+            outcome, JobStatus(job.status), before, job.saved_step, permanent=permanent
+        )
+        job.failures, job.failed_step = verdict.count.failures, verdict.count.failed_step
+        return verdict
+
+    # --- shared ----------------------------------------------------------------------------------------------------
+
+    def _held(self, session: Session, lease: Lease) -> JobRow | None:
+        job = session.get(JobRow, lease.job_id, with_for_update=True)
+        return job if job is not None and _is_held(job, lease) else None
+
+    def _held_or_raise(self, session: Session, lease: Lease) -> JobRow:
+        job = self._held(session, lease)
+        if job is None:
+            raise LeaseLostError(f"{lease.job_id}: lease {lease.epoch} of {lease.dispatcher} is no longer held.")
+        return job
+
+    @staticmethod
+    def _requeue(session: Session, job: JobRow, now: float, not_before: float) -> None:
+        job.not_before = not_before
+        job.lease_owner = job.lease_expires_at = None
+        move(session, job, Transition.REQUEUE, now)
+
+
+def _ready(now: float) -> ColumnElement[bool]:
+    """Queued and to be started, or held by a dispatcher that was not heard of again."""
+    queued = and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= now)
+    expired = and_(JobRow.status.in_(ACTIVE), JobRow.lease_expires_at < now)
+    return or_(queued, expired)
+
+
+def _is_held(job: JobRow, lease: Lease) -> bool:
+    return job.status in ACTIVE and job.lease_epoch == lease.epoch and job.lease_owner == lease.dispatcher
+
+
+def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
+    unused = []
+    for file in files:
+        if file.step is not None:
+            job.saved_step = max(job.saved_step or 0, file.step)
+        row = session.get(ArtifactRow, (job.id, file.name))
+        if row is None:
+            row = ArtifactRow(job_id=job.id, name=file.name)
+            session.add(row)
+        elif row.location != file.location:
+            unused.append(row.location)
+        row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+        if not file.name.startswith("."):
+            data = {"name": file.name, "size": file.size, "sha256": file.sha256}
+            add_event(session, job.id, "artifact", data, now)
+    return unused
+
+
+def _close_attempt(
+    session: Session, job: JobRow, outcome: AttemptOutcome, error: dict[str, Any] | None, now: float
+) -> None:
+    session.execute(
+        update(AttemptRow)
+        .where(AttemptRow.job_id == job.id, AttemptRow.number == job.attempt)
+        .values(finished_at=now, outcome=outcome, error=error)
+    )
+    count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

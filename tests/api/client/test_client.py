@@ -1,0 +1,384 @@
+"""`Client` and `AsyncClient` against the API in its real process: one source, and the same scenarios through both."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import inspect
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import stamina
+
+from api.client import uploads
+from api.client.answers import ApiError, Event, Job, RequestError
+from api.client.client import AsyncClient, Client
+from api.client.transport import TRIES
+from service.files.artifacts import Artifacts
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from tests.api.service import Service
+from tests.small_scenes import wall, write_files
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": ply, "style": style, "cameras": cameras}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("client") / "data", alone=True) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[Store]:
+    made = open_store(ServiceSettings(data=service.data))
+    yield made
+    made.close()
+
+
+@pytest.fixture(autouse=True)
+def no_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As many tries as outside of tests, without the seconds between them."""
+    monkeypatch.setattr("api.client.events.FIRST_WAIT", 0.0)
+    with stamina.set_testing(True, attempts=TRIES):
+        yield
+
+
+class Awaited:
+    """An `AsyncClient` to be called as a `Client`: what runs through it runs in an event loop of its own."""
+
+    def __init__(self, url: str) -> None:
+        self._runner = asyncio.Runner()
+        self._client = self._runner.run(self._open(url))
+
+    @staticmethod
+    async def _open(url: str) -> AsyncClient:
+        return await AsyncClient(url).__aenter__()
+
+    def __enter__(self) -> Awaited:
+        return self
+
+    def __exit__(self, *ignored: object) -> None:
+        self._runner.run(self._client.close())
+        self._runner.close()
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        found = getattr(self._client, name)
+        if inspect.isasyncgenfunction(getattr(AsyncClient, name)):
+
+            async def gather(*args: Any, **options: Any) -> list[Any]:
+                return [item async for item in found(*args, **options)]
+
+            return lambda *args, **options: iter(self._runner.run(gather(*args, **options)))
+        return lambda *args, **options: self._runner.run(found(*args, **options))
+
+
+both = pytest.mark.parametrize("connect", [Client, Awaited], ids=["Client", "AsyncClient"])
+
+
+# --- one source ----------------------------------------------------------------------------------------------------
+
+
+METHODS = {
+    "submit": "Job",
+    "plan": "dict[str, Any]",
+    "upload": "str",
+    "job": "Job",
+    "jobs": "Iterator[Job]",
+    "watch": "Iterator[Event]",
+    "wait": "Job",
+    "artifacts": "list[dict[str, Any]]",
+    "download": "Path",
+    "cancel": "Job",
+    "retry": "Job",
+    "delete": "None",
+}
+
+
+def public(kind: type) -> dict[str, Any]:
+    found = {name for name in dir(kind) if not name.startswith("_")}
+    return {name: getattr(kind, name) for name in found if callable(getattr(kind, name))}
+
+
+def test_both_have_the_same_methods() -> None:
+    blocking, awaiting = public(Client), public(AsyncClient)
+    assert blocking.keys() == awaiting.keys()
+    assert blocking.keys() == {*METHODS, "close"}
+
+
+@pytest.mark.parametrize("name", [*METHODS, "close"])
+def test_each_method_has_one_signature_and_one_docstring(name: str) -> None:
+    blocking, awaiting = getattr(Client, name), getattr(AsyncClient, name)
+    first, second = inspect.signature(blocking), inspect.signature(awaiting)
+    assert first.parameters == second.parameters
+    assert first.return_annotation == METHODS.get(name, "None")
+    assert blocking.__doc__
+    assert blocking.__doc__ == awaiting.__doc__
+    assert blocking.__name__ == awaiting.__name__ == name
+    if inspect.isgeneratorfunction(blocking):
+        assert inspect.isasyncgenfunction(awaiting)
+        assert f"Async{first.return_annotation}" == second.return_annotation
+    else:
+        assert inspect.iscoroutinefunction(awaiting)
+        assert first.return_annotation == second.return_annotation
+
+
+# --- the same scenario through both --------------------------------------------------------------------------------
+
+
+@both
+def test_a_job_from_its_upload_to_its_removal(
+    connect: Any,
+    service: Service,
+    store: Store,
+    files: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(uploads, "PART_BYTES", 10_000)
+    told: list[tuple[int, int]] = []
+    with connect(service.url) as client:
+        made: Job = client.submit(
+            files["scene"],
+            files["style"],
+            cameras=files["cameras"],
+            name="mine",
+            steps_sos=7,
+            background=None,
+            progress=lambda done, total: told.append((done, total)),
+        )
+        large = [path.stat().st_size for path in files.values() if path.stat().st_size > 10_000]
+        assert told[-1] == (sum(large), sum(large))
+        assert [done for done, _ in told] == sorted({done for done, _ in told})
+        assert len(told) == sum(-(-size // 10_000) for size in large)
+        shown: Job = client.job(made.id)
+        assert (shown.status, shown.data["name"]) == ("queued", "mine")
+        assert shown.data["parameters"] == {**shown.data["parameters"], "steps_sos": 7}
+        digests = {entry["role"]: entry["sha256"] for entry in shown.data["inputs"]}
+        assert digests == {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
+
+        assert client.cancel(made.id).status == "canceled"
+        assert client.retry(made.id).status == "queued"
+        result = finish(store, service, made.id, bytes(range(256)) * 9000, tmp_path)
+        events: list[Event] = list(client.watch(made.id))
+        statuses = [event.data["status"] for event in events if event.kind == "status"]
+        assert statuses == ["queued", "canceled", "queued", "starting", "running", "succeeded"]
+        assert list(client.watch(made.id, after=events[3].id)) == events[4:]
+        assert list(client.watch(made.id, after=events[-1].id)) == []
+        assert client.wait(made.id).finished
+
+        assert [entry["name"] for entry in client.artifacts(made.id)] == ["stylized.ply"]
+        told.clear()
+        target = tmp_path / "mine.ply"
+        assert client.download(made.id, target, progress=lambda done, total: told.append((done, total))) == target
+        assert target.read_bytes() == result
+        assert told[-1] == (len(result), len(result))
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.ply", "result"]
+
+        client.delete(made.id)
+        with pytest.raises(RequestError, match="no job") as caught:
+            client.job(made.id)
+        assert (caught.value.status, caught.value.problem["code"]) == (404, "not-found")
+
+
+def finish(store: Store, service: Service, job_id: str, content: bytes, folder: Path) -> bytes:
+    """Do a dispatcher's part for a job that is queued: its result is the content."""
+    while (lease := store.leases.take("test")) is not None and lease.job_id != job_id:
+        store.leases.stop(lease)
+    assert lease is not None
+    source = folder / "result"
+    source.write_bytes(content)
+    file = Artifacts(ServiceSettings(data=service.data).artifacts_url).put(job_id, lease.epoch, "stylized.ply", source)
+    store.leases.begin(lease)
+    store.leases.succeed(lease, [file], {"steps": 1})
+    return content
+
+
+@both
+def test_all_jobs_are_listed_page_by_page(
+    connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("api.client.client._PAGE", 2)
+    with connect(service.url) as client:
+        made = [client.submit(files["scene"], files["style"], orbit=2, seed=number).id for number in range(5)]
+        assert [job.id for job in client.jobs()][:5] == made[::-1]
+        assert [job.id for job in client.jobs(limit=3)] == made[:1:-1]
+        client.cancel(made[0])
+        assert made[0] not in [job.id for job in client.jobs(status=["queued", "running"])]
+        assert next(iter(client.jobs(status=["canceled"]))).id == made[0]
+
+
+@both
+def test_a_plan_queues_nothing_and_bad_files_are_refused(
+    connect: Any, service: Service, files: dict[str, Path], tmp_path: Path
+) -> None:
+    with connect(service.url) as client:
+        before = [job.id for job in client.jobs()]
+        with pytest.raises(RequestError, match="PLY header") as caught:
+            client.plan(files["style"], files["style"], orbit=2)
+        assert (caught.value.status, caught.value.problem["input"]) == (422, "scene")
+        with pytest.raises(RequestError, match="is not a file"):
+            client.submit(tmp_path / "none.ply", files["style"], orbit=2)
+        with pytest.raises(RequestError, match="holds no photos"):
+            client.submit(files["scene"], files["style"], cameras=files["cameras"], photos=tmp_path)
+        assert [job.id for job in client.jobs()] == before
+
+
+@both
+def test_one_upload_serves_many_jobs(connect: Any, service: Service, files: dict[str, Path]) -> None:
+    with connect(service.url) as client:
+        uploaded = client.upload(files["scene"], "other.ply")
+    with service.client() as plain:
+        shown = plain.get(f"/v1/uploads/{uploaded}").json()
+        assert (shown["filename"], shown["complete"]) == ("other.ply", True)
+
+
+# --- connections that break ----------------------------------------------------------------------------------------
+
+
+class Relay:
+    """Passes connections on to a server, and cuts each one off after so many bytes of its answer.
+
+    Args:
+        port: of the server, on this machine.
+        limits: bytes of each connection, one after the other; later ones are not cut off.
+    """
+
+    def __init__(self, port: int, limits: list[int]) -> None:
+        self._port, self._limits = port, list(limits)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.cuts = 0
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def __enter__(self) -> Relay:
+        return self
+
+    def __exit__(self, *ignored: object) -> None:
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            limit = self._limits.pop(0) if self._limits else None
+            threading.Thread(target=self._serve, args=(near, limit), daemon=True).start()
+
+    def _serve(self, near: socket.socket, limit: int | None) -> None:
+        with near, socket.create_connection(("127.0.0.1", self._port)) as far:
+            threading.Thread(target=self._pass_on, args=(near, far, None), daemon=True).start()
+            self._pass_on(far, near, limit)
+
+    def _pass_on(self, source: socket.socket, target: socket.socket, left: int | None) -> None:
+        try:
+            while data := source.recv(1 << 16):
+                target.sendall(data if left is None else data[:left])
+                left = None if left is None else left - len(data)
+                if left is not None and left <= 0:
+                    self.cuts += 1
+                    break
+            target.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            return
+
+
+@both
+def test_a_download_goes_on_where_it_broke_off(
+    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+) -> None:
+    with connect(service.url) as client:
+        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+    content = finish(store, service, job_id, hashlib.sha256(job_id.encode()).digest() * 100_000, tmp_path)
+    told: list[tuple[int, int]] = []
+    # a block is written once it is whole: the first connection leaves one, the second adds none, the third another
+    with (
+        Relay(int(service.environment["SGSST_PORT"]), [1_500_000, 700, 1_500_000]) as relay,
+        connect(relay.url) as client,
+    ):
+        target = client.download(job_id, tmp_path / "mine.ply", progress=lambda done, size: told.append((done, size)))
+        assert target.read_bytes() == content
+        assert relay.cuts == 3
+    assert {size for _, size in told} == {len(content)}
+    assert [done for done, _ in told] == sorted({done for done, _ in told}), "nothing was sent twice"
+
+
+@both
+def test_a_part_of_something_else_is_thrown_away(
+    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+) -> None:
+    with connect(service.url) as client:
+        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        content = finish(store, service, job_id, job_id.encode() * 1000, tmp_path)
+        tag = f'"{hashlib.sha256(content).hexdigest()}"'
+        for number, (left, stamp) in enumerate(
+            [
+                (b"an older download", None),
+                (b"of an older result", f'"{"0" * 64}"'),
+                (b"damaged on this disk", tag),
+                (content[:1000], tag),
+                (content, tag),
+            ]
+        ):
+            target = tmp_path / f"{number}.ply"
+            target.with_name(f"{number}.ply.part").write_bytes(left)
+            if stamp is not None:
+                target.with_name(f"{number}.ply.part.etag").write_text(stamp)
+            assert client.download(job_id, target).read_bytes() == content
+        assert not list(tmp_path.glob("*.part*"))
+
+
+@both
+def test_events_go_on_where_they_broke_off(
+    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+) -> None:
+    with connect(service.url) as client:
+        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        for _ in range(5):
+            client.cancel(job_id)
+            client.retry(job_id)
+        finish(store, service, job_id, b"ply", tmp_path)
+        whole = list(client.watch(job_id))
+    with Relay(int(service.environment["SGSST_PORT"]), [600, 650, 700]) as relay, connect(relay.url) as client:
+        assert list(client.watch(job_id)) == whole
+        assert relay.cuts == 3
+
+
+@both
+def test_uploads_go_on_where_they_broke_off(
+    connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer to a part is lost, so that the part is sent again, which the service refuses: it has it already."""
+    monkeypatch.setattr(uploads, "PART_BYTES", 20_000)
+    # connections are kept open: each relay's first one carries the creation's answer, and not that of the first part
+    with Relay(int(service.environment["SGSST_PORT"]), [900]) as relay, connect(relay.url) as client:
+        uploaded = client.upload(files["scene"])
+        assert relay.cuts == 1
+    with service.client() as plain:
+        shown = plain.get(f"/v1/uploads/{uploaded}").json()
+    assert shown["sha256"] == hashlib.sha256(files["scene"].read_bytes()).hexdigest()
+
+
+@both
+def test_who_never_answers_is_asked_so_often(connect: Any, service: Service, tmp_path: Path) -> None:
+    with Relay(int(service.environment["SGSST_PORT"]), [1] * 100) as relay, connect(relay.url) as client:
+        for count, ask in enumerate(
+            (
+                lambda: client.job("job_1"),
+                lambda: client.download("job_1", tmp_path / "x"),
+                lambda: list(client.watch("job_1")),
+            ),
+            start=1,
+        ):
+            with pytest.raises(ApiError, match="cannot be reached"):
+                ask()
+            assert relay.cuts == count * TRIES

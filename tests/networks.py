@@ -1,0 +1,55 @@
+"""A feature network so small that its share of a test can be neglected."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from pathlib import Path
+
+import torch
+
+from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
+from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_weights
+
+#: Channels of every layer.
+CHANNELS = 16
+
+
+@functools.cache
+def tiny_weights() -> BackboneWeights:
+    """VGG16's layers with `CHANNELS` channels each and random weights, the same ones in every process.
+
+    For tests that compare one computation with another one, which any network serves for.
+    """
+    return BackboneWeights(
+        name="vgg16",
+        source="random",
+        sha256="0" * 64,
+        convolutions=_random_layers(),
+        input_scale=torch.full((3,), 255.0),
+        input_shift=-torch.tensor(CAFFE_MEAN),
+    )
+
+
+def install_tiny_weights(folder: Path) -> Path:
+    """Make a folder what `SGSST_CACHE` can name: `tiny_weights` as vgg16, and the real weights of LPIPS beside it."""
+    file = folder / "narrow.pth"
+    state = {}
+    for name, (weight, bias) in tiny_weights().convolutions.items():
+        state |= {f"{name}.weight": weight.flip(1) if name == "conv1_1" else weight, f"{name}.bias": bias}
+    torch.save(state, file)
+    fetch_weights("vgg16", source=file, folder=folder)
+    shutil.copy(cache_folder() / "lpips_alex.safetensors", folder)
+    return folder
+
+
+def _random_layers() -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Convolutions after He et al. (2015), which keep the features' size from layer to layer."""
+    generator = torch.Generator().manual_seed(16)
+    layers, channels = {}, 3
+    for block, count in enumerate(BLOCKS["vgg16"], start=1):
+        for index in range(1, count + 1):
+            weight = torch.randn(CHANNELS, channels, 3, 3, generator=generator) * (2 / (9 * channels)) ** 0.5
+            layers[f"conv{block}_{index}"] = weight, torch.randn(CHANNELS, generator=generator)
+            channels = CHANNELS
+    return layers

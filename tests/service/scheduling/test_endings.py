@@ -1,0 +1,66 @@
+"""How an attempt has ended: the decision by itself, without a process."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import pytest
+
+from service.scheduling.attempt_process import Message
+from service.scheduling.endings import Ending, Wish, attempt_ending
+from service.store.states import AttemptOutcome
+
+DONE: Message = {"kind": "done", "result": {"steps": 3}}
+INTERRUPTED: Message = {"kind": "interrupted"}
+ERROR = {"code": "diverged", "message": "The loss is not finite."}
+FAILED: Message = {"kind": "failed", "error": ERROR, "permanent": True}
+WISHES = [None, Wish.CANCEL, Wish.RELEASE]
+
+
+def ending(wish: Wish | None, last: Message | None, code: int = 0, log: str | None = "the log", **has: bool) -> Ending:
+    return attempt_ending(wish, last, code, log, **{"has_result": True, **has})
+
+
+@pytest.mark.parametrize("wish", WISHES)
+def test_who_is_done_has_succeeded_even_if_the_end_was_wanted(wish: Wish | None) -> None:
+    assert ending(wish, DONE) == Ending(AttemptOutcome.SUCCEEDED)
+
+
+@pytest.mark.parametrize("wish", WISHES)
+def test_without_a_result_nobody_has_succeeded(wish: Wish | None) -> None:
+    found = ending(wish, DONE, has_result=False)
+    assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
+    assert found.error == {"code": "internal", "message": "The job ended without a result."}
+
+
+@pytest.mark.parametrize(("wish", "outcome"), [(Wish.CANCEL, "canceled"), (Wish.RELEASE, "released")])
+@pytest.mark.parametrize("last", [INTERRUPTED, FAILED, None])
+@pytest.mark.parametrize("code", [0, 1, -signal.SIGKILL])
+def test_an_end_that_was_wanted_is_no_failure(wish: Wish, outcome: str, last: Message | None, code: int) -> None:
+    assert ending(wish, last, code) == Ending(AttemptOutcome(outcome))
+
+
+@pytest.mark.parametrize("permanent", [False, True])
+def test_a_failure_is_told_as_its_process_tells_it(permanent: bool) -> None:
+    last: Message = {"kind": "failed", "error": ERROR, "permanent": permanent}
+    assert ending(None, last) == Ending(AttemptOutcome.FAILED, ERROR, permanent)
+
+
+@pytest.mark.parametrize("last", [INTERRUPTED, None])
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [
+        (-signal.SIGKILL, "was killed; perhaps the machine had run out of memory"),
+        (-signal.SIGSEGV, "was ended by SIGSEGV"),
+        (3, "ended with code 3"),
+        (0, "ended with code 0"),
+    ],
+)
+def test_a_process_without_a_last_word_has_crashed(last: Message | None, code: int, told: str) -> None:
+    found = ending(None, last, code)
+    assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
+    error: dict[str, Any] = found.error or {}
+    assert (error["code"], error["log"]) == ("crashed", "the log")
+    assert told in error["message"]
+    assert "log" not in (ending(None, last, code, None).error or {})

@@ -1,0 +1,134 @@
+"""What is published of an attempt's folder, and when: a real store, a real folder of results, no process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from service.files.artifacts import Artifacts
+from service.scheduling.publishing import Publisher
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.leases import Lease
+
+SHA = "a" * 64
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> ServiceSettings:
+    return ServiceSettings(data=tmp_path / "data")
+
+
+@pytest.fixture
+def store(settings: ServiceSettings) -> Iterator[Store]:
+    made = open_store(settings)
+    made.inputs.add_blob(SHA, "aa/blob", 3)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def lease(store: Store) -> Lease:
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+    found = store.leases.take("one")
+    assert found is not None
+    return found
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "attempt" / "out" / "previews").mkdir(parents=True)
+    (tmp_path / "attempt" / "log.txt").write_text("first\n")
+    return tmp_path / "attempt"
+
+
+@pytest.fixture
+def publisher(lease: Lease, folder: Path, store: Store, settings: ServiceSettings) -> Publisher:
+    return Publisher(lease, folder, store, Artifacts(settings.artifacts_url), log_seconds=1e6)
+
+
+def told(store: Store, lease: Lease) -> list[str]:
+    """Names of files that watchers were told of, in order."""
+    return [event.data["name"] for event in store.jobs.events(lease.job_id, 0) if event.kind == "artifact"]
+
+
+def content(store: Store, settings: ServiceSettings, lease: Lease, name: str) -> bytes:
+    row = store.jobs.artifact(lease.job_id, name)
+    assert row is not None
+    return b"".join(Artifacts(settings.artifacts_url).read(row.location, 0, row.size))
+
+
+def places(settings: ServiceSettings) -> list[str]:
+    return sorted(path.name for path in (settings.folder / "artifacts").rglob("*") if path.is_file())
+
+
+def test_files_are_published_once_they_are_there_and_again_once_they_change(
+    publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
+) -> None:
+    publisher.publish_unfinished(whole_log=True)
+    assert told(store, lease) == ["log.txt"]
+    (folder / "out" / "stylized.plan.json").write_text("{}")
+    (folder / "out" / "previews" / "step_000010.jpg").write_bytes(b"jpg")
+    (folder / "out" / "previews" / "half").write_bytes(b"no preview")
+    publisher.publish_unfinished()
+    publisher.publish_unfinished()
+    assert sorted(told(store, lease)) == ["log.txt", "plan.json", "previews/step_000010.jpg"]
+    (folder / "out" / "stylized.plan.json").write_text('{"decisions": []}')
+    publisher.publish_unfinished()
+    assert told(store, lease)[-1] == "plan.json"
+    assert content(store, settings, lease, "plan.json") == b'{"decisions": []}'
+    assert places(settings) == ["log.txt", "plan.json", "step_000010.jpg"], "the older plan is still there"
+
+
+def test_a_log_is_copied_once_in_a_while_and_whole_at_the_end(
+    publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
+) -> None:
+    publisher.publish_unfinished(whole_log=True)
+    (folder / "log.txt").write_text("first\nsecond\n")
+    publisher.publish_unfinished()
+    assert content(store, settings, lease, "log.txt") == b"first\n"
+    publisher.publish_unfinished(whole_log=True)
+    assert content(store, settings, lease, "log.txt") == b"first\nsecond\n"
+    assert publisher.log_tail() == "first\nsecond\n"
+    (folder / "log.txt").unlink()
+    assert publisher.log_tail() is None
+
+
+def test_a_checkpoint_tells_how_far_the_job_is_saved(
+    publisher: Publisher, folder: Path, store: Store, lease: Lease
+) -> None:
+    checkpoint = folder / "out" / "stylized.checkpoint.safetensors"
+    for step, saved in ((10, 10), (25, 25), (None, 25)):
+        if step is None:
+            checkpoint.write_bytes(b"damaged")
+        else:
+            save_file({"x": np.zeros(step)}, checkpoint, metadata={"step": str(step)})
+        publisher.publish_unfinished()
+        assert store.jobs.get(lease.job_id, None).saved_step == saved
+    assert told(store, lease) == ["log.txt"], "nobody is told of checkpoints"
+
+
+def test_the_end_publishes_results_and_sweeps_what_no_row_refers_to(
+    publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
+) -> None:
+    save_file({"x": np.zeros(1)}, folder / "out" / "stylized.checkpoint.safetensors", metadata={"step": "1"})
+    publisher.publish_unfinished(whole_log=True)
+    assert not publisher.has_result()
+    for name in ("stylized.ply", "stylized.report.json", "stylized.loss.png", "stray.txt"):
+        (folder / "out" / name).write_text(name)
+    Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "cut_off.jpg", folder / "log.txt")
+    assert publisher.has_result()
+    publisher.succeed({"steps": 1})
+    publisher.sweep()
+    job = store.jobs.get(lease.job_id, None)
+    assert (job.status, job.result) == ("succeeded", {"steps": 1})
+    names = ["log.txt", "loss.png", "report.json", "stylized.ply"]
+    assert [row.name for row in store.jobs.artifacts(lease.job_id)] == names
+    assert places(settings) == names
+    assert store.retention.unswept(10) == []

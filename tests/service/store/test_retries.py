@@ -1,0 +1,86 @@
+"""What becomes of a job after an attempt: the decision by itself, without a store."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.store.retries import MAX_RETRY_SECONDS, FailureCount, RetryPolicy, Verdict
+from service.store.states import TRANSITIONS, AttemptOutcome, JobStatus, Transition
+
+POLICY = RetryPolicy(max_attempts=3, retry_seconds=5.0)
+FRESH = FailureCount(0, None)
+
+
+@pytest.mark.parametrize(
+    ("before", "saved", "after"),
+    [
+        (FailureCount(0, None), None, FailureCount(1, None)),
+        (FailureCount(1, None), None, FailureCount(2, None)),
+        (FailureCount(1, None), 0, FailureCount(2, 0)),
+        (FailureCount(2, None), 10, FailureCount(0, 10)),
+        (FailureCount(2, 10), 10, FailureCount(3, 10)),
+        (FailureCount(2, 10), 11, FailureCount(0, 11)),
+        (FailureCount(1, 10), 5, FailureCount(2, 5)),
+    ],
+)
+def test_failures_count_only_without_progress(before: FailureCount, saved: int | None, after: FailureCount) -> None:
+    assert before.with_failure(saved) == after
+
+
+@pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
+@pytest.mark.parametrize("permanent", [False, True])
+def test_a_job_that_is_being_canceled_is_stopped(outcome: AttemptOutcome, permanent: bool) -> None:
+    found = POLICY.after_attempt(outcome, JobStatus.CANCELING, FailureCount(2, 3), 3, permanent=permanent)
+    assert found == Verdict(Transition.STOP, FailureCount(2, 3))
+
+
+@pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING])
+def test_a_released_job_is_queued_at_once_and_nothing_counts(status: JobStatus) -> None:
+    found = POLICY.after_attempt(AttemptOutcome.RELEASED, status, FailureCount(2, 3), 9)
+    assert found == Verdict(Transition.REQUEUE, FailureCount(2, 3), 0.0)
+
+
+def test_waits_double_up_to_the_longest() -> None:
+    policy = RetryPolicy(max_attempts=100, retry_seconds=5.0)
+    count, waits = FRESH, []
+    for _ in range(9):
+        verdict = policy.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, count, None)
+        assert verdict.transition == Transition.REQUEUE
+        count = verdict.count
+        waits.append(verdict.wait)
+    assert waits == [5, 10, 20, 40, 80, 160, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS]
+
+
+def test_progress_makes_the_wait_short_again() -> None:
+    found = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FailureCount(2, 10), 20)
+    assert found == Verdict(Transition.REQUEUE, FailureCount(0, 20), POLICY.retry_seconds)
+
+
+def test_nobody_waits_after_a_loss() -> None:
+    found = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.RUNNING, FailureCount(1, None), None)
+    assert found == Verdict(Transition.REQUEUE, FailureCount(2, None), 0.0)
+
+
+@pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST])
+def test_attempts_in_a_row_without_progress_are_bounded(outcome: AttemptOutcome) -> None:
+    count, found = FRESH, []
+    for _ in range(POLICY.max_attempts):
+        verdict = POLICY.after_attempt(outcome, JobStatus.STARTING, count, None)
+        found.append(verdict.transition)
+        count = verdict.count
+    assert found == [Transition.REQUEUE, Transition.REQUEUE, Transition.FAIL]
+
+
+def test_what_would_fail_again_is_not_tried_again() -> None:
+    found = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FRESH, 50, permanent=True)
+    assert found.transition == Transition.FAIL
+
+
+@pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING, JobStatus.CANCELING])
+@pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
+@pytest.mark.parametrize("permanent", [False, True])
+def test_every_verdict_is_a_way_that_there_is(status: JobStatus, outcome: AttemptOutcome, permanent: bool) -> None:
+    for failures in range(POLICY.max_attempts + 1):
+        count = FailureCount(failures, None)
+        verdict = POLICY.after_attempt(outcome, status, count, None, permanent=permanent)
+        assert status in TRANSITIONS[verdict.transition]

@@ -1,0 +1,78 @@
+"""The table of states: every pair of a state and a transition, against what the service promises."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from service.store.states import (
+    ACTIVE,
+    ENDED,
+    FINISHED,
+    TRANSITIONS,
+    UNFINISHED,
+    JobStatus,
+    Transition,
+    TransitionError,
+    allowed,
+    next_status,
+)
+
+#: Rows: from; columns: by. A dot: there is no way.
+EXPECTED = """
+            take      begin     succeed    fail    requeue  stop      cancel     retry   expire
+queued      starting  .         .          .       .        .         canceled   .       .
+starting    starting  running   succeeded  failed  queued   canceled  canceling  .       .
+running     starting  running   succeeded  failed  queued   canceled  canceling  .       .
+canceling   .         canceling succeeded  .       .        canceled  canceling  .       .
+succeeded   .         .         .          .       .        .         .          .       expired
+failed      .         .         .          .       .        .         .          queued  expired
+canceled    .         .         .          .       .        .         canceled   queued  expired
+expired     .         .         .          .       .        .         .          .       .
+"""
+
+
+def expected() -> dict[tuple[JobStatus, Transition], JobStatus | None]:
+    first, *rows = [line.split() for line in EXPECTED.strip().splitlines()]
+    return {
+        (JobStatus(row[0]), Transition(name)): None if cell == "." else JobStatus(cell)
+        for row in rows
+        for name, cell in zip(first, row[1:], strict=True)
+    }
+
+
+@pytest.mark.parametrize(("status", "transition"), list(product(JobStatus, Transition)))
+def test_every_pair(status: JobStatus, transition: Transition) -> None:
+    wanted = expected()[status, transition]
+    assert allowed(status, transition) == (wanted is not None)
+    if wanted is not None:
+        assert next_status(status, transition) == wanted
+        return
+    with pytest.raises(TransitionError, match=f"no {transition} for a job with status {status}"):
+        next_status(status, transition)
+
+
+def test_every_state_is_in_one_group() -> None:
+    assert sorted([JobStatus.QUEUED, *ACTIVE, *ENDED]) == sorted(JobStatus)
+    assert set(UNFINISHED) == set(JobStatus) - set(ENDED)
+    assert set(FINISHED) == set(ENDED) - {JobStatus.EXPIRED}
+
+
+def test_every_state_is_reached_from_the_first_one() -> None:
+    reached = {JobStatus.QUEUED}
+    while new := {way[start] for way in TRANSITIONS.values() for start in reached & way.keys()} - reached:
+        reached |= new
+    assert reached == set(JobStatus)
+
+
+def test_a_job_that_is_being_canceled_can_only_end() -> None:
+    """Never back into the queue, and never failed: its user has given it up."""
+    ways = {way[JobStatus.CANCELING] for way in TRANSITIONS.values() if JobStatus.CANCELING in way}
+    assert ways == {JobStatus.CANCELING, JobStatus.CANCELED, JobStatus.SUCCEEDED}
+
+
+def test_names_are_stored_as_text() -> None:
+    """The database and the API know plain strings."""
+    assert [str(status) for status in JobStatus] == [status.value for status in JobStatus]
+    assert next_status("queued", Transition.TAKE) == "starting"
