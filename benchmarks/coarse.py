@@ -45,11 +45,11 @@ def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str,
     colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
     gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
-    coarse = CoarseRasterizer(cpu)
+    coarse = CoarseRasterizer(cpu, scale)
 
     def with_operator(rasterizer: CoarseRasterizer = coarse) -> None:
-        rasterizer.render(colours, camera, scale)
-        rasterizer.colour_gradient(gradient, camera, scale)
+        rasterizer.render(colours, camera)
+        rasterizer.colour_gradient(gradient, camera)
 
     ways: dict[str, Callable[[], None]] = {
         "cpu": lambda: at_full_size(cpu, colours, gradient, camera, scale),
@@ -63,8 +63,8 @@ def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str,
     for _ in range(repeats):
         for name, way in ways.items():
             seconds[name].append(timed(way))
-        fresh = CoarseRasterizer(cpu)
-        builds.append(timed(lambda fresh=fresh: fresh.render(colours, camera, scale)))  # type: ignore[misc]
+        fresh = CoarseRasterizer(cpu, scale)
+        builds.append(timed(lambda fresh=fresh: fresh.render(colours, camera)))  # type: ignore[misc]
     fastest = {name: min(times) for name, times in seconds.items()}
     return {
         "gaussians": len(scene),

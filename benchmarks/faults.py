@@ -27,8 +27,8 @@ from typing import Any, get_args
 import psutil
 
 from benchmarks.machine import write_result
+from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import Progress
-from sgsst_core.stylizing.stylizer import mean_loss
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
 from worker.ranks.attempts import RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster

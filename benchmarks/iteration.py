@@ -31,9 +31,9 @@ def main() -> None:
     scene = read_scene(arguments.scene).scene
     cameras = [resized(camera) for camera in spread(read_cameras(arguments.cameras), arguments.views)]
     results = {}
-    for rasterizer in ("cpu", "cached"):
-        settings = make_settings("standard", steps_coarse=0, steps_sos=10_000)
-        stylizer = Stylizer(scene, cameras, load_image(arguments.style), settings, rasterizer=rasterizer)
+    for rasterizer, kept in (("cpu", "none"), ("cached", "float32")):
+        settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, kept_weights=kept)
+        stylizer = Stylizer.planned(scene, cameras, load_image(arguments.style), settings)
         for _ in cameras:  # the first round prepares views
             stylizer.run_step()
         seconds: dict[str, float] = {}

@@ -67,7 +67,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
     kept = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
     settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False, keep=kept)
-    stylizer = Stylizer(scene, views, load_image(arguments.style), settings)
+    stylizer = Stylizer.planned(scene, views, load_image(arguments.style), settings)
     for _ in range(arguments.rounds * len(stylizer.views.covered)):
         stylizer.run_step()
     steps = [sum(record.parts.values()) for record in stylizer.history[len(stylizer.views.covered) :]]

@@ -101,7 +101,7 @@ def make(collectives: Collectives, scene: Any, view: Camera, style: Any, argumen
         rebalance=False,
         keep=("ranks",),
     )
-    return Stylizer(scene, [view], style, settings, collectives=collectives)
+    return Stylizer.planned(scene, [view], style, settings, collectives=collectives)
 
 
 def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]:
@@ -124,7 +124,8 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
     if alone is None:
         return {}
     loss = alone.loss
-    pieces = pieces_of(alone.views.cameras[0], loss, None)
+    camera = alone.views.cameras[0]
+    pieces = pieces_of((camera.height, camera.width), loss.tiling, None)
     areas = [[tile.outer.pixels for tile in loss.tiles(*piece.size)] for piece in pieces]
     halo = loss.network.halo
     one, shared = (divide(pieces, halo, (1.0,) * count) for count in (1, collectives.size))
@@ -141,10 +142,10 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "steps": steps,
         "pieces": [[piece.scale, *piece.size] for piece in pieces],
         "halo": halo,
-        "held_pixels": loss.held,
+        "held_pixels": loss.tiling.held,
         "pixels_one_rank": sum(map(sum, areas)),
-        "pixels_twice_one_rank": sum(computed_twice(each, loss.kept(each)) for each in areas),
-        "working": loss.working,
+        "pixels_twice_one_rank": sum(computed_twice(each, loss.tiling.kept(each)) for each in areas),
+        "working": loss.tiling.working,
     }
 
 

@@ -20,7 +20,7 @@ from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene, write_stylized
-from sgsst_core.stylizing.stylizer import mean_loss
+from sgsst_core.stylizing.evaluation import mean_loss
 
 #: Shares of each phase after which all views are evaluated.
 MARKS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
@@ -50,7 +50,7 @@ def main() -> None:
     for name, values in (("paper", paper), ("standard", {})):
         if arguments.only in (None, name):
             settings = make_settings("standard", coarsest_side=arguments.coarsest_side, **values)
-            stylizer = Stylizer(file.scene, cameras, load_image(arguments.style), settings)
+            stylizer = Stylizer.planned(file.scene, cameras, load_image(arguments.style), settings)
             results[name] = {"settings": settings.model_dump(mode="json"), "points": _run(stylizer)}
             if arguments.out:
                 arguments.out.mkdir(parents=True, exist_ok=True)

@@ -18,8 +18,9 @@ from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import bought, build_report, plan_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
+from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
-from sgsst_core.stylizing.stylizer import Evaluation, Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer
 from worker.prepare import Job, Warn
 from worker.request import Outputs
 

@@ -21,10 +21,9 @@ from sgsst_core.files.ply import SceneFile, read_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
-from sgsst_core.scene.camera import Camera, orbit, resized, spread
+from sgsst_core.scene.camera import Camera, fit_cameras, orbit, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import fingerprint
-from sgsst_core.stylizing.stylizer import fit_cameras
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 

@@ -15,8 +15,10 @@ import torch
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.probe import common_device
 from sgsst_core.planning.progress import ShowPlanning
-from sgsst_core.quality.measure import with_measuring
 from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
@@ -75,9 +77,22 @@ def prepare(
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
-    # A plan made for fewer ranks cannot say what more of them are good for.
-    plan = resumed.plan if resumed and collectives.size <= resumed.ranks else None
+    plan, workshop, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
+    if plan is not None and resumed is not None:
+        planned_ranks = resumed.ranks
+    else:
+        plan, workshop = make_plan(
+            inputs.scene_file.scene,
+            inputs.cameras,
+            settings,
+            weights=inputs.weights,
+            collectives=collectives,
+            looked=resumed.plan.survey if resumed else None,
+            measured=True,
+            show=show_planning,
+        )
     stylizer = Stylizer(
+        plan,
         inputs.scene_file.scene,
         inputs.cameras,
         inputs.style,
@@ -85,16 +100,22 @@ def prepare(
         weights=inputs.weights,
         photos=inputs.load_photo,
         collectives=collectives,
-        plan=plan,
-        show_planning=show_planning,
+        workshop=workshop,
     )
-    planned_ranks = resumed.ranks if resumed and plan else collectives.size
-    if plan is None:
-        stylizer.plan = with_measuring(stylizer.plan)
     source, scene_file, images = request.source, inputs.scene_file, request.images
     sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, inputs.weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
     return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
+
+
+def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
+    """The plan of a resumed job; None where there is none, or where it was made for another device.
+
+    Nor can a plan made for fewer ranks say what more of them are good for.
+    """
+    if resumed is None or collectives.size > resumed.ranks:
+        return None
+    return resumed.plan if resumed.plan.device == common_device(collectives) else None
 
 
 def _workers_used(stylizer: Stylizer) -> dict[str, Any]:

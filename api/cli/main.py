@@ -191,7 +191,7 @@ def _tell_losses(ended: RanksResult) -> None:
 
 
 def _conclude(outputs: Outputs, result: Result, command: str) -> None:
-    from sgsst_core.stylizing.stylizer import mean_loss
+    from sgsst_core.stylizing.evaluation import mean_loss
 
     before, after = mean_loss(result.before), mean_loss(result.after)
     out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")

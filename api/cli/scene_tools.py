@@ -14,16 +14,15 @@ from sgsst_core.features.network_weights import load_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
-from sgsst_core.planning.planner import Plan
+from sgsst_core.planning import planner
+from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.quality.findings import Finding, findings_of
-from sgsst_core.quality.measure import with_measuring
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.stylizer import Stylizer
 from worker.inputs import check_something_seen, read_scene_and_cameras
 from worker.request import SceneRequest, check_choice, check_folder
 
@@ -54,9 +53,9 @@ def make_plan(
     check_folder(out.parent)
     file, cameras = read_scene_and_cameras(source)
     weights = load_weights(backbone)
-    stylizer = Stylizer(file.scene, cameras, load_image(style), settings, weights=weights, show_planning=show_planning)
+    load_image(style)  # a style that cannot be used is told before the work, too
+    plan, _ = planner.make_plan(file.scene, cameras, settings, weights=weights, measured=True, show=show_planning)
     out.parent.mkdir(parents=True, exist_ok=True)
-    plan = with_measuring(stylizer.plan)
     write_json(out, plan_json(plan))
     return plan
 

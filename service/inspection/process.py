@@ -20,7 +20,6 @@ from typing import Any
 
 import psutil
 import torch
-from torch import Tensor
 
 from service.files.staging import Staged
 from service.parameters import JobParameters
@@ -30,11 +29,10 @@ from sgsst_core.features.network_weights import list_weights, load_weights
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene
 from sgsst_core.files.ply_header import element_offsets, read_header
-from sgsst_core.quality.measure import with_measuring
+from sgsst_core.planning.planner import make_plan
 from sgsst_core.report.document import plan_json
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.stylizer import Stylizer, fit_cameras
 from worker.inputs import check_something_in_view, read_cameras_of
 from worker.request import check_steps
 
@@ -61,8 +59,8 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
 
 def _read_inputs(
     staged: Staged, parameters: JobParameters, limits: dict[str, Any]
-) -> tuple[dict[str, Any], Scene, list[Camera], Tensor]:
-    """What `validate` finds, and what it has read: the scene, the cameras, and the style [H, W, 3]."""
+) -> tuple[dict[str, Any], Scene, list[Camera]]:
+    """What `validate` finds, and what it has read: the scene and the cameras."""
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
@@ -99,16 +97,15 @@ def _read_inputs(
             _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
-    return found, file.scene, cameras, image
+    return found, file.scene, cameras
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`."""
-    found, scene, cameras, style = _read_inputs(staged, parameters, limits)
+    found, scene, cameras = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_weights(request.backbone)
-    stylizer = Stylizer(scene, cameras, style, request.settings, weights=weights)
-    made = with_measuring(stylizer.plan)
+    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True)
     seconds = memory = None
     if made.prediction:
         memory = made.prediction.peak_bytes

@@ -30,7 +30,9 @@ from sgsst_core.report.palette import INK, colour_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings, make_settings
-from sgsst_core.stylizing.stylizer import Phase, Stylizer, mean_loss
+from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.schedule import Phase
+from sgsst_core.stylizing.stylizer import Stylizer
 
 #: The budget is cut into so many slices, and the variants take turns: where the machine is slower for a while, it is
 #: slower for all of them.
@@ -176,7 +178,7 @@ def error_time(
     base = make_settings("standard", **settings)
     share = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
     base = base.model_copy(update={"memory_limit": share})
-    exact = ExactTwin(Stylizer(scene, cameras, style, base, weights=weights))
+    exact = ExactTwin(Stylizer.planned(scene, cameras, style, base, weights=weights))
     views = exact.views.covered
     start = exact.evaluate(views, scene.sh_dc)
     running = [_begin(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
@@ -204,7 +206,7 @@ def _begin(
 ) -> tuple[Curve, _TimedStylizer | None]:
     """A variant that is ready to run, or the reason why it is left out."""
     settings = base.model_copy(update=variant.settings)
-    stylizer = _TimedStylizer(*inputs, settings, weights=weights)
+    stylizer = _TimedStylizer.planned(*inputs, settings, weights=weights)
     reason = _reason_to_leave_out(settings, stylizer)
     if reason:
         return Curve(variant, [], left_out=reason), None

@@ -94,12 +94,27 @@ def covered_region(coverage: Tensor) -> Rectangle:
     rows, columns = (coverage > 0).any(dim=1).nonzero(), (coverage > 0).any(dim=0).nonzero()
     if not len(rows):
         return Rectangle(0, 0, 0, 0)
-    top, bottom, left, right = (int(t) for t in (rows[0], rows[-1], columns[0], columns[-1]))
+    top, bottom, left, right = (int(t) for t in (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1))
+    return _aligned(Rectangle(top, left, bottom, right), (height, width))
+
+
+def scaled_region(region: Rectangle, scale: int, size: tuple[int, int]) -> Rectangle:
+    """`covered_region` at a scale of size (height, width), of a view whose covered pixels at full size are a region."""
+    side = 1 << scale
+    bottom, right = min(-(-region.bottom // side), size[0]), min(-(-region.right // side), size[1])
+    scaled = Rectangle(region.top // side, region.left // side, bottom, right)
+    if scaled.top >= scaled.bottom or scaled.left >= scaled.right:
+        return Rectangle(0, 0, 0, 0)
+    return _aligned(scaled, size)
+
+
+def _aligned(region: Rectangle, size: tuple[int, int]) -> Rectangle:
+    """The smallest rectangle at multiples of 16, within a view of size (height, width), that holds a region."""
     return Rectangle(
-        top // ALIGNMENT * ALIGNMENT,
-        left // ALIGNMENT * ALIGNMENT,
-        min((bottom // ALIGNMENT + 1) * ALIGNMENT, height),
-        min((right // ALIGNMENT + 1) * ALIGNMENT, width),
+        region.top // ALIGNMENT * ALIGNMENT,
+        region.left // ALIGNMENT * ALIGNMENT,
+        min(-(-region.bottom // ALIGNMENT) * ALIGNMENT, size[0]),
+        min(-(-region.right // ALIGNMENT) * ALIGNMENT, size[1]),
     )
 
 

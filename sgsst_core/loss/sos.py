@@ -14,14 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
-from sgsst_core.features.partition import (
-    PartitionTile,
-    Rectangle,
-    choose_tile_size,
-    covered_region,
-    kept_tiles,
-    partition,
-)
+from sgsst_core.features.partition import PartitionTile, Rectangle, covered_region
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import (
     CONTENT_LAYER,
@@ -32,13 +25,13 @@ from sgsst_core.features.vgg import (
     layer_stride,
 )
 from sgsst_core.loss.terms import TERMS, LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
+from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
 from sgsst_core.parallel.division import Piece, Size, divide, rounds
 from sgsst_core.scene.pyramid import (
     add_upscaled_,
     coverage_pyramid,
     downscale,
-    scale_count,
     style_size,
 )
 from sgsst_core.timing import Timer
@@ -142,7 +135,9 @@ class SosLoss:
         self.tile_size = tile_size
         self.coarsest = coarsest
         self.leave_out = leave_out
-        self.keep_activations = keep_activations
+        held = network.held_bytes_per_pixel()
+        working = network.working_bytes_per_pixel() / held
+        self.tiling = Tiling(network.halo, memory / held, working, coarsest, tile_size, keep_activations)
         self.timer = timer or Timer()
         self.collectives = collectives
         self.speeds = (1.0,) * collectives.size
@@ -150,7 +145,7 @@ class SosLoss:
 
     def scale_count(self, height: int, width: int) -> int:
         """n_s of views of a size."""
-        return scale_count(height, width, self.coarsest)
+        return self.tiling.scale_count((height, width))
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
         """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
@@ -181,29 +176,9 @@ class SosLoss:
             return Piece(scale, size, Rectangle(0, 0, *size))
         return Piece(scale, size, covered_region(coverage))
 
-    def kept(self, areas: Sequence[int]) -> list[bool]:
-        """Which of the tiles with so many pixels keep their activations, if they are in memory at the same time."""
-        if not self.keep_activations:
-            return [False] * len(areas)
-        return kept_tiles(areas, self.held, self.working)
-
-    @property
-    def held(self) -> float:
-        """Pixels whose activations the memory holds."""
-        return self.memory / self.network.held_bytes_per_pixel()
-
-    @property
-    def working(self) -> float:
-        """Memory that a tile needs in a pass beside its activations, as a share of them."""
-        return self.network.working_bytes_per_pixel() / self.network.held_bytes_per_pixel()
-
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
         """The partition tiles of a piece, as large as the memory allows."""
-        halo = self.network.halo
-        tile_size = self.tile_size
-        if tile_size is None:
-            tile_size = choose_tile_size(*piece.size, halo, held=self.held, working=self.working, region=piece.region)
-        tiles = partition(*piece.size, tile_size, halo, piece.region)
+        tiles = self.tiling.tiles(piece.size, piece.region)
         if coverage is None or not self.leave_out:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
@@ -236,10 +211,10 @@ class SosLoss:
             target.content_image = None
         return target
 
-    def _sizes(self, size: Size, scales: Sequence[int] | None = None) -> dict[int, Size]:
-        """(height, width) of scales of a view; None for all."""
+    def _sizes(self, size: Size, scales: Sequence[int] | None = None, image_scale: int = 0) -> dict[int, Size]:
+        """(height, width) of scales of a view, whose size is given at one of them; None for all."""
         scales = range(self.scale_count(*size)) if scales is None else scales
-        return {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
+        return {scale: (size[0] >> scale - image_scale, size[1] >> scale - image_scale) for scale in scales}
 
     def position_weights(self, coverage: Tensor) -> list[Tensor]:
         """Coverage [H, W] in 0..1 at every power of two that a layer of a scale needs."""
@@ -270,33 +245,30 @@ class SosLoss:
         scales: Sequence[int] | None = None,
         *,
         gradient: bool = True,
+        image_scale: int = 0,
     ) -> SosResult:
         """Loss of an image [H, W, 3] (0..1, not clamped), and dE/dimage.
 
         Args:
+            image: of the view at its scale `image_scale`.
             style: targets by scale, from `style_targets`.
             view: from `view_target`.
-            scales: which scales; None for all (SOS). Phase 1 passes the coarsest alone.
+            scales: which scales, none of them finer than the image; None for all (SOS), of a full-size image. Phase 1
+                passes the coarsest alone.
             gradient: False evaluates the loss only.
+            image_scale: 0 for full size.
         """
-        sizes = self._sizes(_size(image), scales)
+        sizes = self._sizes(_size(image), scales, image_scale)
         share = self._share_of(view, sizes)
         total = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=self.network.device)
         terms: dict[int, LossTerms] = {}
         for some in rounds(list(sizes), self.collectives.size):
-            scaled = {scale: downscale(image.to(self.network.device), scale) for scale in some}
+            scaled = {scale: downscale(image.to(self.network.device), scale - image_scale) for scale in some}
             for pass_, pixel_gradient in self._round(scaled, style, view, share, gradient):
                 terms[pass_.scale] = pass_.terms
                 if pixel_gradient is not None:
-                    add_upscaled_(total, pixel_gradient, pass_.scale, 1.0 / len(sizes))
+                    add_upscaled_(total, pixel_gradient, pass_.scale - image_scale, 1.0 / len(sizes))
         return SosResult(terms, total if gradient else None)
-
-    def evaluate_scale(self, image: Tensor, style: ScaleTarget, view: ViewTarget, scale: int) -> SosResult:
-        """Loss of one scale from the image at that scale, [H >> scale, W >> scale, 3], and dE/dimage of that size."""
-        share = self._share_of(view, {scale: _size(image)})
-        scaled = {scale: image.to(self.network.device)}
-        ((pass_, pixel_gradient),) = self._round(scaled, {scale: style}, view, share, True)
-        return SosResult({scale: pass_.terms}, pixel_gradient)
 
     def _share_of(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Share:
         if view.share is not None and view.share.tiles.keys() == sizes.keys():
@@ -370,7 +342,7 @@ class SosLoss:
         """For each scale, the merge of its statistics and terms under way, and the activations that fit."""
         merged: list[Merged] = []
         kept: list[dict[PartitionTile, Activations]] = []
-        fits = iter(self.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
+        fits = iter(self.tiling.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
             statistics = [
                 LayerStatistics.zero(self.network.channels(layer), pass_.image.device) for layer in self.style_layers

@@ -18,7 +18,8 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import LayerTarget
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
-from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, evaluate
+from sgsst_core.stylizing.evaluation import Evaluation, evaluate
+from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 
 

@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import torch
 
-from sgsst_core.planning.planner import Plan
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut, moments
 from sgsst_core.quality.lpips import load_lpips_or_none
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.stylizing.stylizer import Evaluation, Stylizer
-
-#: What measuring and the report take beside the iterations: libraries, LPIPS, another set of raster lists (measured on
-#: jobs of 10 to 100 small views).
-MEASURING_BYTES = 400 << 20
-
-
-def with_measuring(plan: Plan) -> Plan:
-    """The plan of a job that is measured and reported, as `sgsst stylize` does it."""
-    assert plan.prediction is not None
-    peak = plan.prediction.peak_bytes + MEASURING_BYTES
-    return replace(plan, prediction=replace(plan.prediction, peak_bytes=peak))
+from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.stylizer import Stylizer
 
 
 class Measurements:

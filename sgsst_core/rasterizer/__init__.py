@@ -1,4 +1,4 @@
-"""Rasterizers: one small protocol, five implementations.
+"""Rasterizers: one small protocol, six implementations.
 
 Geometry is frozen, so a view's image is linear in its colours: image = W c + T_final * background,
 and the gradient with respect to the colours is W^T dL/dimage.
@@ -28,9 +28,13 @@ class Rasterizer(Protocol):
     `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colours` are the
     colours of one view, after spherical harmonics and clamp. Arguments may come in any floating dtype and from any
     device; results are on `device`, in `dtype`. A wrong shape is a ValueError.
+
+    Images are of full size (`scale` 0) but for `coarse`, whose images are 2^scale x 2^scale box averages of the
+    camera's: heights, widths and rows are those at its scale.
     """
 
     name: str
+    scale: int
     device: torch.device
     dtype: torch.dtype
 

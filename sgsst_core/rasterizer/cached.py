@@ -193,9 +193,11 @@ class CachedRasterizer:
             (Off the CPU the values are rounded through float16 but kept as float32.)
         max_bytes: memory for operators; None is no limit.
         device: where operators are kept and applied, and where results lie.
+        cpu: of the same scene, whose lists, background, near plane and clamp of alpha are shared; None makes one.
     """
 
     name = "cached"
+    scale = 0
     dtype = torch.float32
 
     def __init__(
@@ -208,14 +210,15 @@ class CachedRasterizer:
         precision: Precision = "float32",
         max_bytes: int | None = None,
         device: torch.device | str = "cpu",
+        cpu: CpuRasterizer | None = None,
     ) -> None:
         self.scene = scene
         self.device = torch.device(device)
         self.precision: Precision = precision
         self.max_bytes = max_bytes
         self.kept_bytes = 0
-        self._cpu = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
-        self._background = torch.tensor(background, dtype=torch.float32, device=self.device)
+        self._cpu = cpu or CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
+        self._background = torch.as_tensor(self._cpu.background, device=self.device)
         self._kept: dict[tuple[CameraKey, Rows], _Kept | None] = {}
         self._lock = threading.Lock()
 

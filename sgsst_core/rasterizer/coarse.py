@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import coarse_kernels, kernels
-from sgsst_core.rasterizer.arguments import CameraKey, camera_key, check_colours
+from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colours
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
 from sgsst_core.scene.camera import Camera
@@ -42,10 +42,8 @@ class _Grid:
         """The grid of a view at a scale.
 
         Raises:
-            ValueError: scale 0 or less, or a view that does not hold one square.
+            ValueError: a view that does not hold one square.
         """
-        if scale < 1:
-            raise ValueError(f"scale {scale}: a coarse operator is for scale 1 or more; use `cached` for full size")
         size = (camera.height >> scale << scale, camera.width >> scale << scale)
         if 0 in size:
             raise ValueError(
@@ -134,80 +132,23 @@ class CoarseOperator:
         return gradient
 
 
-class CoarseRasterizer:
-    """Renders views at a coarse scale and takes gradients back from there, on the CPU.
+class _Operators:
+    """Operators of views at coarse scales, kept until the next one would exceed `max_bytes`."""
 
-    Operators are kept in the order in which views first come, until the next one would exceed `max_bytes`; nothing is
-    ever evicted. Views without a kept operator are rendered at full size by `cpu` and averaged, with the same result up
-    to rounding. Results are the same bits for any number of threads.
-
-    A scale is 1 or more; rows and columns that fill no square of 2^scale pixels are left out, as by
-    `pyramid.downscale`. Every method raises ValueError for scale 0 or less, and for a view that holds no
-    such square: its image would be empty.
-
-    Args:
-        cpu: whose scene, lists, background, near plane and clamp of alpha this object shares.
-        max_bytes: most bytes of operators to keep; None for no limit.
-    """
-
-    device = _CPU
-
-    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None = None) -> None:
-        self.scene = cpu.scene
+    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None) -> None:
         self.max_bytes = max_bytes
         self.kept_bytes = 0
+        self.kept: dict[tuple[CameraKey, int], CoarseOperator | None] = {}
         self._cpu = cpu
-        self._kept: dict[tuple[CameraKey, int], CoarseOperator | None] = {}
         self._lock = threading.Lock()
 
-    def operator_bytes(self, camera: Camera, scale: int) -> int:
-        """Bytes that a view's operator takes or would take. Costs about one render, and keeps nothing."""
-        grid = _Grid.of(camera, scale)
-        lists = self._cpu.lists(camera)
-        return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
-
-    def is_kept(self, camera: Camera, scale: int) -> bool:
-        """Whether a view is served from a kept operator by now."""
-        return self._kept.get((camera_key(camera), scale)) is not None
-
-    def render(self, colours: Tensor, camera: Camera, scale: int) -> Tensor:
-        """Image [H >> scale, W >> scale, 3] float32 of colours [N, 3], over the background."""
-        grid = _Grid.of(camera, scale)
-        values = check_colours(colours, len(self.scene), torch.float32, _CPU)
-        operator = self._operator(camera, scale, grid)
-        if operator is None:
-            return downscale(self._cpu.render(values, camera), scale)
-        image = torch.from_numpy(operator.render(values.numpy(), self._cpu.background))
-        return downscale(image, scale - operator.scale)
-
-    def colour_gradient(self, coarse_gradient: Tensor, camera: Camera, scale: int) -> Tensor:
-        """W^T D^T dL/dimage_s, [N, 3] float32, of coarse_gradient [H >> scale, W >> scale, 3]."""
-        grid = _Grid.of(camera, scale)
-        expected = (*grid.shape(scale), 3)
-        if tuple(coarse_gradient.shape) != expected:
-            raise ValueError(
-                f"gradient of shape {tuple(coarse_gradient.shape)}: scale {scale} of view {camera.name!r} needs "
-                f"{expected}"
-            )
-        pixels = coarse_gradient.detach().to(device=_CPU, dtype=torch.float32).contiguous()
-        operator = self._operator(camera, scale, grid)
-        if operator is None:
-            whole = torch.zeros((camera.height, camera.width, 3))
-            add_upscaled_(whole, pixels, scale)
-            return self._cpu.colour_gradient(whole, camera)
-        if scale > operator.scale:
-            of_squares = pixels
-            pixels = torch.zeros((*grid.shape(operator.scale), 3))
-            add_upscaled_(pixels, of_squares, scale - operator.scale)
-        return torch.from_numpy(operator.colour_gradient(pixels.numpy(), len(self.scene)))
-
-    def _operator(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
+    def get(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
         """The view's kept operator, built now if it is new and fits; None where it does not fit."""
         key = (camera_key(camera), scale)
         with self._lock:
-            if key not in self._kept:
-                self._kept[key] = self._build(camera, grid)
-            return self._kept[key]
+            if key not in self.kept:
+                self.kept[key] = self._build(camera, grid)
+            return self.kept[key]
 
     def _build(self, camera: Camera, grid: _Grid) -> CoarseOperator | None:
         lists = self._cpu.lists(camera)
@@ -218,3 +159,124 @@ class CoarseRasterizer:
         operator = CoarseOperator(lists, counts, grid, self._cpu.alpha_max)
         self.kept_bytes += size
         return operator
+
+
+class CoarseRasterizer:
+    """The protocol of `sgsst_core.rasterizer.Rasterizer` at a coarse scale, on the CPU.
+
+    Operators are kept in the order in which views first come, until the next one would exceed `max_bytes`; nothing is
+    ever evicted. Views without a kept operator are rendered at full size by `cpu` and averaged, with the same result up
+    to rounding. Results are the same bits for any number of threads.
+
+    Cameras are those of full-size views. Rows and columns that fill no square of 2^scale pixels are left out, as by
+    `pyramid.downscale`. Every method raises ValueError for a view that holds no such square: its image would be empty.
+
+    Args:
+        cpu: whose scene, lists, background, near plane and clamp of alpha this object shares.
+        scale: 1 or more.
+        max_bytes: most bytes of operators to keep; None for no limit.
+
+    Raises:
+        ValueError: scale 0 or less.
+    """
+
+    name = "coarse"
+    device = _CPU
+    dtype = torch.float32
+
+    def __init__(self, cpu: CpuRasterizer, scale: int = 1, max_bytes: int | None = None) -> None:
+        if scale < 1:
+            raise ValueError(f"scale {scale}: a coarse operator is for scale 1 or more; use `cached` for full size")
+        self.scene = cpu.scene
+        self.scale = scale
+        self._cpu = cpu
+        self._operators = _Operators(cpu, max_bytes)
+
+    def at(self, scale: int) -> CoarseRasterizer:
+        """The same at another scale; what both keep counts together."""
+        other = CoarseRasterizer(self._cpu, scale)
+        other._operators = self._operators
+        return other
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the operators that are kept by now, of all scales."""
+        return self._operators.kept_bytes
+
+    def operator_bytes(self, camera: Camera) -> int:
+        """Bytes that a view's operator takes or would take. Costs about one render, and keeps nothing."""
+        grid = _Grid.of(camera, self.scale)
+        lists = self._cpu.lists(camera)
+        return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
+
+    def is_kept(self, camera: Camera) -> bool:
+        """Whether a view is served from a kept operator by now."""
+        return self._operators.kept.get((camera_key(camera), self.scale)) is not None
+
+    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, W >> scale, 3] float32 of colours [N, 3] in some rows at the scale, over the background."""
+        grid = _Grid.of(camera, self.scale)
+        band = self._band(camera, rows)
+        values = check_colours(colours, len(self.scene), torch.float32, _CPU)
+        operator = self._operators.get(camera, self.scale, grid)
+        if operator is None:
+            return downscale(self._cpu.render(values, camera, self._full_size(band)), self.scale)
+        image = torch.from_numpy(operator.render(values.numpy(), self._cpu.background))
+        return downscale(image, self.scale - operator.scale)[slice(*band)]
+
+    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """1 - T_final, [h, W >> scale] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        grid = _Grid.of(camera, self.scale)
+        band = self._band(camera, rows)
+        operator = self._operators.get(camera, self.scale, grid)
+        if operator is None:
+            return downscale(self._cpu.coverage(camera, self._full_size(band)), self.scale)
+        return 1 - downscale(torch.from_numpy(operator.transmittance), self.scale - operator.scale)[slice(*band)]
+
+    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """W^T D^T dL/dimage_s, [N, 3] float32, of image_gradient [h, W >> scale, 3] in some rows at the scale."""
+        grid = _Grid.of(camera, self.scale)
+        band = self._band(camera, rows)
+        pixels = self._whole(self._checked(image_gradient, camera, band), grid, band)
+        operator = self._operators.get(camera, self.scale, grid)
+        if operator is None:
+            whole = torch.zeros((camera.height, camera.width, 3))
+            add_upscaled_(whole, pixels, self.scale)
+            return self._cpu.colour_gradient(whole, camera)
+        if self.scale > operator.scale:
+            of_squares = pixels
+            pixels = torch.zeros((*grid.shape(operator.scale), 3))
+            add_upscaled_(pixels, of_squares, self.scale - operator.scale)
+        return torch.from_numpy(operator.colour_gradient(pixels.numpy(), len(self.scene)))
+
+    def _band(self, camera: Camera, rows: Rows | None) -> Rows:
+        """The band of rows at the scale as (start, stop); None is the whole view."""
+        height = camera.height >> self.scale
+        start, stop = rows or (0, height)
+        if not 0 <= start < stop <= height:
+            raise ValueError(
+                f"rows {start} to {stop}: a band of view {camera.name!r} at scale {self.scale} lies within 0 to "
+                f"{height}"
+            )
+        return start, stop
+
+    def _full_size(self, band: Rows) -> Rows:
+        return band[0] << self.scale, band[1] << self.scale
+
+    def _checked(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+        expected = (band[1] - band[0], camera.width >> self.scale, 3)
+        if tuple(image_gradient.shape) != expected:
+            raise ValueError(
+                f"gradient of shape {tuple(image_gradient.shape)}: scale {self.scale} of view {camera.name!r} needs "
+                f"{expected}"
+            )
+        return image_gradient.detach().to(device=_CPU, dtype=torch.float32).contiguous()
+
+    def _whole(self, pixels: Tensor, grid: _Grid, band: Rows) -> Tensor:
+        """The gradient of the whole view: none in the other rows."""
+        size = grid.shape(self.scale)
+        if band == (0, size[0]):
+            return pixels
+        whole = torch.zeros((*size, 3))
+        whole[slice(*band)] = pixels
+        return whole

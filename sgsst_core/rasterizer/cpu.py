@@ -46,6 +46,7 @@ class CpuRasterizer:
     """
 
     name = "cpu"
+    scale = 0
     dtype = torch.float32
     device = _CPU
 

@@ -120,6 +120,7 @@ class ReferenceRasterizer:
     """
 
     name = "reference"
+    scale = 0
     device = torch.device("cpu")
 
     def __init__(

@@ -84,6 +84,7 @@ class TritonRasterizer:
     """
 
     name = "triton"
+    scale = 0
     dtype = torch.float32
 
     def __init__(

@@ -12,11 +12,13 @@ from typing import Any
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.planner import Plan
+from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
 from sgsst_core.stylizing.loop import Stopped
-from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, Stylizer, mean_loss
+from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Of report.json: raised whenever a field changes its meaning or goes away.
 REPORT_VERSION = 2

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
 
 #: Focal length of an orbit's cameras in widths: a field of view of 49 degrees, about that of a phone's main camera.
 ORBIT_FOCAL = 1.1
@@ -77,6 +78,14 @@ def resized(camera: Camera, longer_side: int) -> Camera:
     return replace(
         camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
     )
+
+
+def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
+    """The cameras, those with more pixels than `settings.max_resolution` on their longer side brought down to it."""
+    limit = settings.max_resolution
+    return [
+        resized(camera, limit) if limit and max(camera.width, camera.height) > limit else camera for camera in cameras
+    ]
 
 
 def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:

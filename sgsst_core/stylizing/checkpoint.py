@@ -23,15 +23,18 @@ from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.planner import Decision, Plan, Prediction
+from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, StylizerState
+from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.state import StepRecord, StylizerState
 
 #: Raised whenever the meaning of a stored value changes.
-FORMAT_VERSION = "3"
+FORMAT_VERSION = "4"
+#: Its plans do not say which network and rasterizer run; see `_completed`.
+_PLANS_WITHOUT_DEVICE = "3"
 #: Settings that may differ between a checkpoint and the run that goes on from it: they only end it, or (the memory
 #: limit, which decides the partition) change no more than its rounding.
 _FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit"}
@@ -198,7 +201,7 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        if metadata["version"] != FORMAT_VERSION:
+        if metadata["version"] not in (FORMAT_VERSION, _PLANS_WITHOUT_DEVICE):
             raise CheckpointError(f"{path}: is of another version of this program. Start again without --resume.")
         if metadata.pop("digest") != _digest(tensors, metadata):
             raise ValueError("its content is not what was written")
@@ -211,7 +214,7 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
             raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
         return Checkpoint(
             state=_state(tensors, metadata),
-            plan=_plan(tensors, json.loads(metadata["plan"])),
+            plan=_plan(tensors, _plan_values(metadata)),
             ranks=int(metadata["ranks"]),
             before=_evaluation(json.loads(metadata["before"])),
             run=metadata["run"],
@@ -269,15 +272,39 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, values
 
 
+def _plan_values(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """A plan's values, whichever version wrote them."""
+    values: dict[str, Any] = json.loads(metadata["plan"])
+    return values if metadata["version"] == FORMAT_VERSION else _completed(values, json.loads(metadata["memory"]))
+
+
+def _completed(values: dict[str, Any], memory: int) -> dict[str, Any]:
+    """A plan of version 3 with what it left to the stylizer: on the CPU, as all of its measurements.
+
+    On a GPU gsplat may have run instead, which a new plan decides there.
+    """
+    precision = "features in bfloat16" in [line["decision"] for line in values["decisions"]]
+    return {
+        **values,
+        "memory_limit": memory,
+        "device": "cpu",
+        "rasterizer": "cpu" if values["kept_weights"] == "none" else "cached",
+        "precision": "bfloat16" if precision else "float32",
+        "measured": True,
+    }
+
+
 def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     looked = values.pop("survey")
     regions = [Rectangle(**region) for region in looked.pop("regions")]
-    decisions = [Decision(**decision) for decision in values.pop("decisions")]
+    decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
+    covered = tuple(values.pop("covered"))
     expected = values.pop("prediction")
     return Plan(
         survey=Survey(total_weights=tensors["plan.total_weights"], regions=regions, **looked),
         optimised=tensors["plan.optimised"],
         seen=tensors["plan.seen"],
+        covered=covered,
         decisions=decisions,
         prediction=Prediction(**expected) if expected else None,
         **values,

@@ -18,7 +18,8 @@ from sgsst_core.loss.convergence import has_converged, has_reached
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
+from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import PhotoLoader
 
 Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interrupted"]
@@ -144,11 +145,11 @@ def stylize(
     photos: PhotoLoader | None = None,
     callbacks: Callbacks | None = None,
 ) -> Tensor:
-    """Stylize a scene from beginning to end; the arguments are those of `Stylizer`.
+    """Stylize a scene from beginning to end; the arguments are those of `Stylizer.planned`.
 
     Returns:
         The new sh_dc [N, 3], float32 on the CPU. Everything else of the scene stays as it is.
     """
-    stylizer = Stylizer(scene, cameras, style, settings, weights=weights, photos=photos)
+    stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, photos=photos)
     run(stylizer, callbacks)
     return stylizer.stylized()

@@ -90,26 +90,39 @@ class Views:
         rest = self._rest.get(index, lambda: rest_colours(self._sh_rest, self._means, self.cameras[index]))
         return view_colours(sh_dc, rest)
 
-    def render(self, index: int, colours: Tensor) -> Tensor:
-        """Image [H, W, 3] of a view with its colours [N, 3]."""
-        band, camera = self._own_band(index), self.cameras[index]
+    def render(self, index: int, colours: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
+        """Image [h, w, 3] of a view with its colours [N, 3].
+
+        Args:
+            rasterizer: takes the place of the views' own; h and w are those of its scale. Images of a coarse scale
+                are so small that every rank renders them whole.
+        """
+        rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
+        if rasterizer.scale:
+            return rasterizer.render(colours, camera)
+        band = self._own_band(index)
         some = band[0] < band[1]
-        rows = self.rasterizer.render(colours, camera, band) if some else self._nothing(0, camera.width, 3)
+        rows = rasterizer.render(colours, camera, band) if some else self._nothing(0, camera.width, 3)
         with self.loss.timer("communication"):
             return self.collectives.all_gather_rows(rows, self._bands[index])
 
-    def gradient(self, index: int, image_gradient: Tensor, colours: Tensor) -> Tensor:
-        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [H, W, 3] and the colours that were rendered."""
-        with self.loss.timer("communication"):
-            rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
-        if len(rows):
-            gradient = self.rasterizer.colour_gradient(rows, self.cameras[index], self._own_band(index))
-        else:
-            gradient = self._nothing(len(colours), 3)
-        return self.add_up(gradient, colours)
+    def gradient(
+        self, index: int, image_gradient: Tensor, colours: Tensor, rasterizer: Rasterizer | None = None
+    ) -> Tensor:
+        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [h, w, 3] and the colours that were rendered.
 
-    def add_up(self, gradient: Tensor, colours: Tensor) -> Tensor:
-        """dL/dsh_dc [N, 3] from this rank's part of dL/dcolours [N, 3] and the colours that were rendered."""
+        Args:
+            rasterizer: as for `render`.
+        """
+        rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
+        if rasterizer.scale:
+            gradient = rasterizer.colour_gradient(image_gradient, camera)
+        else:
+            with self.loss.timer("communication"):
+                rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
+            gradient = self._nothing(len(colours), 3)
+            if len(rows):
+                gradient = rasterizer.colour_gradient(rows, camera, self._own_band(index))
         with self.loss.timer("communication"):
             gradient = self.collectives.all_reduce(gradient)
         # After the sum: which colours are let through depends on the sign of their whole gradient.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import read_scene
 from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
+from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
@@ -65,6 +68,41 @@ def test_planning_is_shown_and_a_resumed_job_follows_the_plan_of_the_first(
     assert request_.out.read_bytes() == whole.out.read_bytes()
     assert not Path(request_.out).with_name("s.checkpoint.safetensors").exists()
     assert not Path(request_.out).with_name("s.checkpoint.previous.safetensors").exists()
+
+
+def test_a_checkpoint_of_the_version_before_goes_on_with_its_plan(request_: StylizeRequest, tmp_path: Path) -> None:
+    whole = small_request(tmp_path / "whole", 8)
+    go_on(prepare(whole))
+    first = prepare(request_)
+    go_on(first, steps=3)
+    of_version_3(first.outputs.checkpoint)
+    told: list[PlanningProgress] = []
+    second = prepare(request_, resume=Resume(True), show_planning=told.append)
+    assert not told, "it has a survey"
+    assert second.stylizer.plan.prediction == first.stylizer.plan.prediction
+    assert go_on(second).stopped == "finished"
+    assert request_.out.read_bytes() == whole.out.read_bytes()
+
+
+def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: StylizeRequest) -> None:
+    """As if the first attempt had run on a GPU that is not there any more."""
+    first = prepare(request_)
+    go_on(first, steps=3)
+    kept = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
+    plan = replace(kept.plan, device="cuda", rasterizer="cuda")
+    save_checkpoint(first.outputs.checkpoint, replace(kept, plan=plan), first.fingerprint)
+    second = prepare(request_, resume=Resume(True))
+    assert (second.stylizer.plan.device, second.stylizer.plan.rasterizer) == ("cpu", first.stylizer.plan.rasterizer)
+    assert second.resumed is not None
+    assert second.stylizer.plan.survey is second.resumed.plan.survey
+    assert go_on(second).stopped == "finished"
+
+
+def test_planning_is_shown(request_: StylizeRequest) -> None:
+    told: list[PlanningProgress] = []
+    job = prepare(request_, show_planning=told.append)
+    views = len(job.stylizer.views)
+    assert [progress.done for progress in told] == list(range(views + 1))
 
 
 def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: StylizeRequest) -> None:

@@ -24,7 +24,7 @@ from sgsst_core.errors import SceneTooLargeError, SgsstError
 from sgsst_core.files.ply import SceneFile, read_scene
 from sgsst_core.files.ply_header import read_header
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.planning.planner import OPTIMISER_BYTES
+from sgsst_core.planning.cost import OPTIMISER_BYTES
 from sgsst_core.scene.gaussians import Scene
 from worker.processes import home
 

@@ -82,7 +82,7 @@ def _stylizer(scene: Scene, steps: int, *, shallow: bool = True, **values: Any) 
     values |= {"content_weight": 0} if shallow else {}
     settings = make_settings(steps_coarse=0, steps_sos=steps, memory_limit=1 << 30, **values)
     kind = _OnShallowLayers if shallow else Stylizer
-    return kind(scene, [_camera()], _style(), settings, weights=vgg16())
+    return kind.planned(scene, [_camera()], _style(), settings, weights=vgg16())
 
 
 def _style() -> Tensor:

@@ -8,8 +8,10 @@ from sgsst_core.features.partition import (
     covered_region,
     kept_tiles,
     partition,
+    scaled_region,
 )
 from sgsst_core.features.vgg import STYLE_LAYERS, layer_stride
+from sgsst_core.scene.pyramid import downscale
 
 
 @pytest.mark.parametrize("size", [(500, 730), (333, 517), (256, 1031), (64, 64), (15, 17), (1, 1)])
@@ -63,6 +65,20 @@ def test_region_holds_what_is_covered_and_no_more_than_it_must():
     assert tile.outer == Rectangle(16, 32, 80, 210)
     tiles = partition(100, 210, 64, 16, region)
     assert sum(tile.inner.pixels for tile in tiles) == region.pixels
+
+
+@pytest.mark.parametrize("scale", [0, 1, 2, 3])
+@pytest.mark.parametrize("size", [(100, 210), (97, 133), (64, 48)])
+def test_a_region_at_a_scale_is_that_of_the_averaged_coverage(size, scale):
+    generator = torch.Generator().manual_seed(scale)
+    for _ in range(30):
+        rows, columns = (torch.randint(0, side + 1, (2,), generator=generator).sort().values.tolist() for side in size)
+        coverage = torch.zeros(size)
+        coverage[rows[0] : rows[1], columns[0] : columns[1]] = 1
+        region = covered_region(coverage)
+        coverage[region.slices] = 1
+        scaled = downscale(coverage, scale)
+        assert scaled_region(region, scale, tuple(scaled.shape)) == covered_region(scaled)
 
 
 def test_work_outside_the_region_does_not_count():

@@ -10,8 +10,6 @@ import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning import planner
-from sgsst_core.planning.planner import choose_network
 from sgsst_core.planning.pruning import distinct_views, pruned_image_error
 from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
@@ -38,7 +36,7 @@ def higher_bands_of_zeros(scene: Scene) -> Scene:
 
 def make(scene: Scene, views: list[Camera], weights: BackboneWeights, **values: Any) -> Stylizer:
     settings = make_settings(**{"steps_coarse": 0, "steps_sos": 4, "learning_rate": 0.05, **values})
-    return Stylizer(scene, views, picture(60, 70, seed=9).float(), settings, weights=weights)
+    return Stylizer.planned(scene, views, picture(60, 70, seed=9).float(), settings, weights=weights)
 
 
 SCENES = {
@@ -116,9 +114,9 @@ def test_pruning_everything_is_refused(tiny_weights: BackboneWeights) -> None:
 def test_similar_views_are_left_out_only_when_asked(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     views = [camera for camera in cameras(3) for _ in range(2)]  # every view twice
-    assert make(scene, views, tiny_weights).plan.covered == [0, 1, 2, 3, 4, 5]
+    assert make(scene, views, tiny_weights).plan.covered == (0, 1, 2, 3, 4, 5)
     plan = make(scene, views, tiny_weights, similar_views=1e-4).plan
-    assert plan.covered == [0, 2, 4]
+    assert plan.covered == (0, 2, 4)
     assert any(decision.item == "similar views" for decision in plan.decisions)
 
 
@@ -132,17 +130,6 @@ def test_distinct_views_by_their_shift() -> None:
     weights = torch.ones(len(scene), dtype=torch.float64)
     assert distinct_views(scene, turned, [0, 1, 2], weights, 0.09) == [0, 1, 2]
     assert distinct_views(scene, turned, [0, 1, 2], weights, 0.11) == [0, 2]
-
-
-def test_bfloat16_is_left_out_where_it_is_slower(
-    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The two timings are all that is replaced: which of them is shorter depends on the processor."""
-    for slower, dtype in ((torch.bfloat16, torch.float32), (torch.float32, torch.bfloat16)):
-        monkeypatch.setattr(planner, "_convolution_seconds", lambda d, device, s=slower: 2.0 if d == s else 1.0)
-        network, decisions = choose_network(tiny_weights, make_settings(precision="bfloat16"))
-        assert network.dtype == dtype
-        assert [decision.item for decision in decisions] == ["precision"]
 
 
 def test_rendering_without_unseen_gaussians_is_bitwise_the_same(tiny_weights: BackboneWeights) -> None:
@@ -205,6 +192,6 @@ def test_unseen_gaussians_keep_their_colour_in_paper(tiny_weights: BackboneWeigh
     scene = behind(wall())
     for preset, moved in (("paper", False), ("standard", True)):
         settings = make_settings(preset, steps_coarse=0, steps_sos=2)
-        stylizer = Stylizer(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=tiny_weights)
+        stylizer = Stylizer.planned(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=tiny_weights)
         run(stylizer)
         assert bool((stylizer.stylized()[-10:] != scene.sh_dc[-10:]).any()) == moved

@@ -369,7 +369,7 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
     views = [resized(camera, 120) for camera in spread(read_cameras(folder / "cameras.json"), 10)]
     painting = load_image(shared_data / "styles" / "starry_night.jpg")
     settings = make_settings(steps_coarse=0, steps_sos=10, learning_rate=0.2, learning_rate_end=0.1)
-    stylizer = Stylizer(scene, views, painting, settings, weights=vgg16_weights)
+    stylizer = Stylizer.planned(scene, views, painting, settings, weights=vgg16_weights)
     measured = HeldOut(
         stylizer.views.cameras,
         stylizer.views.covered,

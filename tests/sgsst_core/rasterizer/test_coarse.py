@@ -61,26 +61,27 @@ def test_agrees_with_the_average_of_the_reference(name: str) -> None:
     image, band = reference.render(colours, view), reference.near_cutoff(view, CLOSE)
     coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
     for scale in SCALES:
+        coarse = coarse.at(scale)
         close = downscale(band.double(), scale) > 0
-        actual = coarse.render(colours, view, scale)
+        actual = coarse.render(colours, view)
         assert actual.dtype == torch.float32
         assert_close_outside_band(actual, downscale(image, scale), close, tolerance=3e-6, largest_share=0.01)
         pixels = coarse_pixels(view, scale)
         pixels[close] = 0
-        gradient = coarse.colour_gradient(pixels, view, scale)
+        gradient = coarse.colour_gradient(pixels, view)
         assert gradient.dtype == torch.float32
         assert relative_error(gradient, reference.colour_gradient(upscaled(pixels.double(), view, scale), view)) < 1e-6
-        assert coarse.is_kept(view, scale)
+        assert coarse.is_kept(view)
 
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_gradient_is_the_transpose(scale: int) -> None:
     scene, view = cloud(seed=11), camera(107, 77)
-    coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
+    coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND), scale)
     colours, pixels = colours_of(scene), coarse_pixels(view, scale)
-    black = coarse.render(torch.zeros_like(colours), view, scale).double()
-    forward = (coarse.render(colours, view, scale).double() - black) * pixels
-    backward = coarse.colour_gradient(pixels, view, scale).double() * colours
+    black = coarse.render(torch.zeros_like(colours), view).double()
+    forward = (coarse.render(colours, view).double() - black) * pixels
+    backward = coarse.colour_gradient(pixels, view).double() * colours
     assert float(backward.sum()) == pytest.approx(float(forward.sum()), abs=1e-6 * float(forward.abs().sum()))
 
 
@@ -92,12 +93,12 @@ def test_what_fills_no_square_does_not_count(scale: int) -> None:
     corner = ((view.width - 0.5 - view.cx) / view.fx, (view.height - 0.5 - view.cy) / view.fy, 1.0)
     cpu = CpuRasterizer(single(corner, scales=(1e-3,) * 3, opacity=0.0045))
     assert torch.nonzero(cpu.coverage(view)).tolist() == [[2 * side, 3 * side]]
-    coarse = CoarseRasterizer(cpu)
-    image = coarse.render(torch.ones(1, 3), view, scale)
+    coarse = CoarseRasterizer(cpu, scale)
+    image = coarse.render(torch.ones(1, 3), view)
     assert image.shape == (2, 3, 3)
     assert not image.any()
-    assert not coarse.colour_gradient(torch.ones(2, 3, 3), view, scale).any()
-    (operator,) = coarse._kept.values()
+    assert not coarse.colour_gradient(torch.ones(2, 3, 3), view).any()
+    (operator,) = coarse._operators.kept.values()
     assert operator is not None
     assert len(operator.pieces.slots) == 0
 
@@ -105,20 +106,20 @@ def test_what_fills_no_square_does_not_count(scale: int) -> None:
 def test_small_views_have_the_scales_whose_squares_they_hold() -> None:
     scene, view = cloud(seed=12), camera(15, 17)
     coarse, colours = CoarseRasterizer(CpuRasterizer(scene)), colours_of(scene)
-    assert [tuple(coarse.render(colours, view, scale).shape) for scale in (1, 2, 3)] == [
+    assert [tuple(coarse.at(scale).render(colours, view).shape) for scale in (1, 2, 3)] == [
         (8, 7, 3),
         (4, 3, 3),
         (2, 1, 3),
     ]
     for use in (
-        lambda: coarse.render(colours, view, 4),
-        lambda: coarse.colour_gradient(torch.zeros(1, 0, 3), view, 4),
-        lambda: coarse.operator_bytes(view, 4),
+        lambda: coarse.at(4).render(colours, view),
+        lambda: coarse.at(4).colour_gradient(torch.zeros(1, 0, 3), view),
+        lambda: coarse.at(4).operator_bytes(view),
     ):
         with pytest.raises(ValueError, match="view 'test': 15x17 pixels hold no square of 16 pixels a side"):
             use()
     with pytest.raises(ValueError, match="1x1 pixels hold no square of 2 pixels"):
-        coarse.render(colours, camera(1, 1), 1)
+        coarse.render(colours, camera(1, 1))
 
 
 def test_arguments_are_checked_before_any_work() -> None:
@@ -126,13 +127,16 @@ def test_arguments_are_checked_before_any_work() -> None:
     coarse = CoarseRasterizer(CpuRasterizer(scene))
     for scale in (0, -1):
         with pytest.raises(ValueError, match="for scale 1 or more; use `cached`"):
-            coarse.render(colours_of(scene), view, scale)
+            coarse.at(scale)
+    for rows in ((0, 0), (3, 2), (0, 23), (-1, 4)):
+        with pytest.raises(ValueError, match="at scale 1 lies within 0 to 22"):
+            coarse.render(colours_of(scene), view, rows)
     with pytest.raises(ValueError, match="colours of shape"):
-        coarse.render(torch.zeros(9, 3), view, 1)
+        coarse.render(torch.zeros(9, 3), view)
     with pytest.raises(
         ValueError, match=r"gradient of shape \(45, 70, 3\): scale 1 of view 'test' needs \(22, 35, 3\)"
     ):
-        coarse.colour_gradient(pixels_like(view), view, 1)
+        coarse.colour_gradient(pixels_like(view), view)
     assert coarse.kept_bytes == 0
 
 
@@ -145,10 +149,11 @@ def test_a_view_without_gaussians_is_background(scene: Scene) -> None:
     view = camera()
     coarse = CoarseRasterizer(CpuRasterizer(scene, background=(0.5, 0.25, 0.125)))
     for scale in SCALES:
-        image = coarse.render(colours_of(scene), view, scale)
+        image = coarse.at(scale).render(colours_of(scene), view)
         assert image.shape == (view.height >> scale, view.width >> scale, 3)
         assert torch.equal(image.flatten(0, 1).unique(dim=0), torch.tensor([[0.5, 0.25, 0.125]]))
-        gradient = coarse.colour_gradient(coarse_pixels(view, scale), view, scale)
+        gradient = coarse.at(scale).colour_gradient(coarse_pixels(view, scale), view)
+        assert not coarse.at(scale).coverage(view).any()
         assert gradient.shape == (len(scene), 3)
         assert not gradient.any()
 
@@ -159,9 +164,9 @@ def test_background_fills_what_is_not_covered() -> None:
     left = 1 - cpu.coverage(view)
     assert 0 < float(left.min()) < float(left.max()) == 1
     for scale in SCALES:
-        expected = CoarseRasterizer(black).render(colours_of(scene), view, scale)
+        expected = CoarseRasterizer(black, scale).render(colours_of(scene), view)
         expected = expected + downscale(left, scale)[..., None] * torch.tensor(BACKGROUND)
-        assert torch.allclose(CoarseRasterizer(cpu).render(colours_of(scene), view, scale), expected, atol=1e-6)
+        assert torch.allclose(CoarseRasterizer(cpu, scale).render(colours_of(scene), view), expected, atol=1e-6)
 
 
 def test_many_gaussians_in_a_pixel_lose_no_digits() -> None:
@@ -176,7 +181,7 @@ def test_many_gaussians_in_a_pixel_lose_no_digits() -> None:
     )
     colours, cpu = 1 + colours_of(scene), CpuRasterizer(scene)
     expected = downscale(cpu.render(colours, view).double(), 4)
-    assert relative_error(CoarseRasterizer(cpu).render(colours, view, 4), expected) < 2e-7
+    assert relative_error(CoarseRasterizer(cpu, 4).render(colours, view), expected) < 2e-7
 
 
 def test_what_does_not_fit_the_budget_is_recomputed() -> None:
@@ -185,40 +190,65 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
     colours, cpu = colours_of(scene), CpuRasterizer(scene, background=BACKGROUND)
     for scale in SCALES:
         pixels = coarse_pixels(views[0], scale)
-        sizes = [CoarseRasterizer(cpu).operator_bytes(view, scale) for view in views]
-        budget, whole = sizes[0] + sizes[1], CoarseRasterizer(cpu)
-        coarse = CoarseRasterizer(cpu, max_bytes=budget)
+        sizes = [CoarseRasterizer(cpu, scale).operator_bytes(view) for view in views]
+        budget, whole = sizes[0] + sizes[1], CoarseRasterizer(cpu, scale)
+        coarse = CoarseRasterizer(cpu, scale, max_bytes=budget)
         for _ in range(2):
             for view in views:
                 image = downscale(cpu.render(colours, view), scale)
                 gradient = cpu.colour_gradient(upscaled(pixels, view, scale), view)
                 for one in (coarse, whole):
-                    assert torch.allclose(one.render(colours, view, scale), image, atol=1e-6)
-                    assert relative_error(one.colour_gradient(pixels, view, scale), gradient) < 1e-6
-        assert [coarse.is_kept(view, scale) for view in views] == [True, True, False]
+                    assert torch.allclose(one.render(colours, view), image, atol=1e-6)
+                    assert relative_error(one.colour_gradient(pixels, view), gradient) < 1e-6
+        assert [coarse.is_kept(view) for view in views] == [True, True, False]
         assert coarse.kept_bytes == budget
-        assert sum(o.nbytes for o in coarse._kept.values() if o is not None) == budget
+        assert sum(o.nbytes for o in coarse._operators.kept.values() if o is not None) == budget
         assert whole.kept_bytes == sum(sizes)
 
 
 def test_operators_are_far_smaller_than_the_weights_at_full_size() -> None:
     scene, view = cloud(2000, seed=13), camera(200, 120)
     coarse = CoarseRasterizer(CpuRasterizer(scene))
-    sizes = [CachedRasterizer(scene).operator_bytes(view)] + [coarse.operator_bytes(view, s) for s in (1, 2, 3, 4)]
+    sizes = [CachedRasterizer(scene).operator_bytes(view)] + [coarse.at(s).operator_bytes(view) for s in (1, 2, 3, 4)]
     assert sizes[1] < 0.6 * sizes[0]
     assert sizes[2] < 0.2 * sizes[0]
     assert sizes == sorted(sizes, reverse=True)
     assert coarse.kept_bytes == 0
-    assert not coarse.is_kept(view, 1)
+    assert not coarse.is_kept(view)
 
 
 def test_an_operator_belongs_to_a_camera_and_a_scale() -> None:
     scene, view = cloud(seed=14), camera()
-    coarse = CoarseRasterizer(CpuRasterizer(scene))
-    coarse.render(colours_of(scene), view, 2)
-    assert coarse.is_kept(replace(view, name="another name"), 2)
-    assert not coarse.is_kept(view, 1)
-    assert not coarse.is_kept(replace(view, fx=view.fx * 1.01), 2)
+    coarse = CoarseRasterizer(CpuRasterizer(scene), 2)
+    coarse.render(colours_of(scene), view)
+    assert coarse.is_kept(replace(view, name="another name"))
+    assert not coarse.at(1).is_kept(view)
+    assert not coarse.is_kept(replace(view, fx=view.fx * 1.01))
+
+
+def test_scales_share_one_budget() -> None:
+    scene, view = cloud(seed=14), camera()
+    cpu, colours = CpuRasterizer(scene), colours_of(scene)
+    coarse = CoarseRasterizer(cpu, 2, max_bytes=CoarseRasterizer(cpu, 2).operator_bytes(view))
+    coarse.render(colours, view)
+    coarse.at(3).render(colours, view)
+    assert coarse.at(2).is_kept(view)
+    assert not coarse.at(3).is_kept(view)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("max_bytes", [None, 0], ids=["kept", "not kept"])
+def test_bands_put_together_are_the_whole_view(scale: int, max_bytes: int | None) -> None:
+    scene, view = cloud(seed=16), camera(107, 141)
+    coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND), scale, max_bytes)
+    colours, pixels = colours_of(scene), coarse_pixels(view, scale)
+    height = view.height >> scale
+    bands = [(0, 1), (1, height // 2), (height // 2, height)]
+    for method in (coarse.coverage, lambda *where: coarse.render(colours, *where)):
+        assert torch.equal(torch.cat([method(view, band) for band in bands]), method(view))  # type: ignore[operator]
+    parts = [coarse.colour_gradient(pixels[slice(*band)], view, band) for band in bands]
+    assert relative_error(sum(parts), coarse.colour_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
+    assert torch.allclose(coarse.coverage(view), downscale(CpuRasterizer(scene).coverage(view), scale), atol=1e-6)
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
@@ -230,8 +260,8 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
             torch.set_num_threads(threads)
             coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
             for scale in SCALES:
-                image = coarse.render(colours, view, scale)
-                results.append((image, coarse.colour_gradient(coarse_pixels(view, scale), view, scale)))
+                image = coarse.at(scale).render(colours, view)
+                results.append((image, coarse.at(scale).colour_gradient(coarse_pixels(view, scale), view)))
     finally:
         torch.set_num_threads(before)
     once, count = results[: len(SCALES)], len(SCALES)
@@ -243,12 +273,12 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 def test_python_threads_can_share_a_rasterizer() -> None:
     scene, view = cloud(500, seed=14), camera()
     colours, pixels = colours_of(scene), coarse_pixels(view, 2)
-    alone = CoarseRasterizer(CpuRasterizer(scene))
-    image, gradient = alone.render(colours, view, 2), alone.colour_gradient(pixels, view, 2)
-    shared = CoarseRasterizer(CpuRasterizer(scene))
+    alone = CoarseRasterizer(CpuRasterizer(scene), 2)
+    image, gradient = alone.render(colours, view), alone.colour_gradient(pixels, view)
+    shared = CoarseRasterizer(CpuRasterizer(scene), 2)
     with ThreadPoolExecutor(4) as pool:
-        images = [pool.submit(shared.render, colours, view, 2) for _ in range(8)]
-        gradients = [pool.submit(shared.colour_gradient, pixels, view, 2) for _ in range(8)]
+        images = [pool.submit(shared.render, colours, view) for _ in range(8)]
+        gradients = [pool.submit(shared.colour_gradient, pixels, view) for _ in range(8)]
     assert all(torch.equal(f.result(), image) for f in images)
     assert all(torch.equal(f.result(), gradient) for f in gradients)
     assert shared.kept_bytes == alone.kept_bytes

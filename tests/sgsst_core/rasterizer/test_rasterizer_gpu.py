@@ -12,7 +12,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
+from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max, gsplat_problem
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, pixels_like, turned_pose
@@ -23,6 +23,13 @@ needs_gpu = pytest.mark.skipif(not HAS_GPU, reason="no CUDA GPU that PyTorch can
 needs_gsplat = pytest.mark.skipif(not HAS_GSPLAT, reason="gsplat, the extra [cuda], is not installed")
 #: gsplat projects in float32 and takes exponentials with the fast intrinsic.
 CLOSE = 2e-3
+
+
+@pytest.mark.gpu
+@needs_gpu
+@needs_gsplat
+def test_gsplat_has_no_problem() -> None:
+    assert gsplat_problem() is None
 
 
 @pytest.mark.gpu
@@ -92,3 +99,10 @@ def test_without_a_gpu_the_error_says_what_to_choose() -> None:
 )
 def test_the_clamp_follows_the_version(version: str, clamp: float) -> None:
     assert gsplat_alpha_max(version) == clamp
+
+
+@pytest.mark.skipif(HAS_GPU and HAS_GSPLAT, reason="there is no problem")
+def test_gsplat_that_cannot_be_used_has_a_reason_in_one_line() -> None:
+    problem = gsplat_problem()
+    assert problem
+    assert "\n" not in problem

@@ -14,8 +14,10 @@ from sgsst_core.loss.terms import LossTerms
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import REPORT_VERSION, Sources, bought, build_report
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, Stylizer, mean_loss
+from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, blind_camera, cameras, style
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,7 +28,7 @@ def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evalu
     """Six views of a ball of which one sees nothing, after seven steps; the loss before and after."""
     views = [*cameras(3), blind_camera(), *cameras(2)]
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3)
-    stylizer = Stylizer(ball(), views, style(), settings, weights=tiny_weights)
+    stylizer = Stylizer.planned(ball(), views, style(), settings, weights=tiny_weights)
     before = stylizer.evaluate(stylizer.evaluation_views)
     run(stylizer)
     return stylizer, before, stylizer.evaluate(stylizer.evaluation_views)

@@ -471,7 +471,7 @@ def test_long_history_stays_small() -> None:
 
 
 def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
-    stylizer = Stylizer(
+    stylizer = Stylizer.planned(
         ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=tiny_weights
     )
     before = stylizer.evaluate(stylizer.evaluation_views)

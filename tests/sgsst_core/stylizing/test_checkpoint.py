@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.terms import TERMS, LossTerms
-from sgsst_core.planning.planner import Decision, Plan, Prediction
+from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import (
@@ -24,7 +24,8 @@ from sgsst_core.stylizing.checkpoint import (
     save_checkpoint,
     versions,
 )
-from sgsst_core.stylizing.stylizer import StepRecord, StylizerState
+from sgsst_core.stylizing.state import StepRecord, StylizerState
+from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
 from tests.small_scenes import cameras, style, wall
 
 
@@ -61,12 +62,15 @@ def kept(state: StylizerState) -> Checkpoint:
         survey=looked,
         optimised=seen,
         seen=seen,
-        covered=[0, 2],
+        covered=(0, 2),
         weighted=True,
         steps_coarse=7,
+        memory_limit=12345,
+        rasterizer="cached",
         kept_weights="half",
+        measured=True,
         ranks=2,
-        decisions=[Decision("item", "decision", "reason", seconds=0.1, bytes=3)],
+        decisions=(Decision("item", "decision", "reason", seconds=0.1, bytes=3),),
         prediction=Prediction(0.1, 0.2, 3),
     )
     before = {0: LossTerms(gram=1.0, mean=2.0, std=1 / 3)}
@@ -92,6 +96,25 @@ def test_everything_comes_back_exactly(kept: Checkpoint, tmp_path: Path) -> None
     loaded = load_checkpoint(tmp_path / "c", "job")
     assert_same(kept, loaded)
     torch.Generator().set_state(loaded.state.generator)
+
+
+def test_a_checkpoint_of_version_3_comes_back_with_what_its_plan_meant(kept: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", kept, "job")
+    of_version_3(tmp_path / "c")
+    assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
+    for form, rasterizer in (("none", "cpu"), ("float32", "cached")):
+        other = replace(kept, plan=replace(kept.plan, kept_weights=form))  # type: ignore[arg-type]
+        save_checkpoint(tmp_path / "c", other, "job")
+        of_version_3(tmp_path / "c", decision="features in bfloat16")
+        found = load_checkpoint(tmp_path / "c", "job").plan
+        assert (found.rasterizer, found.precision) == (rasterizer, "bfloat16")
+
+
+def test_a_checkpoint_of_a_version_before_that_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", kept, "job")
+    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"4"', b'"version":"2"'))
+    with pytest.raises(CheckpointError, match="another version of this program"):
+        load_checkpoint(tmp_path / "c", "job")
 
 
 def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Checkpoint, tmp_path: Path) -> None:

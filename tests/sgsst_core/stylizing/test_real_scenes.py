@@ -28,8 +28,8 @@ def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data,
         steps_coarse=10, steps_sos=50, learning_rate=0.2, learning_rate_end=0.05, coarsest_side=100
     )
     chosen = [camera for index, camera in enumerate(cameras) if index % 3 != 1]
-    training = Stylizer(scene, chosen, style, settings, weights=vgg16_weights)
-    held_out = Stylizer(scene, cameras[1::3], style, settings, weights=vgg16_weights)
+    training = Stylizer.planned(scene, chosen, style, settings, weights=vgg16_weights)
+    held_out = Stylizer.planned(scene, cameras[1::3], style, settings, weights=vgg16_weights)
 
     before = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, held_out)]
     assert run(training) == "finished"

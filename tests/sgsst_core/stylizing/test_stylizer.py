@@ -12,12 +12,12 @@ import torch
 from sgsst_core import stylize
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.scene.camera import resized
+from sgsst_core.scene.camera import fit_cameras, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import Callbacks, Progress, run
-from sgsst_core.stylizing.stylizer import Stylizer, fit_cameras
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import HEIGHT, WIDTH, ball, blind_camera, cameras, style, wall
 
@@ -33,7 +33,7 @@ def make(
     weights: BackboneWeights, scene: Scene, views: int = 3, preset: PresetName = "standard", **values: Any
 ) -> Stylizer:
     settings = make_settings(preset, **{"steps_coarse": 5, "steps_sos": 5, **values})
-    return Stylizer(scene, cameras(views), style(), settings, weights=weights)
+    return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
 
 
 def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
@@ -76,8 +76,8 @@ def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWe
     """With little memory phase 1 keeps the weights of the coarsest scale only; nothing else may change."""
     options = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
     views = [resized(camera, 100) for camera in cameras(2)]
-    lean = Stylizer(scene, views, style(), make_settings(**options), weights=tiny_weights)
-    plain = Stylizer(scene, views, style(), make_settings(**options, kept_weights="none"), weights=tiny_weights)
+    lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=tiny_weights)
+    plain = Stylizer.planned(scene, views, style(), make_settings(**options, kept_weights="none"), weights=tiny_weights)
     assert lean.plan.coarse_weights
     assert not plain.plan.coarse_weights
     for scales in ([2], [0, 1, 2]):
@@ -120,7 +120,7 @@ def test_learning_rate_falls_exponentially_to_its_end(tiny_weights: BackboneWeig
 def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
     tiny_weights: BackboneWeights, scene: Scene
 ) -> None:
-    left_out = Stylizer(scene, [cameras(4)[1]], style(), make_settings(), weights=tiny_weights)
+    left_out = Stylizer.planned(scene, [cameras(4)[1]], style(), make_settings(), weights=tiny_weights)
     start = left_out.evaluate([0])[0].total
     stylizer = make(tiny_weights, scene, steps_sos=20, learning_rate=0.1)
     before = stylizer.evaluate([0, 1, 2])[0].total
@@ -191,7 +191,7 @@ def test_phase_1_is_left_out_where_there_is_one_scale(
 
 def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: BackboneWeights) -> None:
     settings = make_settings(steps_coarse=1, steps_sos=1)
-    stylizer = Stylizer(wall(), cameras(1, width=512, height=512), style(), settings, weights=tiny_weights)
+    stylizer = Stylizer.planned(wall(), cameras(1, width=512, height=512), style(), settings, weights=tiny_weights)
     run(stylizer)
     first, second = stylizer.history
     assert (first.stage, list(first.terms)) == ("coarse", [1])
@@ -223,7 +223,7 @@ def test_position_weights_are_for_views_with_an_empty_surround(
 
 def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scene: Scene) -> None:
     settings = make_settings(steps_sos=3)
-    stylizer = Stylizer(scene, [blind_camera(), *cameras(2)], style(), settings, weights=tiny_weights)
+    stylizer = Stylizer.planned(scene, [blind_camera(), *cameras(2)], style(), settings, weights=tiny_weights)
     run(stylizer)
     assert stylizer.views.covered == [1, 2]
     assert {record.view for record in stylizer.history} == {1, 2}
@@ -231,16 +231,16 @@ def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scen
 
 def test_cameras_without_any_sight_of_the_scene_are_refused(tiny_weights: BackboneWeights, scene: Scene) -> None:
     with pytest.raises(CameraError, match="None of the 1 cameras sees a Gaussian"):
-        Stylizer(scene, [blind_camera()], style(), make_settings(), weights=tiny_weights)
+        Stylizer.planned(scene, [blind_camera()], style(), make_settings(), weights=tiny_weights)
     with pytest.raises(CameraError, match="no cameras"):
-        Stylizer(scene, [], style(), make_settings(), weights=tiny_weights)
+        Stylizer.planned(scene, [], style(), make_settings(), weights=tiny_weights)
 
 
 def test_photos_are_the_content_where_they_are_given(tiny_weights: BackboneWeights, scene: Scene) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings()
-    own = Stylizer(scene, cameras(1), style(), settings, weights=tiny_weights)
-    given = Stylizer(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
+    own = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights)
+    given = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
     assert own.evaluate([0])[0]["content"] == 0
     assert given.evaluate([0])[0]["content"] > 0
 

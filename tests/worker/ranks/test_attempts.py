@@ -18,8 +18,8 @@ import pytest
 from PIL import Image
 
 from sgsst_core.errors import SceneError
+from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import Progress
-from sgsst_core.stylizing.stylizer import mean_loss
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, shared_memory, small_request
 from worker.description import Prepared
 from worker.execute import execute

@@ -64,7 +64,7 @@ def gradient(
     result = loss.evaluate(views.render(0, colours), targets, target, scales)
     assert result.image_gradient is not None
     assert target.share is not None
-    kept = loss.kept([tile.outer.pixels for tiles in target.share.tiles.values() for tile in tiles])
+    kept = loss.tiling.kept([tile.outer.pixels for tiles in target.share.tiles.values() for tile in tiles])
     return views.gradient(0, result.image_gradient, colours), result.loss, kept
 
 
@@ -114,7 +114,9 @@ def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
 def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str, Any]) -> dict[str, Any]:
     """A whole run."""
     settings = make_settings("standard", keep=("ranks",), coarsest_side=40, **values)
-    stylizer = Stylizer(scene, cameras(views), style(), settings, weights=tiny_weights(), collectives=collectives)
+    stylizer = Stylizer.planned(
+        scene, cameras(views), style(), settings, weights=tiny_weights(), collectives=collectives
+    )
     stopped = run(stylizer)
     return {
         "stopped": stopped,
@@ -160,7 +162,7 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
 def one_view_a_step_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
-    stylizer = Stylizer(scene, cameras(5), style(), settings, weights=tiny_weights())
+    stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     gradients = [stylizer.gradient(view, range(stylizer.scale_count(view)))[0] for view in views]
     return torch.stack(gradients).mean(dim=0)
 
@@ -168,8 +170,8 @@ def one_view_a_step_by_hand(views: list[int]) -> Tensor:
 def test_gradients_of_a_steps_views_are_averaged() -> None:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3)
-    stylizer = Stylizer(scene, cameras(5), style(), settings, weights=tiny_weights())
-    order = Stylizer(scene, cameras(5), style(), settings, weights=tiny_weights())
+    stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
+    order = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     views = [order._next_view() for _ in range(3)]
     stylizer.run_step()
     assert stylizer.sh_dc.grad is not None
@@ -178,7 +180,7 @@ def test_gradients_of_a_steps_views_are_averaged() -> None:
 
 def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
     settings = make_settings("standard", steps_coarse=0, steps_sos=20, keep=("ranks",), rebalance=rebalance)
-    stylizer = Stylizer(
+    stylizer = Stylizer.planned(
         wall(), cameras(2, 192, 144), style(), settings, weights=tiny_weights(), collectives=collectives
     )
     forward = stylizer.network.forward

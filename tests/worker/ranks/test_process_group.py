@@ -128,7 +128,7 @@ def test_an_error_of_the_first_rank_is_raised_on_all() -> None:
 
 def drift(collectives: Collectives) -> str:
     settings = make_settings("standard", steps_coarse=0, steps_sos=60, keep=("ranks",), early_stop=False)
-    stylizer = Stylizer(wall(), cameras(1), style(), settings, weights=tiny_weights(), collectives=collectives)
+    stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights(), collectives=collectives)
     if collectives.rank == 1:
         stylizer.sh_dc.data[3, 1] += 1e-6
     try:
@@ -147,7 +147,7 @@ def test_ranks_that_drift_apart_are_found() -> None:
 def leave_out(collectives: Collectives) -> str | int:
     settings = make_settings("standard", steps_coarse=0, steps_sos=4)
     try:
-        stylizer = Stylizer(
+        stylizer = Stylizer.planned(
             wall(), cameras(1, 32, 24), style(), settings, weights=tiny_weights(), collectives=collectives
         )
     except RankLeftOut:

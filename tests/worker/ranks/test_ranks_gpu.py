@@ -27,7 +27,7 @@ def gradient(collectives: Collectives, name: str) -> Tensor:
     """Colour gradient [n, 3] of one view at two scales, as a step computes it on this machine's devices."""
     scene = wall(sh_degree=1) if name == "wall" else ball()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, keep=("ranks",))
-    stylizer = Stylizer(
+    stylizer = Stylizer.planned(
         scene, cameras(1, 320, 240), style(), settings, weights=load_weights("vgg16"), collectives=collectives
     )
     return stylizer.gradient(0, range(stylizer.scale_count(0)))[0]

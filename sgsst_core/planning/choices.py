@@ -1,0 +1,65 @@
+"""Choices that follow from the settings and a first measurement.
+
+What is measured next depends on them, so the probe and `decide` share them.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.planning.plan import Device
+from sgsst_core.planning.survey import Survey
+from sgsst_core.rasterizer import RasterizerName
+from sgsst_core.settings import Precision, Settings
+
+
+def optimised_gaussians(looked: Survey, settings: Settings) -> Tensor:
+    """[N] bool, Gaussians whose colours the views decide.
+
+    Raises:
+        SettingsError: pruning would leave none.
+    """
+    optimised = looked.total_weights > settings.prune_weight
+    if not optimised.any():
+        raise SettingsError(
+            f"--prune-weight {settings.prune_weight:g} would leave out every Gaussian: the largest total blend weight "
+            f"is {float(looked.total_weights.max()):.3g}. Give a smaller one."
+        )
+    return optimised
+
+
+def rendered_gaussians(optimised: Tensor, settings: Settings) -> Tensor:
+    """[N] bool, Gaussians that are rendered: the optimised ones, or all for comparison."""
+    everything = "unseen" in settings.keep and not settings.prune_weight
+    return torch.ones_like(optimised) if everything else optimised
+
+
+def pruned_gaussians(looked: Survey, seen: Tensor) -> Tensor:
+    """[N] bool, Gaussians that a view shows and that are not rendered all the same."""
+    return ~seen & (looked.total_weights > 0)
+
+
+def precision_of(ratio: float | None) -> Precision:
+    """The network's precision, where a convolution in float32 takes `ratio` times as long as in bfloat16.
+
+    Processors without bfloat16 instructions compute it hundreds of times slower than float32.
+
+    Args:
+        ratio: None where bfloat16 was not asked for.
+    """
+    return "bfloat16" if ratio is not None and ratio > 1 else "float32"
+
+
+def rasterizer_anew(device: Device, gsplat_problem: str | None, settings: Settings) -> RasterizerName:
+    """The rasterizer that computes blend weights anew in every call.
+
+    gsplat does it on a GPU, unless weights are to be kept: those are computed on the CPU, wherever they are applied.
+
+    Args:
+        gsplat_problem: why gsplat cannot be used; None where it can.
+    """
+    if device == "cuda" and gsplat_problem is None and settings.kept_weights in ("auto", "none"):
+        return "cuda"
+    return "cpu"

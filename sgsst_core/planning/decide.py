@@ -1,0 +1,220 @@
+"""What a scene does not need is left out: every decision before the first iteration, from a probe and the settings.
+
+Nothing is rendered or timed here, and the machine is not looked at: the same probe and settings give the same plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.tiling import Tiling
+from sgsst_core.parallel.division import divide, loads
+from sgsst_core.planning import decisions
+from sgsst_core.planning.choices import optimised_gaussians, precision_of, rendered_gaussians
+from sgsst_core.planning.cost import Work, content_bytes, image_bytes, pieces_of
+from sgsst_core.planning.plan import Decision, Plan, Prediction
+from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
+from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
+from sgsst_core.settings import KeptWeights, Settings
+
+#: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
+UNCOVERED_SHARE = 0.01
+#: Building a view's kept weights costs about three renders with gradient, and each use of them saves two thirds of one:
+#: with fewer visits they do not pay.
+LEAST_VISITS = 5
+#: What measuring between steps and the report take beside the iterations: libraries, LPIPS, another set of raster lists
+#: (measured on jobs of 10 to 100 small views).
+MEASURING_BYTES = 400 << 20
+
+
+def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
+    """The plan for a job.
+
+    Args:
+        measured: the job will be measured between its steps and reported, as `sgsst stylize` does it.
+
+    Raises:
+        SettingsError: pruning would leave no Gaussian.
+    """
+    return _Deciding(probe, settings, measured=measured).plan()
+
+
+class _Deciding:
+    """Everything that follows from a probe and settings, step by step."""
+
+    def __init__(self, probe: Probe, settings: Settings, *, measured: bool) -> None:
+        self.probe = probe
+        self.settings = settings
+        self.measured = measured
+        memory = probe.machine.memory
+        network = probe.network
+        self.activations = int(memory * MEMORY_SHARES["activations"])
+        self.budget = int(memory * MEMORY_SHARES["rasterizer"])
+        self.tiling = Tiling(
+            network.halo,
+            self.activations / network.held_bytes,
+            network.working_bytes / network.held_bytes,
+            settings.coarsest_side,
+            keep_activations="activations" not in settings.keep,
+        )
+        self.base = self._without_decisions()
+        self.sizes = [probe.sizes[index] for index in self.base.covered]
+        leave_out = self.base.weighted and "uncovered" not in settings.keep
+        self.regions: list[Rectangle] | None = None
+        if leave_out:
+            self.regions = [probe.survey.regions[index] for index in self.base.covered]
+        self.work = Work.of(self.sizes, self.tiling, self.regions)
+
+    def plan(self) -> Plan:
+        """Decisions and prediction."""
+        expected, ranks, line = self._one_rank() if self.probe.machine.ranks == 1 else self._several_ranks()
+        return replace(self.base, ranks=ranks, decisions=self._decisions(line), prediction=expected)
+
+    def _without_decisions(self) -> Plan:
+        probe, settings = self.probe, self.settings
+        looked = probe.survey
+        optimised = optimised_gaussians(looked, settings)
+        weighted = settings.position_weights == "on" or (
+            settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
+        )
+        several = any(self.tiling.scale_count(size) > 1 for size in probe.sizes)
+        steps_coarse = settings.steps_coarse if several or settings.preset == "paper" else 0
+        views = len(probe.distinct)
+        form = self._kept_form((steps_coarse + settings.steps_sos) * settings.views_per_step / views)
+        return Plan(
+            survey=looked,
+            optimised=optimised,
+            seen=rendered_gaussians(optimised, settings),
+            covered=probe.distinct,
+            weighted=weighted,
+            steps_coarse=steps_coarse,
+            memory_limit=probe.machine.memory_limit,
+            device=probe.machine.device,
+            rasterizer=probe.rasterizer if form == "none" else "cached",
+            precision=precision_of(probe.network.precision_ratio),
+            kept_weights=form,
+            coarse_weights=self._keeps_coarse(form, steps_coarse / views),
+            measured=self.measured,
+        )
+
+    def _kept_form(self, visits: float) -> KeptWeights:
+        """How blend weights are kept: exactly where they fit, in half precision where only that fits, where it pays."""
+        raster, form = self.probe.raster, self.settings.kept_weights
+        if raster.bytes is None or raster.half_bytes is None or "blend-weights" in self.settings.keep:
+            return "none"
+        if form != "auto":
+            return form
+        if visits < LEAST_VISITS:
+            return "none"
+        exactly = raster.bytes <= self.budget or self.settings.preset == "paper" or raster.half_bytes >= raster.bytes
+        return "float32" if exactly else "half"
+
+    def _keeps_coarse(self, form: KeptWeights, visits: float) -> bool:
+        """Whether phase 1, with so many visits of each view, keeps the weights of the coarsest scale only."""
+        if form == "none" or self.settings.kept_weights != "auto" or self.probe.machine.device != "cpu":
+            return False
+        size = self.probe.raster.bytes if form == "float32" else self.probe.raster.half_bytes
+        return visits >= LEAST_VISITS and size is not None and size > self.budget
+
+    def _decisions(self, ranks: Decision | None) -> tuple[Decision, ...]:
+        probe, settings, plan = self.probe, self.settings, self.base
+        shared = self._content_bytes(probe.survey.covered) - self._content_bytes(plan.covered)
+        found = [
+            *decisions.of_scene(probe, plan, settings),
+            *decisions.of_views(probe, plan, settings, self.work, shared),
+            *decisions.of_network(probe, settings, self.work, self.activations),
+            *decisions.of_rasterizer(probe, plan),
+            decisions.of_blend_weights(probe, plan, settings, self.budget),
+            *decisions.of_schedule(plan, settings, [self.tiling.scale_count(size) for size in self.sizes]),
+        ]
+        found += [ranks] if ranks else []
+        return (*found, *decisions.of_precision(probe.network.precision_ratio))
+
+    # --- what is expected ------------------------------------------------------------------------------------------
+
+    def _content_bytes(self, views: Iterable[int]) -> int:
+        sizes = [self.probe.sizes[index] for index in views]
+        return content_bytes(sizes, self.tiling, self.probe.network.content_bytes)
+
+    @property
+    def _raster_seconds(self) -> float:
+        raster = self.probe.raster
+        return raster.kept_seconds if self.base.kept_weights != "none" and raster.kept_seconds else raster.seconds
+
+    def _peak_bytes(self) -> int:
+        """Of a rank, but for activations."""
+        probe, raster = self.probe, self.probe.raster
+        memory, ranks = probe.machine.memory, probe.machine.ranks
+        kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[self.base.kept_weights] or 0
+        content = 0 if "content" in self.settings.keep else self._content_bytes(self.base.covered)
+        peak = probe.process_bytes + image_bytes(probe.sizes)
+        peak += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
+        return peak + (MEASURING_BYTES if self.measured else 0)
+
+    def _one_rank(self) -> tuple[Prediction, int, None]:
+        network, raster = self.probe.network, self._raster_seconds
+        coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
+        peak = self._peak_bytes() + int(self.work.peak * network.held_bytes)
+        seconds = (self.work.seconds(network.rate) + raster, coarse.seconds(network.rate) + raster)
+        return Prediction(*seconds, peak), 1, None
+
+    def _several_ranks(self) -> tuple[Prediction, int, Decision]:
+        """What is expected of the ranks that take part, how many that are, and why."""
+        available, link = self.probe.machine.ranks, self.probe.link
+        samples = [self._sampled(coarsest=True), self._sampled(coarsest=False)]
+        phases = list(zip((self.base.steps_coarse, self.settings.steps_sos), samples, strict=True))
+        choice = choose_ranks(phases, self.settings.views_per_step, available, link)
+        if "ranks" in self.settings.keep:
+            choice = replace(choice, ranks=available)
+        expected = self._expected(choice, *samples)
+        return expected, choice.ranks, decisions.of_ranks(choice, available, link)
+
+    def _expected(self, choice: RanksChoice, coarse: list[IterationWork], sos: list[IterationWork]) -> Prediction:
+        """Of the ranks that take part; those that form groups take a view each, at the same time."""
+        link, network = self.probe.link, self.probe.network
+        groups = math.gcd(self.settings.views_per_step, choice.ranks)
+        each, turns = choice.ranks // groups, self.settings.views_per_step // groups
+
+        def mean(values: Iterable[float]) -> float:
+            found = list(values)
+            return turns * sum(found) / len(found)
+
+        largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
+        sharing = self.probe.machine.sharing
+        memory = self.activations * sharing / min(choice.ranks, sharing)  # of fewer ranks, each has more
+        return Prediction(
+            mean(work.seconds(each, link, groups) for work in sos),
+            mean(work.seconds(each, link, groups) for work in coarse),
+            self._peak_bytes() + int(min(largest * (network.held_bytes + network.working_bytes), memory)),
+            mean(work.communication(each, link) for work in sos),
+            mean(work.seconds(1, link) for work in sos) * groups,
+        )
+
+    def _sampled(self, *, coarsest: bool) -> list[IterationWork]:
+        """Iterations of some views, for the model of several ranks: of phase 1, or on all scales."""
+        network, sharing = self.probe.network, self.probe.machine.sharing
+        step = max(1, len(self.sizes) // SAMPLED_VIEWS)
+        found = []
+        for index in range(0, len(self.sizes), step):
+            region = self.regions[index] if self.regions else None
+            pieces = pieces_of(self.sizes[index], self.tiling, region, coarsest=coarsest)
+            found.append(
+                IterationWork(
+                    pieces,
+                    network.halo,
+                    network.rate.both,
+                    self._raster_seconds,
+                    network.fixed * len(pieces),
+                    int(self.base.seen.sum()),
+                    whole_image=not (coarsest and self.base.coarse_weights),
+                    forward=network.rate.forward,
+                    held=self.tiling.held * sharing,
+                    working=self.tiling.working,
+                    sharing=sharing,
+                )
+            )
+        return found

@@ -1,0 +1,218 @@
+"""The lines of a plan that people read: what was decided, and the evidence for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sgsst_core.loss.convergence import LEAST_FALL, window_length
+from sgsst_core.planning.choices import precision_of, pruned_gaussians
+from sgsst_core.planning.cost import OPTIMISER_BYTES, Work
+from sgsst_core.planning.plan import Decision, Plan
+from sgsst_core.planning.probe import Probe
+from sgsst_core.planning.ranks_model import Link, RanksChoice
+from sgsst_core.settings import Settings
+
+
+def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
+    """Gaussians and spherical harmonics."""
+    scene = probe.scene
+    pruned = int(pruned_gaussians(plan.survey, plan.seen).sum())
+    unseen = int((~plan.seen).sum()) - pruned
+    change = "keep their colours" if settings.unseen == "keep" else "take their neighbours' colour change at the end"
+    decisions = []
+    if unseen:
+        decisions.append(
+            Decision(
+                "unseen Gaussians",
+                f"{unseen:,} of {scene.gaussians:,} are not rendered and not optimised; they {change}",
+                "their blend weights are 0 in every pixel of every view",
+                bytes=unseen * OPTIMISER_BYTES,
+            )
+        )
+    if pruned:
+        assert probe.pruned_error is not None
+        decisions.append(
+            Decision(
+                "pruned Gaussians",
+                f"{pruned:,} of {scene.gaussians:,} are not rendered and not optimised; they {change}",
+                f"their blend weights over all views add up to at most {settings.prune_weight:g} each",
+                bytes=pruned * OPTIMISER_BYTES,
+                error=f"of colours in 0..255, no pixel of a view changes by more than "
+                f"{255 * probe.pruned_error.largest:.3g}, the mean pixel by no more than "
+                f"{255 * probe.pruned_error.mean:.2g}",
+            )
+        )
+    return decisions + _of_harmonics(probe, settings)
+
+
+def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
+    scene, degree = probe.scene, probe.scene.used_degree
+    if not scene.sh_degree:
+        return [Decision("spherical harmonics", "no view directions are computed", "the scene has degree 0")]
+    if "sh" in settings.keep or degree == scene.sh_degree:
+        return []
+    return [
+        Decision(
+            "spherical harmonics",
+            f"evaluated up to degree {degree}",
+            f"all coefficients of degrees {degree + 1} to {scene.sh_degree} are 0",
+            bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
+        )
+    ]
+
+
+def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_bytes: int) -> list[Decision]:
+    """Views and their pixels; content_bytes: what leaving out similar views saves."""
+    decisions = []
+    total = len(probe.sizes)
+    blind = total - len(plan.survey.covered)
+    if blind:
+        decisions.append(Decision("views", f"{blind} of {total} are left out", "they see no Gaussian"))
+    similar = len(plan.survey.covered) - len(plan.covered)
+    if similar:
+        decisions.append(
+            Decision(
+                "similar views",
+                f"{similar} of {total} are left out",
+                f"their picture is that of another view, shifted by less than {settings.similar_views:.1%} of its side",
+                bytes=content_bytes,
+                error="what only these views show gets fewer steps, or none",
+            )
+        )
+    share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
+    if plan.weighted and work.pixels < work.without_region:
+        decisions.append(
+            Decision(
+                "uncovered pixels",
+                f"{1 - work.pixels / work.without_region:.0%} of the pixels do not go through the network",
+                share,
+                seconds=(work.without_region - work.pixels) * probe.network.rate.both,
+            )
+        )
+    if plan.weighted:
+        decisions.append(
+            Decision(
+                "position weights",
+                "statistics are weighted by coverage",
+                share,
+                error="it is another loss than the paper's",
+            )
+        )
+    return decisions
+
+
+def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -> list[Decision]:
+    """Layers, content, partition and forward passes; activations: bytes that they may take."""
+    layers = "relu5_1, the deepest one used"
+    decisions = [Decision("network layers", f"none behind {layers}", "the loss reads no deeper one")]
+    if not settings.content_weight:
+        decisions.append(Decision("content", "no content features are computed or kept", "its weight is 0"))
+    gigabytes = f"{activations / 1e9:.1f} GB for activations"
+    if work.tiles <= 1:
+        decisions.append(Decision("partition", "none: a view goes through the network whole", f"it fits {gigabytes}"))
+    else:
+        decisions.append(Decision("partition", f"up to {work.tiles} tiles a view", f"more would not fit {gigabytes}"))
+    if work.again:
+        reason = f"activations of {1 - work.again / work.pixels:.0%} of the pixels fit {gigabytes}"
+        decisions.append(Decision("second forward", f"for {work.again / work.pixels:.0%} of the pixels", reason))
+    else:
+        decisions.append(
+            Decision(
+                "second forward",
+                "none: activations are kept between statistics and gradient",
+                f"they fit {gigabytes}",
+                seconds=work.pixels * probe.network.rate.forward,
+            )
+        )
+    return decisions
+
+
+def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
+    """On a GPU, which rasterizer renders; on the CPU there is nothing to choose."""
+    if plan.device != "cuda":
+        return []
+    names = {"cuda": "gsplat on the GPU", "triton": "Triton on the GPU", "cached": "kept blend weights on the GPU"}
+    how = names.get(plan.rasterizer, "on the CPU")
+    problem = probe.machine.gsplat_problem
+    reason = "gsplat works here" if problem is None else f"gsplat cannot be used: {problem}"
+    if problem is None and plan.rasterizer != "cuda":
+        reason = "asked for"
+    return [Decision("rasterizer", how, reason)]
+
+
+def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:
+    """Whether blend weights are kept, in `budget` bytes."""
+    raster = probe.raster
+    if plan.kept_weights == "none":
+        visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
+        reason = f"a view comes {visits:.1f} times"
+        if "none" in (settings.kept_weights, *settings.keep):
+            reason = "asked for"
+        elif raster.bytes is None:
+            reason = "gsplat keeps none"
+        return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
+    room = f"{budget / 1e9:.1f} GB are there for blend weights"
+    saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
+    size, error = raster.bytes or 0, "none"
+    if plan.kept_weights == "half":
+        size = raster.half_bytes or 0
+        error = "each weight is off by at most 1/4096 of itself: 0.06 of 255 levels in a pixel"
+    part = "all" if size <= budget else f"{budget / size:.0%} of the views'"
+    decision = f"{part} kept in {'half precision' if plan.kept_weights == 'half' else 'float32'}"
+    if plan.coarse_weights:
+        decision += "; in phase 1 only those of the coarsest scale"
+    share = min(1.0, budget / max(size, 1))
+    reason = f"they take {size / 1e9:.2f} GB of all views; {room}"
+    return Decision(
+        "blend weights", decision, reason, seconds=saved * share if saved is not None else None, error=error
+    )
+
+
+def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[Decision]:
+    """Scales, of which the views have so many each, phase 1 and the end."""
+    decisions = []
+    scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
+    reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
+    decisions.append(Decision("scales", scales, reason))
+    if settings.steps_coarse and not plan.steps_coarse:
+        decisions.append(
+            Decision(
+                "phase 1",
+                f"its {settings.steps_coarse} steps are left out",
+                "the coarsest scale is the only one, so that it would be the same as phase 2",
+                error="the steps, which work on the same loss",
+            )
+        )
+    if settings.early_stop:
+        decisions.append(
+            Decision(
+                "early stop",
+                f"when the mean loss of {window_length(len(plan.covered))} steps is less than {LEAST_FALL:.1%} below "
+                "that of as many steps before",
+                "later steps would buy little",
+                error="what the loss would still have fallen",
+            )
+        )
+    return decisions
+
+
+def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
+    """How many ranks take part."""
+    speed = f"{choice.speed_up:.2f} times as fast as one"
+    measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
+    if choice.ranks == available:
+        return Decision("ranks", f"all {available} take part, {speed}", measured)
+    other = choice.seconds[1] / choice.seconds[available]
+    reason = f"all of them would be {other:.2f} times as fast: the rest would only add communication; {measured}"
+    return Decision("ranks", f"{choice.ranks} of {available} take part, {speed}", reason)
+
+
+def of_precision(ratio: float | None) -> list[Decision]:
+    """The network's precision, where bfloat16 was asked for; ratio: how many times faster it is than float32."""
+    if ratio is None:
+        return []
+    if precision_of(ratio) == "bfloat16":
+        error = "about 20 % of the gradient's norm; measured during the run"
+        return [Decision("precision", "features in bfloat16", f"asked for, {ratio:.1f} times faster here", error=error)]
+    reason = f"bfloat16 was asked for, but this processor computes it {1 / ratio:.0f} times slower"
+    return [Decision("precision", "features in float32", reason)]

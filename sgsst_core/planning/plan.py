@@ -1,0 +1,101 @@
+"""What was decided for a scene before the first iteration, for people and for the stylizer that follows it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from torch import Tensor
+
+from sgsst_core.planning.survey import Survey
+from sgsst_core.settings import KeptWeights, Precision
+
+Device = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One line of a plan.
+
+    Attributes:
+        item: what was looked at.
+        decision: what was decided.
+        reason: the evidence.
+        seconds: saved in every iteration, estimated; None where that is not known.
+        bytes: of memory saved; None likewise.
+        error: what it may cost in accuracy; "none" for what changes no result beyond rounding.
+    """
+
+    item: str
+    decision: str
+    reason: str
+    seconds: float | None = None
+    bytes: int | None = None
+    error: str = "none"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the plan expects, mean over views.
+
+    Attributes:
+        seconds: of an SOS iteration.
+        seconds_coarse: of an iteration of phase 1.
+        peak_bytes: of physical memory of a rank, at any time.
+        communication: seconds of an SOS iteration in which a rank waits for what others send.
+        seconds_one_rank: of an SOS iteration on one rank; None where there is only one.
+    """
+
+    seconds: float
+    seconds_coarse: float
+    peak_bytes: int
+    communication: float = 0.0
+    seconds_one_rank: float | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was decided for a scene. Nothing changes it afterwards.
+
+    Attributes:
+        survey: what the views show.
+        optimised: [N] bool, Gaussians whose colours the views decide.
+        seen: [N] bool, Gaussians that are rendered: the optimised ones, or all for comparison.
+        covered: indices of the views that are stylized.
+        weighted: statistics are weighted by coverage.
+        steps_coarse: of phase 1; 0 where it is left out.
+        memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
+        device: on which the feature network computes.
+        rasterizer: that renders; "cached" keeps blend weights in the form `kept_weights`.
+        precision: of the feature network.
+        kept_weights: in which form blend weights are kept between iterations.
+        coarse_weights: phase 1 keeps the weights of the coarsest scale only.
+        measured: the prediction counts what measuring between steps and the report take.
+        ranks: how many take part.
+        decisions: for people.
+        prediction: for comparison with what happens.
+    """
+
+    survey: Survey
+    optimised: Tensor
+    seen: Tensor
+    covered: tuple[int, ...]
+    weighted: bool
+    steps_coarse: int
+    memory_limit: int
+    device: Device = "cpu"
+    rasterizer: str = "cpu"
+    precision: Precision = "float32"
+    kept_weights: KeptWeights = "none"
+    coarse_weights: bool = False
+    measured: bool = False
+    ranks: int = 1
+    decisions: tuple[Decision, ...] = ()
+    prediction: Prediction | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "decisions": [asdict(decision) for decision in self.decisions],
+            "prediction": asdict(self.prediction) if self.prediction else None,
+        }

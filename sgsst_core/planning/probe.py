@@ -1,0 +1,341 @@
+"""What is measured before anything is decided, on the rasterizer and the device that will do the work.
+
+A `Probe` holds plain facts; `decide` makes a plan of them. What measuring builds is a `Workshop`, which the job goes on
+to use.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import psutil
+import torch
+
+from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel.division import Size
+from sgsst_core.planning.choices import (
+    optimised_gaussians,
+    precision_of,
+    pruned_gaussians,
+    rasterizer_anew,
+    rendered_gaussians,
+)
+from sgsst_core.planning.cost import RasterCost, Rate
+from sgsst_core.planning.plan import Device
+from sgsst_core.planning.pruning import ImageError, distinct_views, pruned_image_error
+from sgsst_core.planning.ranks_model import Link
+from sgsst_core.planning.survey import Survey
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.cuda import gsplat_problem
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Precision, Settings
+
+#: Largest side of the picture that the network is timed on: large enough that its rate is that of a partition tile.
+PROBE_SIDE = 384
+#: Views whose blend weights are counted and timed; the others are taken to be like them.
+SAMPLED_VIEWS = 3
+
+_DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """Of the scene.
+
+    Attributes:
+        gaussians: N.
+        sh_degree: of its file.
+        used_degree: highest SH degree with a coefficient that is not 0, among the Gaussians that are rendered.
+    """
+
+    gaussians: int
+    sh_degree: int
+    used_degree: int
+
+
+@dataclass(frozen=True)
+class NetworkFacts:
+    """Of the feature network, in the precision in which it will run.
+
+    Attributes:
+        halo: pixels around a partition tile.
+        held_bytes: a pixel, that a forward pass keeps for the backward pass.
+        working_bytes: a pixel, that a pass needs beside them.
+        content_bytes: of a cell of the content layer.
+        rate: seconds a pixel.
+        fixed: seconds that a partition tile of hardly any pixel takes.
+        precision_ratio: seconds of a convolution in float32, over those in bfloat16; None where that was not asked for.
+    """
+
+    halo: int
+    held_bytes: float
+    working_bytes: float
+    content_bytes: int
+    rate: Rate
+    fixed: float = 0.0
+    precision_ratio: float | None = None
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Of the machine and the ranks on it.
+
+    Attributes:
+        device: that computes.
+        gsplat_problem: why gsplat cannot render there; None where it can.
+        memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
+        sharing: most ranks that share it.
+        ranks: that there are.
+    """
+
+    device: Device
+    gsplat_problem: str | None
+    memory_limit: int
+    sharing: int = 1
+    ranks: int = 1
+
+    @property
+    def memory(self) -> int:
+        """Bytes that one rank may plan with."""
+        return self.memory_limit // self.sharing
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Everything that decisions follow from, besides the settings.
+
+    Attributes:
+        sizes: (height, width) of each view.
+        survey: what the views show.
+        distinct: indices of the views that are not nearly another one.
+        pruned_error: of leaving out Gaussians that a view shows; None where there are none.
+        rasterizer: that was timed: it computes blend weights anew.
+        raster: what it takes, and what kept weights would.
+        link: between ranks.
+        process_bytes: of physical memory, with scene and network loaded.
+    """
+
+    scene: SceneFacts
+    sizes: tuple[Size, ...]
+    survey: Survey
+    distinct: tuple[int, ...]
+    network: NetworkFacts
+    rasterizer: str
+    raster: RasterCost
+    machine: Machine
+    link: Link
+    process_bytes: int
+    pruned_error: ImageError | None = None
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What measuring needs, and a job that follows the plan goes on to use.
+
+    Attributes:
+        scene: the whole scene.
+        cameras: at the size at which they are stylized.
+        network: in the precision in which it will run.
+        precision_ratio: see `NetworkFacts`.
+        rasterizer: of the whole scene, computes blend weights anew.
+    """
+
+    scene: Scene
+    cameras: tuple[Camera, ...]
+    settings: Settings
+    machine: Machine
+    network: FeatureNetwork
+    precision_ratio: float | None
+    rasterizer: Rasterizer
+
+
+def equip(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: Settings,
+    weights: BackboneWeights,
+    collectives: Collectives,
+    rasterizer: str | None = None,
+) -> Workshop:
+    """See what there is to work with. Every rank calls this, and gets the same but for rounding.
+
+    Args:
+        cameras: at the size at which they are stylized.
+        rasterizer: that computes blend weights anew; None chooses.
+    """
+    device = common_device(collectives)
+    problem = None
+    if device == "cuda":  # what one rank cannot do, none does
+        problem = next(filter(None, collectives.all_gather(gsplat_problem())), None)
+    ratio = None
+    if settings.precision != "float32":
+        ratio = collectives.broadcast(lambda: convolution_ratio(device))
+    network = make_network(weights, settings, precision_of(ratio), device)
+    limit = settings.memory_limit or default_memory_limit(network.device)
+    machine = Machine(
+        device,
+        problem,
+        # The partition follows from it, and so does rounding: it must be the same on all ranks.
+        memory_limit=min(collectives.all_gather(limit)),
+        sharing=sharing_memory(collectives, device),
+        ranks=collectives.size,
+    )
+    name = rasterizer or rasterizer_anew(device, problem, settings)
+    whole = make_rasterizer(name, scene, background=settings.background, near=settings.near)
+    return Workshop(scene, tuple(cameras), settings, machine, network, ratio, whole)
+
+
+def common_device(collectives: Collectives) -> Device:
+    """What all ranks can compute on."""
+    return "cuda" if all(collectives.all_gather(torch.cuda.is_available())) else "cpu"
+
+
+def sharing_memory(collectives: Collectives, device: Device) -> int:
+    """Most ranks that have to share the memory of a machine; each GPU has its own."""
+    return max(collectives.all_gather(1 if device == "cuda" else collectives.local_size))
+
+
+def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
+    """The feature network, with layers up to the deepest one used."""
+    layers = (*STYLE_LAYERS, CONTENT_LAYER) if settings.content_weight else STYLE_LAYERS
+    return FeatureNetwork(weights, layers, _DTYPES[precision], device)
+
+
+def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
+    """Time and count; one rank does it for all, because timings differ from rank to rank.
+
+    Raises:
+        SettingsError: pruning would leave no Gaussian.
+    """
+    scene, cameras, settings = workshop.scene, workshop.cameras, workshop.settings
+    seen = rendered_gaussians(optimised_gaussians(looked, settings), settings)
+    distinct = distinct_views(scene, cameras, looked.covered, looked.total_weights, settings.similar_views)
+    network = _network_facts(workshop)
+    budget = int(workshop.machine.memory * MEMORY_SHARES["rasterizer"])
+    raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)
+    pruned = pruned_gaussians(looked, seen)
+    error = pruned_image_error(~seen, cameras, distinct, workshop.rasterizer) if pruned.any() else None
+    used_degree = scene.subset(seen).without_zero_bands().sh_degree if scene.sh_degree else 0
+    return Probe(
+        SceneFacts(len(scene), scene.sh_degree, used_degree),
+        tuple((camera.height, camera.width) for camera in cameras),
+        looked,
+        tuple(distinct),
+        network,
+        workshop.rasterizer.name,
+        raster,
+        workshop.machine,
+        link,
+        psutil.Process().memory_info().rss,
+        error,
+    )
+
+
+# --- the feature network -------------------------------------------------------------------------------------------
+
+
+def _network_facts(workshop: Workshop) -> NetworkFacts:
+    network, settings = workshop.network, workshop.settings
+    loss = SosLoss(
+        network,
+        content_weight=settings.content_weight,
+        memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
+        coarsest=settings.coarsest_side,
+        keep_activations="activations" not in settings.keep,
+    )
+    side = min(PROBE_SIDE, max(max(camera.width, camera.height) for camera in workshop.cameras))
+    fixed = 0.0
+    rate = measure_rate(loss, side)
+    if workshop.machine.ranks > 1:  # as good as no pixel: what it takes is the same for any number
+        fixed = measure_rate(loss, ALIGNMENT).both * ALIGNMENT**2
+    return NetworkFacts(
+        network.halo,
+        network.held_bytes_per_pixel(),
+        network.working_bytes_per_pixel(),
+        network.channels(CONTENT_LAYER) * torch.finfo(network.dtype).bits // 8 if settings.content_weight else 0,
+        rate,
+        fixed,
+        workshop.precision_ratio,
+    )
+
+
+def measure_rate(loss: SosLoss, side: int) -> Rate:
+    """Time the feature network on a small picture of side x side pixels; the second of two runs counts."""
+    cells = torch.rand((1, 3, side // 16 + 1, side // 16 + 1), generator=torch.Generator().manual_seed(0))
+    picture = torch.nn.functional.interpolate(cells, size=(side, side), mode="bilinear")[0]
+    image = picture.permute(1, 2, 0).contiguous().to(loss.network.device)
+    style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
+    seconds = []
+    for gradient in (True, True, False):
+        started = time.perf_counter()
+        loss.evaluate(image, style, view, [0], gradient=gradient)
+        _wait_for(loss.network.device)
+        seconds.append(time.perf_counter() - started)
+    return Rate(forward=seconds[2] / side**2, both=seconds[1] / side**2)
+
+
+def convolution_ratio(device: Device) -> float:
+    """Seconds of a convolution in float32, over those in bfloat16."""
+    return _convolution_seconds(torch.float32, device) / _convolution_seconds(torch.bfloat16, device)
+
+
+def _convolution_seconds(dtype: torch.dtype, device: Device) -> float:
+    """Of a 3x3 convolution with 128 channels on 24 x 24 cells, the second of two runs."""
+    image = torch.ones((1, 128, 24, 24), dtype=dtype, device=device)
+    kernel = torch.ones((128, 128, 3, 3), dtype=dtype, device=device)
+    seconds = 0.0
+    for _ in range(2):
+        started = time.perf_counter()
+        torch.nn.functional.conv2d(image, kernel, padding=1)
+        _wait_for(image.device)
+        seconds = time.perf_counter() - started
+    return seconds
+
+
+# --- the rasterizer ------------------------------------------------------------------------------------------------
+
+
+def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> RasterCost:
+    """Count and time blend weights on a few of some views, evenly spread; `budget`: bytes for kept ones."""
+    scene, settings, rasterizer = workshop.scene, workshop.settings, workshop.rasterizer
+    count = min(SAMPLED_VIEWS, len(cameras))
+    sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
+    seconds = sum(_raster_seconds(rasterizer, len(scene), camera) for camera in sample) / count
+    if rasterizer.device.type == "cuda":
+        return RasterCost(seconds)
+    device = workshop.machine.device
+    cpu = rasterizer if isinstance(rasterizer, CpuRasterizer) else CpuRasterizer(scene, near=settings.near)
+    cached = CachedRasterizer(scene, device=device, cpu=cpu)
+    half = CachedRasterizer(scene, device=device, precision="half", cpu=cpu)
+    sizes = [cached.operator_bytes(camera) for camera in sample]
+    middle, middle_size = sample[count // 2], sizes[count // 2]
+    kept = _raster_seconds(cached, len(scene), middle) if middle_size <= budget else None
+    total = sum(sizes) * len(cameras) // count
+    return RasterCost(seconds, kept, total, total * half.operator_bytes(middle) // max(middle_size, 1))
+
+
+def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera) -> float:
+    """Of the second of two renders with gradient: the first one prepares the view."""
+    colours = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
+    seconds = 0.0
+    for _ in range(2):
+        started = time.perf_counter()
+        rasterizer.colour_gradient(rasterizer.render(colours, camera), camera)
+        _wait_for(rasterizer.device)
+        seconds = time.perf_counter() - started
+    return seconds
+
+
+def _wait_for(device: torch.device) -> None:
+    """Until a device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -1,0 +1,52 @@
+"""The SOS loss of colours on some views, split by scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from sgsst_core.loss.terms import LayerTarget, LossTerms
+from sgsst_core.scene.camera import Camera
+from sgsst_core.stylizing.views import Views
+
+#: Views on which a job is evaluated before and after, and which the contact sheet shows.
+EVALUATION_VIEWS = 4
+
+Evaluation = dict[int, LossTerms]
+StyleTargets = dict[int, dict[str, LayerTarget]]
+
+
+def evaluation_views(covered: Sequence[int]) -> list[int]:
+    """At most four of some views, evenly spread."""
+    count = min(EVALUATION_VIEWS, len(covered))
+    return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
+
+
+def evaluate(
+    views: Views, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
+) -> Evaluation:
+    """Mean SOS loss of colours [n, 3] over views, split by scale."""
+    evaluations = []
+    for index in indices:
+        camera = views.cameras[index]
+        with torch.no_grad():
+            image = views.render(index, views.colours(index, sh_dc))
+        target = views.target(index, range(views.loss.scale_count(camera.height, camera.width)))
+        evaluations.append(views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
+    return mean_evaluation(evaluations)
+
+
+def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Mean over views, scale by scale."""
+    total: Evaluation = {}
+    for evaluation in evaluations:
+        for scale, part in evaluation.items():
+            total[scale] = total.get(scale, LossTerms()) + part
+    return {scale: terms / len(evaluations) for scale, terms in total.items()}
+
+
+def mean_loss(evaluation: Evaluation) -> float:
+    """E_SOS: the mean of the scales' losses."""
+    return sum(terms.total for terms in evaluation.values()) / len(evaluation)

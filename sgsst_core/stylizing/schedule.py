@@ -1,0 +1,42 @@
+"""What is optimised when: the phases of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sgsst_core.planning.plan import Plan
+from sgsst_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of the schedule.
+
+    Attributes:
+        stage: its name: "coarse" (phase 1) and "sos" (phase 2) in every preset.
+        steps: how many.
+        scale: the one scale that is optimised, counted from the coarsest (0); None for all, the SOS loss.
+    """
+
+    stage: str
+    steps: int
+    scale: int | None = None
+
+    def scales(self, count: int) -> list[int]:
+        """The scales of a view that has `count`, 0 being full size."""
+        return list(range(count)) if self.scale is None else [max(count - 1 - self.scale, 0)]
+
+
+def planned_phases(plan: Plan, settings: Settings) -> list[Phase]:
+    """The two phases of every preset."""
+    return [Phase("coarse", plan.steps_coarse, 0), Phase("sos", settings.steps_sos)]
+
+
+def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
+    """The phase that the step after so many belongs to; the last one when all are done."""
+    for phase in schedule:
+        if step < phase.steps:
+            return phase
+        step -= phase.steps
+    return schedule[-1]

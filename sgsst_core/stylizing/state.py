@@ -1,0 +1,52 @@
+"""What a run leaves behind: a record of every step, and the state from which it can go on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from sgsst_core.loss.terms import LossTerms
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One iteration.
+
+    Attributes:
+        step: counted from 1 over both phases.
+        stage: of the phase: "coarse", "sos".
+        view: index of the camera; the first one where a step has several.
+        seconds: wall-clock seconds of iterations so far, of all sessions of a resumed job.
+        loss: E of the step's views before the step, their mean.
+        terms: split loss by scale.
+        parts: seconds of this step by what they went into.
+        memory: bytes of physical memory that the process held after the step.
+    """
+
+    step: int
+    stage: str
+    view: int
+    seconds: float
+    loss: float
+    terms: dict[int, LossTerms]
+    parts: dict[str, float]
+    memory: int
+
+
+@dataclass
+class StylizerState:
+    """Everything that a resumed run needs to go on bit for bit."""
+
+    sh_dc: Tensor  # [N, 3]
+    first_moment: Tensor  # [N, 3]
+    second_moment: Tensor  # [N, 3]
+    step: int
+    seconds: float
+    generator: Tensor  # state of the random generator
+    queue: list[int]  # views left in this round
+    history: list[StepRecord] = field(default_factory=list)
+    seconds_by_part: dict[str, float] = field(default_factory=dict)
+    memory: int | None = None  # bytes planned with: partition and kept weights follow from it, and so does rounding
+    measured: list[dict[str, Any]] = field(default_factory=list)  # see `Stylizer.measured`

@@ -1,0 +1,92 @@
+"""The ranks that stylize a scene together: who takes part, whether they agree, who does how much."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from sgsst_core.errors import RanksDriftedError
+from sgsst_core.parallel.collectives import Collectives, RankLeftOut, same_on_all
+from sgsst_core.planning.plan import Plan
+from sgsst_core.settings import Settings
+
+#: Steps between two proofs that all ranks have the same colours.
+DRIFT_STEPS = 50
+#: Steps of a phase after which the ranks' speeds are compared; the first one, which prepares more, does not count.
+BALANCE_STEPS = 6
+#: Ranks are given other shares of the work only where the fastest is faster than the slowest by more than this.
+LEAST_IMBALANCE = 1.15
+
+_NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics")
+
+
+class Team:
+    """This rank's place among those that the plan needs.
+
+    Args:
+        collectives: of all ranks that there are.
+
+    Attributes:
+        everybody: the ranks that take part.
+        groups: how many groups they form, each of which takes views of its own.
+        group: the ranks that work on the same views as this one.
+
+    Raises:
+        RankLeftOut: the job goes on without this rank.
+    """
+
+    def __init__(self, plan: Plan, settings: Settings, collectives: Collectives) -> None:
+        taking_part = collectives.leading_group(min(plan.ranks, collectives.size))
+        if taking_part is None:
+            raise RankLeftOut
+        self.everybody = taking_part
+        self.groups = math.gcd(settings.views_per_step, taking_part.size)
+        self.group = taking_part.split_group(self.groups)
+        for ranks in (self.everybody, self.group):
+            ranks.set_timeout_for(plan.prediction.seconds if plan.prediction else 0.0)
+        #: Pixels and seconds of this rank's share of the network in each step, until ranks have been compared.
+        self._pace: list[tuple[int, float]] | None = [] if settings.rebalance and self.group.size > 1 else None
+
+    @property
+    def own_group(self) -> int:
+        """Number of this rank's group."""
+        return self.everybody.rank // self.group.size
+
+    def check_drift(self, step: int, colours: Tensor) -> None:
+        """Prove now and then that all ranks have the same colours [n, 3].
+
+        Raises:
+            RanksDriftedError: they have not.
+        """
+        if self.everybody.size == 1 or step % DRIFT_STEPS:
+            return
+        checksum = zlib.crc32(colours.detach().cpu().numpy().tobytes())
+        if not same_on_all(self.everybody, checksum):
+            raise RanksDriftedError(
+                f"Step {step}: the ranks' colours are no longer the same. They compute differently: run on "
+                "machines of one kind, with the same versions of this program and of PyTorch."
+            )
+
+    def compare_speeds(self, cost: int, seconds: Mapping[str, float]) -> tuple[float, ...] | None:
+        """The speeds of the group's ranks, once, when they have been seen to differ; None otherwise.
+
+        Args:
+            cost: pixels of this rank's share of the network in the step that was made.
+            seconds: of that step, by part.
+        """
+        if self._pace is None:
+            return None
+        self._pace.append((cost, sum(seconds.get(part, 0.0) for part in _NETWORK_PARTS)))
+        if len(self._pace) < BALANCE_STEPS:
+            return None
+        # Medians: one step in which the machine did something else says nothing.
+        rates = sorted(pixels / duration for pixels, duration in self._pace[1:] if pixels)
+        self._pace = None
+        speeds = self.group.all_gather(rates[len(rates) // 2] if rates else 0.0)
+        known = [speed for speed in speeds if speed > 0]
+        if max(known) <= LEAST_IMBALANCE * min(known):
+            return None
+        return tuple(speed or sum(known) / len(known) for speed in speeds)

@@ -1,0 +1,368 @@
+"""Every decision on made-up probes: nothing is rendered, timed or looked up here."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import FrozenInstanceError, replace
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Rate
+from sgsst_core.planning.decide import MEASURING_BYTES, decide
+from sgsst_core.planning.plan import Decision, Plan
+from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
+from sgsst_core.planning.pruning import ImageError
+from sgsst_core.planning.ranks_model import Link
+from sgsst_core.planning.survey import Survey
+from sgsst_core.settings import make_settings
+
+VIEWS = 4
+HEIGHT, WIDTH = 600, 800
+WHOLE = Rectangle(0, 0, HEIGHT, WIDTH)
+GIGABYTE = 10**9
+
+
+def probe(**changes: Any) -> Probe:
+    """Four views of a scene of six Gaussians that fills them, on a CPU with 10 GB; changes: to fields of any part."""
+    weights = torch.tensor([0.0, 0.5, 1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
+    parts: dict[str, Any] = {
+        "scene": SceneFacts(6, 3, 3),
+        "survey": Survey(weights, list(range(VIEWS)), [WHOLE] * VIEWS, 0.0),
+        "network": NetworkFacts(64, 3000.0, 500.0, 2048, Rate(1e-6, 3e-6), fixed=0.01),
+        "machine": Machine("cpu", None, 10 * GIGABYTE),
+    }
+    for name, part in parts.items():
+        own = {field.name for field in dataclasses.fields(part)} & changes.keys()
+        parts[name] = replace(part, **{key: changes.pop(key) for key in own})
+    return Probe(
+        **{
+            **parts,
+            "sizes": ((HEIGHT, WIDTH),) * VIEWS,
+            "distinct": tuple(range(VIEWS)),
+            "rasterizer": "cpu",
+            "raster": RasterCost(0.3, 0.1, GIGABYTE, GIGABYTE // 2),
+            "link": Link(math.inf, 0.0),
+            "process_bytes": GIGABYTE,
+            **changes,
+        }
+    )
+
+
+def plan_of(found: Probe, **values: Any) -> Plan:
+    return decide(found, make_settings(**{"steps_coarse": 40, "steps_sos": 40, **values}))
+
+
+def line(plan: Plan, item: str) -> Decision | None:
+    return next((decision for decision in plan.decisions if decision.item == item), None)
+
+
+def said(plan: Plan, item: str) -> str:
+    found = line(plan, item)
+    assert found is not None, [decision.item for decision in plan.decisions]
+    return f"{found.decision}: {found.reason}"
+
+
+# --- the scene -----------------------------------------------------------------------------------------------------
+
+
+def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
+    plan = plan_of(probe())
+    assert plan.seen.tolist() == plan.optimised.tolist() == [False, True, True, True, True, True]
+    assert said(plan, "unseen Gaussians").startswith("1 of 6 are not rendered and not optimised; they take their neigh")
+    assert line(plan, "unseen Gaussians").bytes == OPTIMISER_BYTES  # type: ignore[union-attr]
+    assert "they keep their colours" in said(plan_of(probe(), unseen="keep"), "unseen Gaussians")
+    everything = plan_of(probe(), keep=("unseen",))
+    assert everything.seen.all()
+    assert not everything.optimised.all()
+    assert line(everything, "unseen Gaussians") is None
+
+
+def test_pruned_gaussians_come_with_their_error() -> None:
+    plan = plan_of(probe(pruned_error=ImageError(0.1, 0.01)), prune_weight=1.0, keep=("unseen",))
+    assert plan.seen.tolist() == [False, False, False, True, True, True]
+    assert said(plan, "pruned Gaussians").startswith("2 of 6 are not rendered")
+    assert "no pixel of a view changes by more than 25.5" in line(plan, "pruned Gaussians").error  # type: ignore[union-attr]
+    assert line(plan_of(probe()), "pruned Gaussians") is None
+    with pytest.raises(SettingsError, match="the largest total blend weight is 8"):
+        plan_of(probe(), prune_weight=8.0)
+
+
+@pytest.mark.parametrize(
+    ("degree", "used", "keep", "expected"),
+    [
+        (3, 3, (), None),
+        (3, 1, (), "evaluated up to degree 1: all coefficients of degrees 2 to 3 are 0"),
+        (3, 1, ("sh",), None),
+        (0, 0, (), "no view directions are computed: the scene has degree 0"),
+    ],
+)
+def test_spherical_harmonics(degree: int, used: int, keep: tuple[Any, ...], expected: str | None) -> None:
+    plan = plan_of(probe(sh_degree=degree, used_degree=used), keep=keep)
+    assert (said(plan, "spherical harmonics") if expected else line(plan, "spherical harmonics")) == expected
+
+
+# --- views ---------------------------------------------------------------------------------------------------------
+
+
+def test_blind_and_similar_views_are_left_out() -> None:
+    plan = plan_of(probe(covered=[0, 1, 3], distinct=(0, 3)), similar_views=0.01)
+    assert plan.covered == (0, 3)
+    assert said(plan, "views") == "1 of 4 are left out: they see no Gaussian"
+    assert said(plan, "similar views").startswith("1 of 4 are left out")
+    assert line(plan, "similar views").bytes > 0  # type: ignore[union-attr, operator]
+    whole = plan_of(probe())
+    assert line(whole, "views") is line(whole, "similar views") is None
+
+
+@pytest.mark.parametrize(
+    ("share", "wanted", "weighted"),
+    [(0.3, "auto", True), (0.001, "auto", False), (0.3, "off", False), (0.0, "on", True)],
+)
+def test_position_weights_are_for_views_with_an_empty_surround(share: float, wanted: str, weighted: bool) -> None:
+    plan = plan_of(probe(uncovered_share=share), position_weights=wanted)
+    assert plan.weighted is weighted
+    assert (line(plan, "position weights") is not None) is weighted
+
+
+def test_uncovered_pixels_do_not_go_through_the_network() -> None:
+    scan = probe(uncovered_share=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
+    plan, kept = plan_of(scan), plan_of(scan, keep=("uncovered",))
+    assert "of the pixels do not go through the network: 50.0% of" in said(plan, "uncovered pixels")
+    assert line(kept, "uncovered pixels") is None
+    assert plan.prediction is not None
+    assert kept.prediction is not None
+    assert plan.prediction.seconds < kept.prediction.seconds
+
+
+# --- the network ---------------------------------------------------------------------------------------------------
+
+
+def test_partition_and_second_forward_follow_from_the_memory() -> None:
+    roomy = plan_of(probe())
+    assert said(roomy, "partition") == "none: a view goes through the network whole: it fits 5.0 GB for activations"
+    assert said(roomy, "second forward").startswith("none: activations are kept")
+    tight = plan_of(probe(memory_limit=GIGABYTE))
+    assert said(tight, "partition").startswith("up to ")
+    assert "of the pixels fit 0.5 GB for activations" in said(tight, "second forward")
+    again = plan_of(probe(), keep=("activations",))
+    assert said(again, "second forward").startswith("for 100% of the pixels")
+    assert roomy.prediction is not None
+    assert again.prediction is not None
+    assert roomy.prediction.seconds < again.prediction.seconds
+
+
+def test_memory_is_shared_by_the_ranks_of_a_machine() -> None:
+    assert said(plan_of(probe(sharing=5)), "partition") == said(plan_of(probe(memory_limit=2 * GIGABYTE)), "partition")
+    assert plan_of(probe(sharing=5)).memory_limit == 10 * GIGABYTE
+
+
+def test_content_is_left_out_without_weight() -> None:
+    assert said(plan_of(probe(content_bytes=0), content_weight=0), "content").endswith("its weight is 0")
+    assert line(plan_of(probe()), "content") is None
+
+
+@pytest.mark.parametrize(
+    ("ratio", "precision", "text"),
+    [
+        (None, "float32", None),
+        (1.7, "bfloat16", "features in bfloat16: asked for, 1.7 times faster here"),
+        (
+            0.04,
+            "float32",
+            "features in float32: bfloat16 was asked for, but this processor computes it 25 times slower",
+        ),
+    ],
+)
+def test_bfloat16_where_it_is_asked_for_and_faster(ratio: float | None, precision: str, text: str | None) -> None:
+    plan = plan_of(probe(precision_ratio=ratio))
+    assert plan.precision == precision
+    assert (said(plan, "precision") if text else line(plan, "precision")) == text
+
+
+# --- the rasterizer ------------------------------------------------------------------------------------------------
+
+WITHOUT_KEPT = RasterCost(0.01)
+
+
+def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
+    kept, once = plan_of(probe()), plan_of(probe(), steps_coarse=0, steps_sos=4 * VIEWS)
+    assert (kept.rasterizer, kept.kept_weights) == ("cached", "float32")
+    assert said(kept, "blend weights") == (
+        "all kept in float32: they take 1.00 GB of all views; 2.5 GB are there for blend weights"
+    )
+    assert (once.rasterizer, once.kept_weights) == ("cpu", "none")
+    assert said(once, "blend weights") == "computed anew in every iteration: a view comes 4.0 times"
+    assert line(kept, "rasterizer") is line(once, "rasterizer") is None
+    assert kept.prediction is not None
+    assert plan_of(probe(), kept_weights="none").prediction.seconds == pytest.approx(  # type: ignore[union-attr]
+        kept.prediction.seconds + 0.2
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "form", "coarse"),
+    [
+        ({}, "half", True),
+        ({"steps_coarse": 4 * VIEWS}, "half", False),  # too few visits of phase 1
+        ({"preset": "paper"}, "float32", True),
+        ({"kept_weights": "float32"}, "float32", False),
+        ({"kept_weights": "half"}, "half", False),
+        ({"kept_weights": "none"}, "none", False),
+        ({"keep": ("blend-weights",)}, "none", False),
+    ],
+)
+def test_weights_that_do_not_fit(values: dict[str, Any], form: str, coarse: bool) -> None:
+    plan = plan_of(probe(raster=RasterCost(0.3, None, 6 * GIGABYTE, 3 * GIGABYTE)), **values)
+    assert (plan.kept_weights, plan.coarse_weights) == (form, coarse)
+    assert plan.rasterizer == ("cpu" if form == "none" else "cached")
+    assert ("phase 1 only those of the coarsest scale" in said(plan, "blend weights")) is coarse
+    assert ("% of the views' kept" in said(plan, "blend weights")) is (form != "none")
+
+
+def test_half_precision_where_only_that_fits() -> None:
+    plan = plan_of(probe(raster=RasterCost(0.3, None, 3 * GIGABYTE, 2 * GIGABYTE)))
+    assert (plan.kept_weights, plan.coarse_weights) == ("half", False)
+    assert said(plan, "blend weights").startswith("all kept in half precision: they take 2.00 GB")
+    assert "1/4096" in line(plan, "blend weights").error  # type: ignore[union-attr]
+
+
+def test_on_a_gpu_gsplat_renders_where_it_works() -> None:
+    plan = plan_of(probe(device="cuda", rasterizer="cuda", raster=WITHOUT_KEPT))
+    assert (plan.device, plan.rasterizer, plan.kept_weights, plan.coarse_weights) == ("cuda", "cuda", "none", False)
+    assert said(plan, "rasterizer") == "gsplat on the GPU: gsplat works here"
+    assert said(plan, "blend weights") == "computed anew in every iteration: gsplat keeps none"
+
+
+def test_on_a_gpu_without_gsplat_weights_are_kept_there() -> None:
+    """In both forms they take as much memory on a GPU: half precision would only lose digits."""
+    broken = probe(device="cuda", gsplat_problem="no kernels", raster=RasterCost(0.3, None, *[6 * GIGABYTE] * 2))
+    plan, once = plan_of(broken), plan_of(broken, kept_weights="none")
+    assert (plan.rasterizer, plan.kept_weights, plan.coarse_weights) == ("cached", "float32", False)
+    assert said(plan, "rasterizer") == "kept blend weights on the GPU: gsplat cannot be used: no kernels"
+    assert (once.rasterizer, once.kept_weights) == ("cpu", "none")
+    assert said(once, "rasterizer") == "on the CPU: gsplat cannot be used: no kernels"
+
+
+def test_on_a_gpu_weights_are_kept_when_that_is_asked_for() -> None:
+    plan = plan_of(probe(device="cuda"), kept_weights="float32")
+    assert (plan.rasterizer, plan.kept_weights) == ("cached", "float32")
+    assert said(plan, "rasterizer") == "kept blend weights on the GPU: asked for"
+
+
+# --- the schedule --------------------------------------------------------------------------------------------------
+
+
+def test_phase_1_is_left_out_where_views_have_one_scale() -> None:
+    assert plan_of(probe()).steps_coarse == 40
+    assert said(plan_of(probe()), "scales") == "2: the shorter side is halved until it is at most 511 pixels"
+    small = probe(sizes=((300, 400),) * VIEWS, regions=[Rectangle(0, 0, 300, 400)] * VIEWS)
+    assert plan_of(small).steps_coarse == 0
+    assert said(plan_of(small), "phase 1").startswith("its 40 steps are left out")
+    assert plan_of(small, preset="paper").steps_coarse == 40
+    mixed = probe(sizes=((300, 400), *((HEIGHT, WIDTH),) * 3))
+    assert said(plan_of(mixed), "scales").startswith("1 to 2")
+
+
+def test_early_stop_is_told_where_it_is_on() -> None:
+    assert "than 0.5% below" in said(plan_of(probe()), "early stop")
+    assert line(plan_of(probe(), early_stop=False), "early stop") is None
+
+
+# --- ranks ---------------------------------------------------------------------------------------------------------
+
+
+def test_ranks_take_part_as_the_link_allows() -> None:
+    fast = plan_of(probe(ranks=4, link=Link(1e12, 1e-9)))
+    assert fast.ranks == 4
+    assert said(fast, "ranks").startswith("all 4 take part, ")
+    slow = plan_of(probe(ranks=4, link=Link(1e5, 1.0)))
+    assert slow.ranks == 1
+    assert "would only add communication" in said(slow, "ranks")
+    assert plan_of(probe(ranks=4, link=Link(1e5, 1.0)), keep=("ranks",)).ranks == 4
+    assert line(plan_of(probe()), "ranks") is None
+    assert fast.prediction is not None
+    assert fast.prediction.seconds_one_rank is not None
+    assert fast.prediction.seconds < fast.prediction.seconds_one_rank
+
+
+def test_kept_coarse_weights_need_no_exchange_of_images() -> None:
+    tight = RasterCost(0.3, 0.3, 6 * GIGABYTE, 6 * GIGABYTE)
+    plans = [plan_of(probe(ranks=2, link=Link(1e8, 1e-3), raster=tight), kept_weights=w) for w in ("auto", "float32")]
+    assert [plan.coarse_weights for plan in plans] == [True, False]
+    coarse, whole = (plan.prediction.seconds_coarse for plan in plans)  # type: ignore[union-attr]
+    assert coarse < whole
+
+
+# --- the plan ------------------------------------------------------------------------------------------------------
+
+
+def test_measuring_takes_memory_but_changes_no_decision() -> None:
+    plain, measured = (decide(probe(), make_settings(), measured=flag) for flag in (False, True))
+    assert plain.decisions == measured.decisions
+    assert plain.prediction is not None
+    assert measured.prediction == replace(plain.prediction, peak_bytes=plain.prediction.peak_bytes + MEASURING_BYTES)
+    assert (plain.measured, measured.measured) == (False, True)
+
+
+def test_the_same_probe_gives_the_same_plan() -> None:
+    one, other = (plan_of(probe(uncovered_share=0.2, ranks=3, link=Link(1e9, 1e-4))) for _ in range(2))
+    for field in dataclasses.fields(Plan):
+        values = [getattr(plan, field.name) for plan in (one, other)]
+        if field.name == "survey":
+            assert torch.equal(*(survey.total_weights for survey in values))
+        elif isinstance(values[0], torch.Tensor):
+            assert torch.equal(*values)
+        else:
+            assert values[0] == values[1], field.name
+
+
+def test_nothing_changes_a_plan() -> None:
+    plan = plan_of(probe())
+    for field in dataclasses.fields(Plan):
+        with pytest.raises(FrozenInstanceError):
+            setattr(plan, field.name, None)
+    assert isinstance(plan.decisions, tuple)
+    assert isinstance(plan.covered, tuple)
+    hash((plan.decisions, plan.covered, plan.prediction))  # nothing in them can change either
+
+
+def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
+    found = probe(
+        covered=[0, 1, 2],
+        distinct=(0, 1),
+        used_degree=0,
+        uncovered_share=0.5,
+        regions=[Rectangle(160, 160, 320, 320)] * VIEWS,
+        pruned_error=ImageError(0.1, 0.1),
+        ranks=2,
+        link=Link(1e9, 1e-4),
+        precision_ratio=2.0,
+        content_bytes=0,
+        device="cuda",
+    )
+    plan = plan_of(found, prune_weight=1.0, content_weight=0, coarsest_side=4000, similar_views=0.1)
+    assert [decision.item for decision in plan.decisions] == [
+        "unseen Gaussians",
+        "pruned Gaussians",
+        "spherical harmonics",
+        "views",
+        "similar views",
+        "uncovered pixels",
+        "position weights",
+        "network layers",
+        "content",
+        "partition",
+        "second forward",
+        "rasterizer",
+        "blend weights",
+        "scales",
+        "phase 1",
+        "early stop",
+        "ranks",
+        "precision",
+    ]

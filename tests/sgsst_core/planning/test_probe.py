@@ -1,0 +1,123 @@
+"""What is measured, on what, and what of it is handed on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.errors import CameraError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.probe import Workshop, convolution_ratio, equip, measure
+from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.planning.pruning import pruned_image_error
+from sgsst_core.planning.ranks_model import Link
+from sgsst_core.planning.survey import _progress, survey
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.small_scenes import ball, blind_camera, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+FREE = Link(float("inf"), 0.0)
+
+
+def equipped(weights: BackboneWeights, scene: Scene, **values: Any) -> Workshop:
+    return equip(scene, cameras(3), make_settings(**values), weights, ALONE)
+
+
+def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
+    scene = replace(wall(), sh_rest=torch.zeros(len(wall()), 15, 3))
+    workshop = equipped(tiny_weights, scene, memory_limit=10**9)
+    probe = measure(workshop, survey(scene, workshop.cameras, workshop.rasterizer), FREE)
+    assert (probe.scene.gaussians, probe.scene.sh_degree, probe.scene.used_degree) == (len(scene), 3, 0)
+    assert probe.sizes == tuple((camera.height, camera.width) for camera in cameras(3))
+    assert probe.distinct == (0, 1, 2)
+    assert probe.pruned_error is None
+    assert (probe.network.halo, probe.network.held_bytes) == (
+        workshop.network.halo,
+        workshop.network.held_bytes_per_pixel(),
+    )
+    assert 0 < probe.network.rate.forward < 10 * probe.network.rate.both
+    assert probe.network.precision_ratio is None
+    assert probe.raster.bytes is not None
+    assert probe.raster.half_bytes is not None
+    assert 0 < probe.raster.half_bytes < probe.raster.bytes
+    assert probe.raster.seconds > 0
+    assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
+    assert probe.process_bytes > 10**7
+
+
+def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    looked = survey(scene, cameras(3), make_rasterizer("cpu", scene))
+    threshold = float(looked.total_weights.quantile(0.5))
+    probe = measure(equipped(tiny_weights, scene, prune_weight=threshold), looked, FREE)
+    left_out = looked.total_weights <= threshold
+    assert probe.pruned_error == pruned_image_error(left_out, cameras(3), [0, 1, 2], make_rasterizer("cpu", scene))
+
+
+def test_the_survey_tells_how_far_it_is() -> None:
+    scene, told = wall(), list[PlanningProgress]()
+    survey(scene, cameras(3), make_rasterizer("cpu", scene), show=told.append)
+    assert [(progress.done, progress.total) for progress in told] == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert told[0].seconds_left is None
+    assert all(progress.seconds_left is not None for progress in told[1:])
+    assert told[1].seconds_left > 0  # type: ignore[operator]
+    assert told[-1].seconds_left == 0
+    assert [progress.fraction for progress in told] == [0, 1 / 3, 2 / 3, 1]
+
+
+def test_the_other_ranks_are_taken_to_be_as_far() -> None:
+    assert _progress(0, 5, 2, 0.1) == PlanningProgress(0, 5, None)
+    assert _progress(2, 5, 2, 4.0) == PlanningProgress(4, 5, 1.0)
+    assert _progress(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
+
+
+def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) -> None:
+    for views, message in (([], "There are no cameras"), ([blind_camera()], "None of the 1 cameras sees")):
+        with pytest.raises(CameraError, match=message):
+            make_plan(wall(), views, make_settings(), weights=tiny_weights)
+
+
+def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeights) -> None:
+    scene, settings, told = wall(), make_settings(), list[PlanningProgress]()
+    first, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+    second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, looked=first.survey, show=told.append)
+    assert not told
+    assert second.survey is first.survey
+    assert torch.equal(second.seen, first.seen)
+
+
+@pytest.mark.parametrize("kept", ["none", "float32"])
+def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneWeights, kept: str) -> None:
+    """Network and lists of views; but not where Gaussians are left out, whose places in the lists would be others."""
+    for scene, handed_on in ((ball(), True), (wall(), False)):
+        settings = make_settings(kept_weights=kept)
+        plan, workshop = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+        inputs = (plan, scene, cameras(2), style(), settings)
+        used, fresh = (Stylizer(*inputs, weights=tiny_weights, workshop=shop) for shop in (workshop, None))
+        assert bool(plan.seen.all()) is handed_on
+        assert used.network is workshop.network
+        rasterizer = used.views.rasterizer
+        own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer._cpu  # type: ignore[attr-defined]
+        assert (own is workshop.rasterizer) is handed_on
+        assert used.run_step().loss == fresh.run_step().loss
+        assert torch.equal(used.sh_dc, fresh.sh_dc)
+
+
+def test_a_rasterizer_that_is_named_is_measured_and_used(tiny_weights: BackboneWeights) -> None:
+    settings = make_settings(kept_weights="none")
+    stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
+    assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"
+
+
+def test_both_precisions_are_timed() -> None:
+    assert convolution_ratio("cpu") > 0

@@ -1,0 +1,69 @@
+"""Who takes part, whether ranks agree, and how fast each is: without a scene."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgsst_core.errors import RanksDriftedError
+from sgsst_core.parallel.collectives import Collectives, RankLeftOut
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.survey import Survey
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.team import BALANCE_STEPS, DRIFT_STEPS, Team
+from tests.worker.ranks.spawn import on_ranks
+
+
+def plan(ranks: int) -> Plan:
+    seen = torch.ones(3, dtype=torch.bool)
+    looked = Survey(torch.ones(3, dtype=torch.float64), [0], [], 0.0)
+    return Plan(looked, seen, seen, (0,), weighted=False, steps_coarse=0, memory_limit=1 << 30, ranks=ranks)
+
+
+def drift(collectives: Collectives) -> list[str]:
+    """What is said after a step of the same colours, and after two of others."""
+    team = Team(plan(2), make_settings(), collectives)
+    colours, other = torch.zeros(3, 3), torch.full((3, 3), 1e-6 * collectives.rank)
+    team.check_drift(DRIFT_STEPS, colours)
+    team.check_drift(DRIFT_STEPS + 1, other)  # nobody looks
+    with pytest.raises(RanksDriftedError) as raised:
+        team.check_drift(2 * DRIFT_STEPS, other)
+    return [str(raised.value)]
+
+
+def test_drift_is_found_on_every_rank() -> None:
+    for said in on_ranks(2, drift):
+        assert said[0].startswith(f"Step {2 * DRIFT_STEPS}: the ranks' colours are no longer the same.")
+
+
+def speeds(collectives: Collectives, slower: float, rebalance: bool) -> list[tuple[float, ...] | None]:
+    """What is told after each step; rank 1 takes `slower` times as long."""
+    team = Team(plan(2), make_settings(rebalance=rebalance), collectives)
+    seconds = {"vgg_forward": 1.0, "vgg_backward": 1.0, "render": 9.0}
+    if collectives.rank == 1:
+        seconds = {name: slower * value for name, value in seconds.items()}
+    return [team.compare_speeds(1000, seconds) for _ in range(BALANCE_STEPS + 2)]
+
+
+@pytest.mark.parametrize(
+    ("slower", "rebalance", "expected"), [(2.0, True, (500.0, 250.0)), (1.1, True, None), (2.0, False, None)]
+)
+def test_speeds_are_told_once_where_they_differ(
+    slower: float, rebalance: bool, expected: tuple[float, ...] | None
+) -> None:
+    for told in on_ranks(2, speeds, slower, rebalance):
+        assert told[BALANCE_STEPS - 1] == expected
+        assert all(value is None for step, value in enumerate(told) if step != BALANCE_STEPS - 1)
+
+
+def place(collectives: Collectives, ranks: int, views_per_step: int) -> tuple[int, int, int] | None:
+    try:
+        team = Team(plan(ranks), make_settings(views_per_step=views_per_step), collectives)
+    except RankLeftOut:
+        return None
+    return team.everybody.size, team.groups, team.own_group
+
+
+def test_ranks_form_groups_and_those_that_are_not_needed_leave() -> None:
+    assert on_ranks(4, place, 4, 2) == [(4, 2, 0), (4, 2, 0), (4, 2, 1), (4, 2, 1)]
+    assert on_ranks(4, place, 2, 1) == [(2, 1, 0), (2, 1, 0), None, None]
