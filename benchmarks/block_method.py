@@ -7,6 +7,8 @@ are computed in every iteration. It runs on this project's network code, so that
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -38,7 +40,7 @@ def blocks(height: int, width: int) -> list[PartitionTile]:
     ]
 
 
-def block_gradient(network: FeatureNetwork, image: Tensor, style: dict[int, ScaleTarget], content: Tensor) -> Tensor:
+def block_gradient(network: FeatureNetwork, image: Tensor, style: Mapping[int, ScaleTarget], content: Tensor) -> Tensor:
     """dE/dimage [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
     scales = range(scale_count(image.shape[0], image.shape[1]))
     total = torch.zeros(image.shape)

@@ -22,7 +22,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import psutil
 
@@ -57,7 +57,7 @@ def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
         if number % 10 < DAEMONS:
             yield DaemonFault(chance.choice(["raylet", "gcs_server"]), chance.randint(3, 12))
             continue
-        what = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
+        what: Literal["SIGKILL", "SIGSTOP"] = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
         rank = 0 if place == "checkpoint" else chance.randint(0, 1)
         # Checkpoints are written twice a second, and values are gathered only while a job is prepared.
         call = chance.randint(*{"checkpoint": (2, 5), "all_gather": (2, 8)}.get(place, (20, 60)))

@@ -39,7 +39,7 @@ SEEDS = (1, 2)
 #: Of the job on two ranks: enough for all of their deaths.
 RANK_STEPS = 200
 #: Attempts end by our hand here: neither a reason to give a job up nor to wait ever longer.
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "SGSST_LEASE_SECONDS": "30",
     "SGSST_MAX_ATTEMPTS": "1000000",
     "SGSST_RETRY_SECONDS": "0",

@@ -34,7 +34,7 @@ from tests.small_scenes import wall, write_files
 
 #: A job that outlasts the benchmark; the others never get its place.
 LONG = {"preset": "standard", "steps_sos": 1_000_000, "backbone": "vgg16", "early_stop": False}
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "SGSST_LEASE_SECONDS": "30",
     "SGSST_POLL_SECONDS": "0.5",
     "SGSST_CHECKPOINT_SECONDS": "60",

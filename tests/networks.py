@@ -34,7 +34,7 @@ def tiny_weights() -> BackboneWeights:
 def install_tiny_weights(folder: Path) -> Path:
     """Make a folder what `SGSST_CACHE` can name: `tiny_weights` as vgg16, and the real weights of LPIPS beside it."""
     file = folder / "narrow.pth"
-    state = {}
+    state: dict[str, torch.Tensor] = {}
     for name, (weight, bias) in tiny_weights().convolutions.items():
         state |= {f"{name}.weight": weight.flip(1) if name == "conv1_1" else weight, f"{name}.bias": bias}
     torch.save(state, file)

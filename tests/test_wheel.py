@@ -80,7 +80,7 @@ def test_the_installed_packages_are_those_of_the_wheel(installed: Path, tmp_path
 def test_a_scene_is_stylized_and_reported(installed: Path, vgg16_weights: BackboneWeights, tmp_path: Path) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
     out = tmp_path / "new" / "stylized.ply"
-    options = ["--cameras", cameras, "--style", style, "--out", out, "--backbone", "vgg16"]
+    options: list[str | Path] = ["--cameras", cameras, "--style", style, "--out", out, "--backbone", "vgg16"]
     run([installed / "sgsst", "stylize", ply, *options, "--steps-sos", "2"], tmp_path, OMP_NUM_THREADS="1")
     assert out.stat().st_size == ply.stat().st_size
     assert "</html>" in out.with_name("stylized.report.html").read_text()

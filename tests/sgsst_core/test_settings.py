@@ -61,4 +61,4 @@ def test_an_unknown_preset_is_refused_with_the_known_ones() -> None:
 
 def test_settings_do_not_change() -> None:
     with pytest.raises(ValueError, match="frozen"):
-        make_settings().seed = 3
+        make_settings().seed = 3  # type: ignore[misc]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from skimage import data
 
 from api.cli import demo_scene
@@ -110,7 +111,7 @@ def test_discs_lie_in_their_surface() -> None:
     offset = constant + DISPARITY_OFFSET + slope_x * CENTRE_X + slope_y * CENTRE_Y
     normal = np.array([FOCAL * slope_x, FOCAL * slope_y, offset])
     np.testing.assert_allclose(means @ normal, FOCAL * BASELINE, rtol=1e-12)
-    rotation = demo_scene.Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    rotation = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
     np.testing.assert_allclose(np.abs(rotation[:, :, 0] @ normal), np.linalg.norm(normal), rtol=1e-6)
     assert (scales[:, 0] < scales[:, 1]).all()
     axes = rotation[:, :, 1:] * np.exp(scales[:, None, 1:])

@@ -94,7 +94,7 @@ def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.
     (error,) = refused.value.errors()
     if name in declared(Settings):
         with pytest.raises(SettingsError, match=declared(Settings)[name].field):
-            make_settings(**{declared(Settings)[name].field: value})
+            make_settings(**{declared(Settings)[name].field: value})  # type: ignore[arg-type]
     if name in ViewOptions.model_fields:
         with pytest.raises(SettingsError, match=name):
             checked(SceneRequest, {"scene": "scene.ply", name: value})

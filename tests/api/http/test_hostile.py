@@ -751,8 +751,8 @@ def test_uploads_that_go_on_wrong(client: httpx.Client, service: Service) -> Non
     assert send(client, where, 0, bytes(100)).status_code == 204
     for offset in (0, 99, 101, 1000, 2**59):
         assert refused(send(client, where, offset, bytes(10)), 409, "conflict")["offset"] == 100
-    for offset in ("-1", "x", "1.5", str(2**60), "9" * 5000, ""):
-        refused(send(client, where, offset, bytes(10)), 422, "invalid-request")
+    for told in ("-1", "x", "1.5", str(2**60), "9" * 5000, ""):
+        refused(send(client, where, told, bytes(10)), 422, "invalid-request")
     wrong = base64.b64encode(bytes(32)).decode()
     refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": f"sha256 {wrong}"}), 460, "checksum-mismatch")
     refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": "sha256"}), 460, "checksum-mismatch")

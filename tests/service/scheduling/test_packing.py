@@ -178,7 +178,8 @@ def test_places_are_parts_of_cores_and_memory() -> None:
 def test_jobs_side_by_side_never_plan_with_more_memory_than_there_is(
     places: int, jobs: list[tuple[int, int | None]]
 ) -> None:
-    room, held, planned = Room(machine(0), places), [], []
+    held: list[Any] = []
+    room, planned = Room(machine(0), places), []
     for scene, limit in jobs:
         grant = room.grant(job(scene, memory_limit=limit), held, len(jobs))
         if grant is not None:

@@ -474,7 +474,7 @@ def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Cl
 
 
 def test_however_a_job_ends_it_is_kept_as_long(store: Store, clock: Clock) -> None:
-    ends = {
+    ends: dict[str, Callable[[], Any]] = {
         "succeeded": lambda: store.leases.succeed(lease(store), [], {}),
         "failed": lambda: store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True),
         "canceled": lambda: store.jobs.cancel(job_id, "local"),
@@ -644,6 +644,6 @@ TestStoreMachine.settings = settings(
 
 
 def test_errors_of_the_service_have_codes_and_statuses() -> None:
-    kinds = [ServiceError, *ServiceError.__subclasses__()]
+    kinds: list[type[ServiceError]] = [ServiceError, *ServiceError.__subclasses__()]
     assert all(400 <= kind.status < 600 for kind in kinds)
     assert len({(kind.code, kind.status) for kind in kinds}) == len(kinds)

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def caffe_state(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
     caffe = torch.tensor(sources.CAFFE_MEAN).double()
     gain = sources.KAPPA / (255 * std)
     offset = gain * (caffe - 255 * mean)
-    state = {}
+    state: dict[str, torch.Tensor] = {}
     for layer, (weight, bias) in layers.items():
         weight, bias = weight.double(), bias.double() * sources.KAPPA
         if layer == "conv1_1":
@@ -300,7 +301,7 @@ def test_code_in_a_pickle_never_runs(tmp_path: Path) -> None:
 
 
 def test_pickles_of_arrays_are_flattened() -> None:
-    arrays = {"a": {"b": np.arange(3, dtype=np.float32)}, "c": np.ones((2, 2), np.float32)}
+    arrays: dict[str, Any] = {"a": {"b": np.arange(3, dtype=np.float32)}, "c": np.ones((2, 2), np.float32)}
     for protocol in (3, 4):
         flat = sources.unpickle_arrays(pickle.dumps(arrays, protocol=protocol), "x")
         assert flat.keys() == {"a/b", "c"}

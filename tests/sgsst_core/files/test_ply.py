@@ -138,7 +138,7 @@ def files(draw: st.DrawFn) -> File:
     rows = [seed | {name: value(kinds.get(name, "float")) for name in fresh} for _ in range(draw(st.integers(1, 3)))]
     vertex = ("vertex", [(kinds.get(name, "float"), name) for name in order], rows)
     lists = [{"vertex_indices": [1, 2, 3][: draw(st.integers(0, 3))], "quality": 0.5} for _ in range(2)]
-    others = [
+    others: list[Any] = [
         ("camera", [("int", "view"), ("double", "focal")], [{"view": 7, "focal": 0.1}] * draw(st.integers(0, 2))),
         ("face", [("list uchar int", "vertex_indices"), ("float", "quality")], lists),
     ]

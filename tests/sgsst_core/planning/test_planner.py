@@ -15,7 +15,7 @@ from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import EVERYTHING, Item, make_settings
+from sgsst_core.settings import EVERYTHING, Item, PresetName, make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.unseen import neighbours_change
@@ -190,7 +190,8 @@ def test_unseen_gaussians_follow_their_seen_neighbours() -> None:
 
 def test_unseen_gaussians_keep_their_colour_in_paper(tiny_weights: BackboneWeights) -> None:
     scene = behind(wall())
-    for preset, moved in (("paper", False), ("standard", True)):
+    cases: list[tuple[PresetName, bool]] = [("paper", False), ("standard", True)]
+    for preset, moved in cases:
         settings = make_settings(preset, steps_coarse=0, steps_sos=2)
         stylizer = Stylizer.planned(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=tiny_weights)
         run(stylizer)

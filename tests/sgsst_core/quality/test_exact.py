@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -18,8 +19,9 @@ from tests.small_scenes import ball, cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def make(weights: BackboneWeights, scene: object = None, **values: object) -> Stylizer:
-    settings = make_settings(**{"steps_coarse": 0, "steps_sos": 12, **values})
+def make(weights: BackboneWeights, scene: object = None, **values: Any) -> Stylizer:
+    given: dict[str, Any] = {"steps_coarse": 0, "steps_sos": 12, **values}
+    settings = make_settings(**given)
     return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -118,7 +119,7 @@ def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_pat
     found = seen_by(tmp_path, scene, cameras())
     file = stored(tmp_path, scene)
     rasterizer = make_rasterizer("reference", file.scene)
-    weights = sum(rasterizer.colour_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
+    weights: Any = sum(rasterizer.colour_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
     unseen = the(found, "in no view")
     assert unseen.count == int((weights == 0).sum()) >= 10
     hardly = the(found, "hardly seen")

@@ -74,7 +74,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
 
 def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """With little memory phase 1 keeps the weights of the coarsest scale only; nothing else may change."""
-    options = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
+    options: dict[str, Any] = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
     views = [resized(camera, 100) for camera in cameras(2)]
     lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=tiny_weights)
     plain = Stylizer.planned(scene, views, style(), make_settings(**options, kept_weights="none"), weights=tiny_weights)

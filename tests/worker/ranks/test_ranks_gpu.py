@@ -54,7 +54,9 @@ def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_co
     expected = gradient(ALONE, name)
     size = min(torch.cuda.device_count(), 4)
     address = f"127.0.0.1:{free_port()}"
-    multiprocessing.spawn(run_rank, (size, address, name, str(tmp_path)), nprocs=size)
+    multiprocessing.spawn(  # type: ignore[attr-defined]
+        run_rank, (size, address, name, str(tmp_path)), nprocs=size
+    )
     found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(size)]
     for own in found:
         assert torch.equal(own, found[0])
