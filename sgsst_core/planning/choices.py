@@ -5,6 +5,8 @@ What is measured next depends on them, so the probe and `decide` share them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -52,14 +54,19 @@ def precision_of(ratio: float | None) -> Precision:
     return "bfloat16" if ratio is not None and ratio > 1 else "float32"
 
 
-def rasterizer_anew(device: Device, gsplat_problem: str | None, settings: Settings) -> RasterizerName:
+#: Rasterizers of GPUs, the preferred one first.
+GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
+
+
+def rasterizer_anew(device: Device, problems: Mapping[str, str], settings: Settings) -> RasterizerName:
     """The rasterizer that computes blend weights anew in every call.
 
-    gsplat does it on a GPU, unless weights are to be kept: those are computed on the CPU, wherever they are applied.
+    On a GPU the first of `GPU_RASTERIZERS` that works, unless weights are to be kept: those are computed on the CPU,
+    wherever they are applied.
 
     Args:
-        gsplat_problem: why gsplat cannot be used; None where it can.
+        problems: why GPU rasterizers cannot be used, by their name; those that can are not in it.
     """
-    if device == "cuda" and gsplat_problem is None and settings.kept_weights in ("auto", "none"):
-        return "cuda"
+    if device == "cuda" and settings.kept_weights in ("auto", "none"):
+        return next((name for name in GPU_RASTERIZERS if name not in problems), "cpu")
     return "cpu"

@@ -131,13 +131,13 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     """On a GPU, which rasterizer renders; on the CPU there is nothing to choose."""
     if plan.device != "cuda":
         return []
-    names = {"cuda": "gsplat on the GPU", "triton": "Triton on the GPU", "cached": "kept blend weights on the GPU"}
-    how = names.get(plan.rasterizer, "on the CPU")
-    problem = probe.machine.gsplat_problem
-    reason = "gsplat works here" if problem is None else f"gsplat cannot be used: {problem}"
-    if problem is None and plan.rasterizer != "cuda":
-        reason = "asked for"
-    return [Decision("rasterizer", how, reason)]
+    names = {"cuda": "gsplat", "triton": "Triton"}
+    where = {"cached": "kept blend weights on the GPU", "cpu": "on the CPU"}
+    how = where.get(plan.rasterizer) or f"{names.get(plan.rasterizer, plan.rasterizer)} on the GPU"
+    failed = [f"{names[name]} cannot be used: {problem}" for name, problem in probe.machine.problems.items()]
+    if plan.rasterizer in names:
+        failed.append(f"{names[plan.rasterizer]} works here")
+    return [Decision("rasterizer", how, "; ".join(failed) or "asked for")]
 
 
 def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:
@@ -149,7 +149,7 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
         if "none" in (settings.kept_weights, *settings.keep):
             reason = "asked for"
         elif raster.bytes is None:
-            reason = "gsplat keeps none"
+            reason = "the GPU's rasterizer keeps none"
         return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
     room = f"{budget / 1e9:.1f} GB are there for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None

@@ -7,8 +7,8 @@ to use.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import psutil
 import torch
@@ -20,6 +20,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import (
+    GPU_RASTERIZERS,
     optimised_gaussians,
     precision_of,
     pruned_gaussians,
@@ -34,7 +35,7 @@ from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.cuda import gsplat_problem
+from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, Settings
@@ -91,17 +92,17 @@ class Machine:
 
     Attributes:
         device: that computes.
-        gsplat_problem: why gsplat cannot render there; None where it can.
         memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
         sharing: most ranks that share it.
         ranks: that there are.
+        problems: why GPU rasterizers cannot be used there, by their name; none on the CPU.
     """
 
     device: Device
-    gsplat_problem: str | None
     memory_limit: int
     sharing: int = 1
     ranks: int = 1
+    problems: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def memory(self) -> int:
@@ -173,9 +174,7 @@ def equip(
         rasterizer: that computes blend weights anew; None chooses.
     """
     device = common_device(collectives)
-    problem = None
-    if device == "cuda":  # what one rank cannot do, none does
-        problem = next(filter(None, collectives.all_gather(gsplat_problem())), None)
+    problems = gpu_problems(collectives) if device == "cuda" else {}
     ratio = None
     if settings.precision != "float32":
         ratio = collectives.broadcast(lambda: convolution_ratio(device))
@@ -183,13 +182,13 @@ def equip(
     limit = settings.memory_limit or default_memory_limit(network.device)
     machine = Machine(
         device,
-        problem,
         # The partition follows from it, and so does rounding: it must be the same on all ranks.
         memory_limit=min(collectives.all_gather(limit)),
         sharing=sharing_memory(collectives, device),
         ranks=collectives.size,
+        problems=problems,
     )
-    name = rasterizer or rasterizer_anew(device, problem, settings)
+    name = rasterizer or rasterizer_anew(device, problems, settings)
     whole = make_rasterizer(name, scene, background=settings.background, near=settings.near)
     return Workshop(scene, tuple(cameras), settings, machine, network, ratio, whole)
 
@@ -197,6 +196,20 @@ def equip(
 def common_device(collectives: Collectives) -> Device:
     """What all ranks can compute on."""
     return "cuda" if all(collectives.all_gather(torch.cuda.is_available())) else "cpu"
+
+
+def gpu_problems(collectives: Collectives) -> dict[str, str]:
+    """Why GPU rasterizers cannot be used, by their name, the preferred one first: what one rank cannot do, none does.
+
+    A rasterizer is only tried where every preferred one has failed.
+    """
+    problems: dict[str, str] = {}
+    for name in GPU_RASTERIZERS:
+        problem = next(filter(None, collectives.all_gather(drawing_problem(name))), None)
+        if problem is None:
+            break
+        problems[name] = problem
+    return problems
 
 
 def sharing_memory(collectives: Collectives, device: Device) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut, moments
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -67,7 +68,7 @@ class Measurements:
         if self._held_out is None:
             stylizer = self._stylizer
             scene = stylizer.scene.without_zero_bands()
-            name = "cuda" if stylizer.views.rasterizer.name == "cuda" else "cpu"
+            name = own if (own := stylizer.views.rasterizer.name) in GPU_RASTERIZERS else "cpu"
             settings = stylizer.settings
             source = self.exact if stylizer.network.dtype != torch.float32 else stylizer
             first = stylizer.measured[0]["held_out"] if stylizer.measured else None

@@ -45,30 +45,6 @@ def load_gsplat() -> ModuleType:
     return module
 
 
-def gsplat_problem(device: torch.device | str = "cuda") -> str | None:
-    """Why gsplat cannot render on a device, in a few words; None where it can: one Gaussian is drawn to see.
-
-    gsplat may be installed without its compiled kernels, or with those of another CUDA, which shows at their first use.
-    """
-    try:
-        gaussian = Scene(
-            torch.tensor([[0.0, 0.0, 2.0]]),
-            torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-            torch.zeros(1, 3),
-            torch.zeros(1),
-            torch.zeros(1, 3),
-            torch.zeros(1, 0, 3),
-        )
-        camera = Camera("probe", RASTER_TILE, RASTER_TILE, 16.0, 16.0, 8.0, 8.0, torch.eye(4, dtype=torch.float64))
-        rasterizer = CudaRasterizer(gaussian, device=device)
-        image = rasterizer.render(torch.ones(1, 3), camera)
-        gradient = rasterizer.colour_gradient(torch.ones_like(image), camera)
-        drawn = float(image.sum()) > 0 and float(gradient.sum()) > 0
-    except Exception as error:  # whatever it is, it cannot be used
-        return (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return None if drawn else "it draws nothing"
-
-
 def gsplat_alpha_max(version: str) -> float:
     """What gsplat clamps alpha at: 0.99 from version 1.6 on, 0.999 before. It cannot be set."""
     major, minor = (int("".join(filter(str.isdigit, part)) or 0) for part in version.split(".")[:2])

@@ -12,6 +12,7 @@ import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
+from sgsst_core.planning.choices import rasterizer_anew
 from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Rate
 from sgsst_core.planning.decide import MEASURING_BYTES, decide
 from sgsst_core.planning.plan import Decision, Plan
@@ -34,7 +35,7 @@ def probe(**changes: Any) -> Probe:
         "scene": SceneFacts(6, 3, 3),
         "survey": Survey(weights, list(range(VIEWS)), [WHOLE] * VIEWS, 0.0),
         "network": NetworkFacts(64, 3000.0, 500.0, 2048, Rate(1e-6, 3e-6), fixed=0.01),
-        "machine": Machine("cpu", None, 10 * GIGABYTE),
+        "machine": Machine("cpu", 10 * GIGABYTE),
     }
     for name, part in parts.items():
         own = {field.name for field in dataclasses.fields(part)} & changes.keys()
@@ -231,21 +232,35 @@ def test_half_precision_where_only_that_fits() -> None:
     assert "1/4096" in line(plan, "blend weights").error  # type: ignore[union-attr]
 
 
-def test_on_a_gpu_gsplat_renders_where_it_works() -> None:
-    plan = plan_of(probe(device="cuda", rasterizer="cuda", raster=WITHOUT_KEPT))
-    assert (plan.device, plan.rasterizer, plan.kept_weights, plan.coarse_weights) == ("cuda", "cuda", "none", False)
-    assert said(plan, "rasterizer") == "gsplat on the GPU: gsplat works here"
-    assert said(plan, "blend weights") == "computed anew in every iteration: gsplat keeps none"
+def test_on_a_gpu_the_first_rasterizer_that_works_renders() -> None:
+    settings, kept = make_settings(), make_settings(kept_weights="float32")
+    assert rasterizer_anew("cuda", {}, settings) == "triton"
+    assert rasterizer_anew("cuda", {"triton": "no driver"}, settings) == "cuda"
+    assert rasterizer_anew("cuda", {"triton": "no driver", "cuda": "no kernels"}, settings) == "cpu"
+    assert rasterizer_anew("cuda", {}, kept) == "cpu"
+    assert rasterizer_anew("cpu", {}, settings) == "cpu"
 
 
-def test_on_a_gpu_without_gsplat_weights_are_kept_there() -> None:
+def test_on_a_gpu_the_plan_says_what_renders_and_why() -> None:
+    plan = plan_of(probe(device="cuda", rasterizer="triton", raster=WITHOUT_KEPT))
+    assert (plan.device, plan.rasterizer, plan.kept_weights, plan.coarse_weights) == ("cuda", "triton", "none", False)
+    assert said(plan, "rasterizer") == "Triton on the GPU: Triton works here"
+    assert said(plan, "blend weights") == "computed anew in every iteration: the GPU's rasterizer keeps none"
+    second = probe(device="cuda", rasterizer="cuda", raster=WITHOUT_KEPT, problems={"triton": "no driver"})
+    expected = "gsplat on the GPU: Triton cannot be used: no driver; gsplat works here"
+    assert said(plan_of(second), "rasterizer") == expected
+
+
+def test_on_a_gpu_without_a_rasterizer_weights_are_kept_there() -> None:
     """In both forms they take as much memory on a GPU: half precision would only lose digits."""
-    broken = probe(device="cuda", gsplat_problem="no kernels", raster=RasterCost(0.3, None, *[6 * GIGABYTE] * 2))
+    problems = {"triton": "no driver", "cuda": "no kernels"}
+    broken = probe(device="cuda", problems=problems, raster=RasterCost(0.3, None, *[6 * GIGABYTE] * 2))
     plan, once = plan_of(broken), plan_of(broken, kept_weights="none")
+    why = "Triton cannot be used: no driver; gsplat cannot be used: no kernels"
     assert (plan.rasterizer, plan.kept_weights, plan.coarse_weights) == ("cached", "float32", False)
-    assert said(plan, "rasterizer") == "kept blend weights on the GPU: gsplat cannot be used: no kernels"
+    assert said(plan, "rasterizer") == f"kept blend weights on the GPU: {why}"
     assert (once.rasterizer, once.kept_weights) == ("cpu", "none")
-    assert said(once, "rasterizer") == "on the CPU: gsplat cannot be used: no kernels"
+    assert said(once, "rasterizer") == f"on the CPU: {why}"
 
 
 def test_on_a_gpu_weights_are_kept_when_that_is_asked_for() -> None:

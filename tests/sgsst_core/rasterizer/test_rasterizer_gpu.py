@@ -12,8 +12,9 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max, gsplat_problem
+from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.trial import drawing_problem
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, pixels_like, turned_pose
 
@@ -29,7 +30,7 @@ CLOSE = 2e-3
 @needs_gpu
 @needs_gsplat
 def test_gsplat_has_no_problem() -> None:
-    assert gsplat_problem() is None
+    assert drawing_problem("cuda") is None
 
 
 @pytest.mark.gpu
@@ -103,6 +104,6 @@ def test_the_clamp_follows_the_version(version: str, clamp: float) -> None:
 
 @pytest.mark.skipif(HAS_GPU and HAS_GSPLAT, reason="there is no problem")
 def test_gsplat_that_cannot_be_used_has_a_reason_in_one_line() -> None:
-    problem = gsplat_problem()
+    problem = drawing_problem("cuda")
     assert problem
     assert "\n" not in problem

@@ -26,6 +26,7 @@ from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -162,6 +163,13 @@ def test_too_many_intersections_are_refused_before_they_are_listed(monkeypatch: 
     monkeypatch.setattr("sgsst_core.rasterizer.raster_lists.MAX_INTERSECTIONS", 10)
     with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
         on_device(cloud(200)).lists(camera())
+
+
+def test_a_trial_drawing_tells_whether_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert drawing_problem("triton", DEVICE) is None
+    monkeypatch.setattr(TritonRasterizer, "render", lambda *arguments: torch.zeros(16, 16, 3))
+    assert drawing_problem("triton", DEVICE) == "it draws nothing"
+    assert "no rasterizer is called 'none'" in str(drawing_problem("none"))  # type: ignore[arg-type]
 
 
 def test_made_by_its_name() -> None:
