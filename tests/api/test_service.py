@@ -76,7 +76,8 @@ def wait_until(service: Service, client: httpx.Client, job_id: str, *statuses: s
 def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int, attempt: int = 1) -> None:
     def there() -> bool:
         progress = job(client, job_id)["progress"] or {}
-        return progress.get("attempt") == attempt and progress.get("step", 0) >= step
+        stepping = progress.get("stage") not in ("planning", "starting")
+        return stepping and progress.get("attempt") == attempt and progress.get("step", 0) >= step
 
     wait_for(there, f"step {step}", service.said)
 
