@@ -180,7 +180,8 @@ def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
         job = run.call("GET", f"/v1/jobs/{job_id}").json()
         if job["status"] in _FINISHED:
             break
-        step = (job["progress"] or {}).get("step") or 0
+        progress = job["progress"] or {}
+        step = 0 if progress.get("stage") in ("planning", "starting") else progress.get("step") or 0
         if step > reached:
             reached = step
             time.sleep(chance.uniform(0, 2))

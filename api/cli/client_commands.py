@@ -22,8 +22,8 @@ from service.parameters import JobParameters
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
 
+    from api.client import Client
     from api.client.answers import Job
-    from api.client.client import Client
 
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
@@ -168,7 +168,7 @@ def jobs(
 def _client(url: str | None, key: str | None) -> Client:
     import stamina.instrumentation
 
-    from api.client.client import Client
+    from api.client import Client
 
     stamina.instrumentation.set_on_retry_hooks([_tell_of_retry])
     return Client(url, key)

@@ -1,6 +1,6 @@
 """A client of the service, for programs: `Client`, and `AsyncClient` with the same methods to await.
 
-from api.client.client import Client
+from api.client import Client
 
 with Client("http://127.0.0.1:8000") as client:
     job = client.submit("scene.ply", "style.jpg", cameras="cameras.json", preset="preview")

@@ -17,7 +17,7 @@ import httpx
 import psutil
 import pytest
 
-from api.client.client import AsyncClient, Client
+from api.client import AsyncClient, Client
 from sgsst_core.files.ply import read_scene
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files

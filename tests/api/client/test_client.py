@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 import stamina
 
-from api.client import uploads
+from api.client import AsyncClient, Client, uploads
 from api.client.answers import ApiError, Event, Job, RequestError
-from api.client.client import AsyncClient, Client
 from api.client.transport import TRIES
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings

@@ -84,9 +84,9 @@ def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
     def there() -> bool:
         found = look(service, job_id)
         progress = found["progress"] or {}
-        return found["status"] == "succeeded" or (
-            progress.get("attempt", 0) >= attempt and progress.get("step", 0) >= step
-        )
+        stepping = progress.get("stage") not in ("planning", "starting")
+        there = stepping and progress.get("attempt", 0) >= attempt and progress.get("step", 0) >= step
+        return found["status"] == "succeeded" or there
 
     wait_for(there, f"step {step} of attempt {attempt}", service.said)
 
