@@ -69,6 +69,16 @@ class Activations:
     size: tuple[int, int] = (0, 0)
 
 
+def use_whole_float32() -> None:
+    """Let convolutions and matrix products of float32 be float32 on GPUs too.
+
+    PyTorch lets cuDNN round their factors to the 10 bits of TF32 unless told otherwise: gradients would no longer be
+    exact, and those of a partition no longer those of the whole view.
+    """
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cuda.matmul.allow_tf32 = False
+
+
 class FeatureNetwork:
     """VGG up to the deepest layer asked for.
 

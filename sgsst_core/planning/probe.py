@@ -15,7 +15,7 @@ import torch
 
 from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
@@ -220,6 +220,7 @@ def sharing_memory(collectives: Collectives, device: Device) -> int:
 def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
     """The feature network, with layers up to the deepest one used."""
     layers = (*STYLE_LAYERS, CONTENT_LAYER) if settings.content_weight else STYLE_LAYERS
+    use_whole_float32()
     return FeatureNetwork(weights, layers, _DTYPES[precision], device)
 
 

@@ -55,7 +55,7 @@ def process_group(
     if size == 1:
         yield ALONE
         return
-    device = torch.device(device)
+    device = with_index(device)
     if device.type == "cuda":
         torch.cuda.set_device(device)
     # Values that are not tensors (plans, decisions) travel between CPUs in any case.
@@ -69,6 +69,14 @@ def process_group(
     finally:
         collectives.close()
         dist.destroy_process_group()
+
+
+def with_index(device: torch.device | str) -> torch.device:
+    """The device; a GPU with its number, without which it can neither be made the current one nor given to NCCL."""
+    found = torch.device(device)
+    if found.type == "cuda" and found.index is None:
+        return torch.device("cuda", torch.cuda.current_device())
+    return found
 
 
 class ProcessGroupCollectives:

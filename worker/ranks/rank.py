@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import pickle
 import socket
+import sys
 import threading
 import time
 import traceback
@@ -182,7 +183,7 @@ class RankProcess:
         from worker.ranks.process_group import process_group
 
         torch.set_num_threads(task.threads)
-        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        device = torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else "cpu"
         timeout = timedelta(seconds=task.timeout + _PATIENCE)
         with process_group(task.rank, task.size, task.address, device=device, timeout=timeout) as collectives:
             # The outcome is told inside the block: leaving the group may have to wait for ranks that are lost.
@@ -241,8 +242,7 @@ class RankProcess:
 
 def _set_environment(task: RankTask) -> None:
     """Threads, GPU, network and folder, before anything is imported that looks at them."""
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = str(task.threads)
+    set_thread_variables(task.threads)
     import ray
 
     # A process that was given no GPU would see all of them.
@@ -253,6 +253,18 @@ def _set_environment(task: RankTask) -> None:
             os.environ.setdefault(name, interface)
     if task.folder.is_dir():
         os.chdir(task.folder)
+
+
+def set_thread_variables(threads: int) -> None:
+    """Tell libraries that have not been imported yet how many threads to use.
+
+    Numba reads its variable again whenever it compiles, and refuses another value than that of its import: where it has
+    been imported, `compiled.kernel_threads` alone says how many of its threads run.
+    """
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    if "numba" not in sys.modules:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)
 
 
 def _failure(error: BaseException) -> Outcome:

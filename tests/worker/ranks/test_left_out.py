@@ -57,7 +57,6 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
 
     monkeypatch.setattr(ray, "init", with_gpus)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
-    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")  # which faulty ranks import before they are told their threads
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it

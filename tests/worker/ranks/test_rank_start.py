@@ -1,0 +1,65 @@
+"""What a rank sets before it begins: threads, its GPU, the precision of products."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from sgsst_core.planning.probe import make_network
+from sgsst_core.settings import make_settings
+from tests.networks import tiny_weights
+from worker.ranks.process_group import with_index
+
+ROOT = Path(__file__).resolve().parents[3]
+
+#: A kernel without machine code on disk, compiled after the threads of Numba have started and been told otherwise.
+COLD_CACHE = """
+import os, sys
+import numba, numpy as np
+from worker.ranks.rank import set_thread_variables
+
+@numba.njit(parallel=True)
+def doubled(x):
+    for i in numba.prange(x.size):
+        x[i] *= 2
+
+doubled(np.ones(8))
+set_thread_variables(numba.config.NUMBA_NUM_THREADS + 1)
+doubled(np.ones(8, np.float32))
+print(os.environ["OMP_NUM_THREADS"])
+"""
+
+
+def test_threads_can_be_told_after_kernels_have_run() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(
+        [sys.executable, "-c", COLD_CACHE], env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout) > 1
+
+
+def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch refuses a device without one, and does so before it looks for a GPU."""
+    with pytest.raises(ValueError, match="index"):
+        torch.cuda.set_device(torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
+    assert with_index("cuda") == torch.device("cuda", 3)
+    assert with_index("cuda:1") == torch.device("cuda", 1)
+    assert with_index("cpu") == torch.device("cpu")
+
+
+def test_float32_is_not_rounded_to_tf32() -> None:
+    before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
+    try:
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = True
+        make_network(tiny_weights(), make_settings(), "float32", "cpu")
+        assert not torch.backends.cudnn.allow_tf32
+        assert not torch.backends.cuda.matmul.allow_tf32
+    finally:
+        torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32 = before
