@@ -92,7 +92,7 @@ def make_rasterizer(
     if name == "triton":
         from sgsst_core.rasterizer.triton import TritonRasterizer
 
-        return TritonRasterizer(scene, device=device or "cuda", **settings)
+        return TritonRasterizer(scene, device=device, **settings)
     if name == "cuda":
         from sgsst_core.rasterizer.cuda import CudaRasterizer
 

@@ -75,7 +75,8 @@ class TritonRasterizer:
         scene: its geometry must not change while this object lives.
         background: three values added where Gaussians leave pixels uncovered.
         near: near plane in world units.
-        device: a GPU; "cpu" where Triton's interpreter is on (TRITON_INTERPRET=1).
+        device: a GPU, or the CPU where Triton's interpreter is on (TRITON_INTERPRET=1); None takes the GPU where there
+            is one.
         alpha_max: clamp of alpha.
         max_list_bytes: see above.
 
@@ -93,7 +94,7 @@ class TritonRasterizer:
         *,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         near: float = NEAR,
-        device: torch.device | str = "cuda",
+        device: torch.device | str | None = None,
         alpha_max: float = ALPHA_MAX,
         max_list_bytes: int = DEFAULT_LIST_BYTES,
     ) -> None:
@@ -226,13 +227,12 @@ class TritonRasterizer:
         return DeviceLists(order, values[order], starts, ranks[slots], slots.to(torch.int32), first_slots)
 
 
-def _usable_device(device: torch.device | str) -> torch.device:
+def _usable_device(device: torch.device | str | None) -> torch.device:
     """The device, with its index.
 
     Raises:
         SettingsError: Triton is missing, or cannot run there.
     """
-    found = torch.device(device)
     try:
         import triton
     except ImportError as error:
@@ -240,11 +240,15 @@ def _usable_device(device: torch.device | str) -> torch.device:
             f"rasterizer 'triton' needs Triton, which cannot be imported ({error}). PyTorch's CUDA and ROCm builds "
             "bring it; choose 'cpu' or 'cached' elsewhere."
         ) from error
+    interpreted = triton.knobs.runtime.interpret
+    if device is None:
+        device = "cpu" if interpreted and not torch.cuda.is_available() else "cuda"
+    found = torch.device(device)
     if found.type == "cuda":
         if not torch.cuda.is_available():
             raise SettingsError(f"rasterizer 'triton' on device {str(device)!r}: PyTorch sees no GPU; choose 'cpu'")
         return torch.device("cuda", torch.cuda.current_device() if found.index is None else found.index)
-    if found.type == "cpu" and not triton.knobs.runtime.interpret:
+    if found.type == "cpu" and not interpreted:
         raise SettingsError(
             "rasterizer 'triton' runs on the CPU in Triton's interpreter only: set TRITON_INTERPRET=1 before the "
             "program starts, or choose 'cpu' or 'cached'."

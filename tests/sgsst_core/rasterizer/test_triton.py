@@ -23,6 +23,7 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
+from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
@@ -30,8 +31,11 @@ from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
+from tests.small_scenes import cameras, style, wall
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -174,12 +178,24 @@ def test_a_trial_drawing_tells_whether_it_works(monkeypatch: pytest.MonkeyPatch)
 
 def test_made_by_its_name() -> None:
     assert make_rasterizer("triton", cloud(10), device=DEVICE).name == "triton"
+    assert make_rasterizer("triton", cloud(10)).device.type == DEVICE
+
+
+def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
+    """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
+    settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=24)
+    losses = {}
+    for name in ("cpu", "triton"):
+        stylizer = Stylizer.planned(wall(), cameras(2), style(), settings, weights=tiny_weights, rasterizer=name)
+        assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == name
+        losses[name] = [stylizer.run_step().loss for _ in range(3)]
+    assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-4)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_the_error_says_what_to_do() -> None:
     with pytest.raises(SettingsError, match="PyTorch sees no GPU"):
-        make_rasterizer("triton", cloud(10))
+        make_rasterizer("triton", cloud(10), device="cuda")
     code = (
         "import torch\nfrom tests.sgsst_core.splat_scenes import cloud\n"
         "from sgsst_core.rasterizer import make_rasterizer\nmake_rasterizer('triton', cloud(3), device='cpu')\n"
