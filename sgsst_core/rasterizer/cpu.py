@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,13 +11,12 @@ from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import ALPHA_MAX, NEAR
 from sgsst_core.rasterizer import kernels
 from sgsst_core.rasterizer.arguments import (
-    CameraKey,
     Rows,
-    camera_key,
     check_colours,
     check_image_gradient,
     check_rows,
 )
+from sgsst_core.rasterizer.kept_lists import KeptLists
 from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -33,9 +30,8 @@ class CpuRasterizer:
     """The protocol of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
 
     The order of summation is fixed, so results are the same bits for any number of threads, and bands of rows put
-    together are the same bits as the whole view. Lists of views are kept until `max_list_bytes` are reached; of the
-    views beyond only the last is held. (Views come round in turn, and evicting the least recently used would then evict
-    each just before it is needed.)
+    together are the same bits as the whole view. Lists of views are kept until `max_list_bytes` are reached
+    (`KeptLists`).
 
     Args:
         scene: its geometry must not change while this object lives.
@@ -63,11 +59,7 @@ class CpuRasterizer:
         self.near = near
         self.alpha_max = alpha_max
         self.background: NDArray[np.float32] = np.asarray(background, dtype=np.float32)
-        self._max_list_bytes = max_list_bytes
-        self._lists: dict[CameraKey, RasterLists] = {}
-        self._latest: tuple[CameraKey, RasterLists] | None = None
-        self._kept_bytes = 0
-        self._lock = threading.Lock()
+        self._lists = KeptLists(lambda camera: build_raster_lists(scene, camera, near=near), max_list_bytes)
 
     def lists(self, camera: Camera) -> RasterLists:
         """The view's Gaussians by raster tile, kept or new.
@@ -75,20 +67,7 @@ class CpuRasterizer:
         Raises:
             TooManyIntersectionsError: see `build_raster_lists`.
         """
-        key = camera_key(camera)
-        with self._lock:
-            if key in self._lists:
-                return self._lists[key]
-            if self._latest is not None and self._latest[0] == key:
-                return self._latest[1]
-            self._latest = None  # free its memory before the next one is built
-            lists = build_raster_lists(self.scene, camera, near=self.near)
-            if self._kept_bytes + lists.nbytes <= self._max_list_bytes:
-                self._lists[key] = lists
-                self._kept_bytes += lists.nbytes
-            else:
-                self._latest = (key, lists)
-            return lists
+        return self._lists.of(camera)
 
     def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""

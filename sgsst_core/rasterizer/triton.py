@@ -17,13 +17,12 @@ from torch import Tensor
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.arguments import (
-    CameraKey,
     Rows,
-    camera_key,
     check_colours,
     check_image_gradient,
     check_rows,
 )
+from sgsst_core.rasterizer.kept_lists import KeptLists
 from sgsst_core.rasterizer.raster_lists import check_intersections, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -69,7 +68,7 @@ class TritonRasterizer:
 
     Colour gradients repeat to the bit on one machine: every pair of Gaussian and tile has a slot of its own, and slots
     are added in a fixed order. Bands of rows put together are the same bits as the whole view. Lists of views are kept
-    until `max_list_bytes` are reached; of the views beyond only the last is held.
+    until `max_list_bytes` are reached (`KeptLists`).
 
     Args:
         scene: its geometry must not change while this object lives.
@@ -109,10 +108,7 @@ class TritonRasterizer:
             tensor.to(self.device).float().contiguous()
             for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
         ]
-        self._max_list_bytes = max_list_bytes
-        self._kept: dict[CameraKey, DeviceLists] = {}
-        self._latest: tuple[CameraKey, DeviceLists] | None = None
-        self._kept_bytes = 0
+        self._lists = KeptLists(self._build, max_list_bytes)
 
     def lists(self, camera: Camera) -> DeviceLists:
         """The view's Gaussians by raster tile, kept or new.
@@ -120,19 +116,7 @@ class TritonRasterizer:
         Raises:
             TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address.
         """
-        key = camera_key(camera)
-        if key in self._kept:
-            return self._kept[key]
-        if self._latest is not None and self._latest[0] == key:
-            return self._latest[1]
-        self._latest = None  # free its memory before the next one is built
-        lists = self._build(camera)
-        if self._kept_bytes + lists.nbytes <= self._max_list_bytes:
-            self._kept[key] = lists
-            self._kept_bytes += lists.nbytes
-        else:
-            self._latest = (key, lists)
-        return lists
+        return self._lists.of(camera)
 
     def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
