@@ -11,7 +11,7 @@ import time
 
 from benchmarks.machine import write_result
 from benchmarks.pictures import picture
-from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 
@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=3361)
     arguments = parser.parse_args()
     size = (arguments.height, arguments.width)
-    network = FeatureNetwork(load_weights("auto"))
+    network = FeatureNetwork(load_network_weights("auto"))
     loss = SosLoss(network, memory=int(arguments.memory * 1e9))
     targets = loss.style_targets(picture("immunohistochemistry", *size), size)
     view = loss.view_target(picture("coffee", *size))

@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.block_method import block_gradient
 from benchmarks.machine import write_result
 from benchmarks.pictures import picture
-from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 
@@ -33,7 +33,7 @@ def main() -> None:
     size = arguments.size
     image, content = picture("astronaut", size, size), picture("coffee", size, size)
     style_image = picture("immunohistochemistry", size, size)
-    weights = load_weights("auto")
+    weights = load_network_weights("auto")
     methods: dict[str, Callable[[], Tensor]] = {}
 
     exact = FeatureNetwork(weights)

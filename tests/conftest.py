@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sgsst_core.errors import WeightsError
-from sgsst_core.features.network_weights import BackboneWeights, fetch_weights, load_weights
+from sgsst_core.features.network_weights import BackboneWeights, fetch_network_weights, load_network_weights
 from tests import networks
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -36,8 +36,8 @@ def one_thread() -> Iterator[None]:
 def vgg16_weights() -> BackboneWeights:
     """The real VGG16 from the user's cache folder, fetched into it once; a test that cannot get it fails."""
     try:
-        fetch_weights("vgg16")
-        return load_weights("vgg16")
+        fetch_network_weights("vgg16")
+        return load_network_weights("vgg16")
     except WeightsError as error:
         pytest.fail(f"the tests need VGG16: {error}")
 

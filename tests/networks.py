@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
-from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_weights
+from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_network_weights
 
 #: Channels of every layer.
 CHANNELS = 16
@@ -38,7 +38,7 @@ def install_tiny_weights(folder: Path) -> Path:
     for name, (weight, bias) in tiny_weights().convolutions.items():
         state |= {f"{name}.weight": weight.flip(1) if name == "conv1_1" else weight, f"{name}.bias": bias}
     torch.save(state, file)
-    fetch_weights("vgg16", source=file, folder=folder)
+    fetch_network_weights("vgg16", source=file, folder=folder)
     shutil.copy(cache_folder() / "lpips_alex.safetensors", folder)
     return folder
 

@@ -21,11 +21,12 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
+from worker.options import RunOptions
 from worker.prepare import Job, Warn
 from worker.request import Outputs
 
 #: Seconds between checkpoints, unless told otherwise: what a lost rank costs at most.
-CHECKPOINT_SECONDS = 60.0
+CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
 
 
 @dataclass(frozen=True)

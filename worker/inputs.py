@@ -14,7 +14,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError, SgsstError
-from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
@@ -148,8 +148,8 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
 
 def _same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
     """The feature network's weights: those that the first rank finds, on every rank."""
-    name = collectives.broadcast(lambda: load_weights(backbone).name)
-    return together(collectives, lambda: load_weights(name))
+    name = collectives.broadcast(lambda: load_network_weights(backbone).name)
+    return together(collectives, lambda: load_network_weights(name))
 
 
 def _same_fingerprint(own: str | None, collectives: Collectives) -> str:

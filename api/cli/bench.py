@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from sgsst_core.bench.error_time import Curve, Point, Variant, as_dict, choose_variants, error_time, write_plot
 from sgsst_core.bench.stability import Case, Measurement, all_cases, measure
 from sgsst_core.errors import OutputError, SettingsError
-from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
 from sgsst_core.files.json_files import write_json
@@ -58,7 +58,7 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
     check_choice(request.source)
     variants: list[Variant] = choose_variants(request.variants)
     check_folder(request.out)
-    weights = load_weights(request.backbone)
+    weights = load_network_weights(request.backbone)
     style = load_image(request.style)
     file, cameras = read_scene_and_cameras(request.source)
     ensure_writable_folder(request.out)

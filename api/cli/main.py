@@ -322,12 +322,12 @@ def demo(
 ) -> None:
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.cli.demo_scene import build_demo
-    from sgsst_core.features.network_weights import load_weights
+    from sgsst_core.features.network_weights import load_network_weights
     from worker.request import SceneRequest, StylizeRequest, check_folder
 
     check_folder(out)
     try:
-        load_weights("auto")
+        load_network_weights("auto")
     except WeightsError:
         fetch("vgg16")
     with _status("Building the scene"):
@@ -391,9 +391,9 @@ def bench_stability(
 @weights_app.command("list")
 def list_() -> None:
     """Show which weights are installed, and where the others come from."""
-    from sgsst_core.features.network_weights import list_weights
+    from sgsst_core.features.network_weights import list_network_weights
 
-    for entry in list_weights():
+    for entry in list_network_weights():
         state = f"installed   {entry.path}" if entry.path else f"to download from {entry.source}"
         out_console.print(f"{entry.name:<12}{entry.size / 1e6:>6.0f} MB  {state}")
 
@@ -406,12 +406,12 @@ def fetch(
     ] = None,
 ) -> None:
     """Download weights, convert them, and keep them in the cache folder; does nothing where they are installed."""
-    from sgsst_core.features.network_weights import fetch_weights
+    from sgsst_core.features.network_weights import fetch_network_weights
 
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with live_bar(error_console, *columns) as bar:
         task = bar.add_task(name, total=None)
-        path = fetch_weights(
+        path = fetch_network_weights(
             name, source=from_, progress=lambda done, total: bar.update(task, completed=done, total=total or None)
         )
     out_console.print(f"{name}: {path}")

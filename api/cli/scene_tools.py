@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sgsst_core.errors import OutputError
-from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
@@ -52,7 +52,7 @@ def make_plan(
         raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
     check_folder(out.parent)
     file, cameras = read_scene_and_cameras(source)
-    weights = load_weights(backbone)
+    weights = load_network_weights(backbone)
     load_image(style)  # a style that cannot be used is told before the work, too
     plan, _ = planner.make_plan(file.scene, cameras, settings, weights=weights, measured=True, show=show_planning)
     out.parent.mkdir(parents=True, exist_ok=True)

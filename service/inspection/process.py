@@ -25,7 +25,7 @@ from service.files.staging import Staged
 from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
-from sgsst_core.features.network_weights import list_weights, load_weights
+from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene
 from sgsst_core.files.ply_header import element_offsets, read_header
@@ -104,7 +104,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`."""
     found, scene, cameras = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
-    weights = load_weights(request.backbone)
+    weights = load_network_weights(request.backbone)
     made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True)
     seconds = memory = None
     if made.prediction:
@@ -135,7 +135,7 @@ class _ErrorsOf:
 
 
 def _check_network_weights(backbone: str) -> None:
-    installed = [entry.name for entry in list_weights() if entry.path]
+    installed = [entry.name for entry in list_network_weights() if entry.path]
     wanted = [name for name in ("vgg19", "vgg16") if backbone in ("auto", name)]
     if not any(name in installed for name in wanted):
         raise WeightsError(f"The service has no weights of {' or '.join(wanted)}: its operator has to fetch them.")

@@ -54,7 +54,7 @@ class BackboneWeights:
 
 @dataclass(frozen=True)
 class WeightsEntry:
-    """One line of `list_weights`.
+    """One line of `list_network_weights`.
 
     Attributes:
         name: "vgg19", "vgg16", "lpips_alex" or "lpips_vgg16".
@@ -80,7 +80,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sgsst"
 
 
-def load_weights(name: str = "auto", folder: Path | None = None) -> BackboneWeights:
+def load_network_weights(name: str = "auto", folder: Path | None = None) -> BackboneWeights:
     """Load a backbone from the cache folder and verify it.
 
     Args:
@@ -120,18 +120,18 @@ def load_perceptual(name: str = "alex", folder: Path | None = None) -> dict[str,
     Args:
         name: "alex": "conv1.weight" [64, 3, 11, 11] .. "conv5.bias", "input_scale", "input_shift" (as for
             `BackboneWeights`) and the heads "linear1.weight" [64] .. "linear5.weight" [256];
-            "vgg16": the heads alone; the features are `load_weights("vgg16")`'s, whose factor kappa
+            "vgg16": the heads alone; the features are `load_network_weights("vgg16")`'s, whose factor kappa
             falls out when LPIPS normalises them to unit length.
 
     Raises:
-        WeightsError: as `load_weights`.
+        WeightsError: as `load_network_weights`.
     """
     if name not in ("alex", "vgg16"):
         raise WeightsError(f"no perceptual network is called {name!r}: use alex or vgg16.")
     return _read(folder or cache_folder(), f"lpips_{name}")[0]
 
 
-def fetch_weights(
+def fetch_network_weights(
     name: str,
     *,
     source: Path | None = None,
@@ -172,8 +172,8 @@ def fetch_weights(
     return target
 
 
-def list_weights(folder: Path | None = None) -> list[WeightsEntry]:
-    """All sets of weights, installed or not. Looks at files' headers only; `load_weights` verifies."""
+def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
+    """All sets of weights, installed or not. Looks at files' headers only; `load_network_weights` verifies."""
     folder = folder or cache_folder()
     entries = []
     for name, fetched_with in _FETCHED_WITH.items():

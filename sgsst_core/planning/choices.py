@@ -23,11 +23,11 @@ def optimised_gaussians(looked: Survey, settings: Settings) -> Tensor:
     Raises:
         SettingsError: pruning would leave none.
     """
-    optimised = looked.total_weights > settings.prune_weight
+    optimised = looked.total_blend_weights > settings.prune_weight
     if not optimised.any():
         raise SettingsError(
             f"--prune-weight {settings.prune_weight:g} would leave out every Gaussian: the largest total blend weight "
-            f"is {float(looked.total_weights.max()):.3g}. Give a smaller one."
+            f"is {float(looked.total_blend_weights.max()):.3g}. Give a smaller one."
         )
     return optimised
 
@@ -40,7 +40,7 @@ def rendered_gaussians(optimised: Tensor, settings: Settings) -> Tensor:
 
 def pruned_gaussians(looked: Survey, seen: Tensor) -> Tensor:
     """[N] bool, Gaussians that a view shows and that are not rendered all the same."""
-    return ~seen & (looked.total_weights > 0)
+    return ~seen & (looked.total_blend_weights > 0)
 
 
 def precision_of(ratio: float | None) -> Precision:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sgsst_core.errors import CameraError
-from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan
@@ -51,7 +51,7 @@ def make_plan(
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
     fitted = fit_cameras(cameras, settings)
-    workshop = equip(scene, fitted, settings, weights or load_weights("auto"), collectives, rasterizer)
+    workshop = equip(scene, fitted, settings, weights or load_network_weights("auto"), collectives, rasterizer)
     if looked is None:
         looked = survey(scene, fitted, workshop.rasterizer, collectives, show)
     link = probe_link(collectives, workshop.network.device)

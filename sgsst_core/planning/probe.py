@@ -232,7 +232,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     """
     scene, cameras, settings = workshop.scene, workshop.cameras, workshop.settings
     seen = rendered_gaussians(optimised_gaussians(looked, settings), settings)
-    distinct = distinct_views(scene, cameras, looked.covered, looked.total_weights, settings.similar_views)
+    distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
     network = _network_facts(workshop)
     budget = int(workshop.machine.memory * MEMORY_SHARES["rasterizer"])
     raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)

@@ -43,13 +43,13 @@ class Survey:
     """What the views show.
 
     Attributes:
-        total_weights: [N] float64, sum of each Gaussian's blend weights over all pixels of all views.
+        total_blend_weights: [N] float64, sum of each Gaussian's blend weights over all pixels of all views.
         covered: indices of the views that see anything.
         regions: for each view, the rectangle that holds every covered pixel.
         uncovered_share: share of uncovered pixels in the views that see anything.
     """
 
-    total_weights: Tensor
+    total_blend_weights: Tensor
     covered: list[int]
     regions: list[Rectangle]
     uncovered_share: float

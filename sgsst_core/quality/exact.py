@@ -29,7 +29,7 @@ def approximations(stylizer: Stylizer) -> list[str]:
     found = []
     if stylizer.network.dtype != torch.float32:
         found.append("bfloat16 features")
-    if bool((stylizer.plan.survey.total_weights[~stylizer.plan.seen] > 0).any()):
+    if bool((stylizer.plan.survey.total_blend_weights[~stylizer.plan.seen] > 0).any()):
         found.append("pruned Gaussians")
     if stylizer.plan.kept_weights == "half" and stylizer.views.rasterizer.name == "cached":
         found.append("half-precision blend weights")
@@ -79,7 +79,7 @@ class ExactTwin:
             memory=stylizer.loss.memory,
             coarsest=settings.coarsest_side,
         )
-        self.shown = stylizer.plan.survey.total_weights > 0
+        self.shown = stylizer.plan.survey.total_blend_weights > 0
         scene = stylizer.scene.subset(self.shown).without_zero_bands()
         name = own if (own := stylizer.views.rasterizer.name) in GPU_RASTERIZERS else "cpu"
         self.views = Views(

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError, WeightsError
-from sgsst_core.features.network_weights import list_weights, load_perceptual, load_weights
+from sgsst_core.features.network_weights import list_network_weights, load_network_weights, load_perceptual
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 
 LpipsNetwork = Literal["alex", "vgg16"]
@@ -118,7 +118,7 @@ def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None =
     Raises:
         WeightsError: the weights are installed, but corrupt.
     """
-    installed = any(entry.name == "lpips_alex" and entry.path for entry in list_weights(folder))
+    installed = any(entry.name == "lpips_alex" and entry.path for entry in list_network_weights(folder))
     return Lpips(device=device, folder=folder) if installed else None
 
 
@@ -149,7 +149,7 @@ def _vgg16(
     heads: list[Tensor], folder: Path | None, dtype: torch.dtype, device: torch.device
 ) -> Callable[[Tensor], list[Tensor]]:
     """VGG16's last ReLU of each block [h, w, c] as a function of pixels [H, W, 3]."""
-    network = FeatureNetwork(load_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
+    network = FeatureNetwork(load_network_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
     if [network.channels(layer) for layer in _VGG16_LAYERS] != [len(head) for head in heads]:
         raise WeightsError(
             "LPIPS weighs the channels of the published VGG16, and the installed one has others: measure with alex."

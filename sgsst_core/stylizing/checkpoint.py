@@ -261,14 +261,14 @@ def _state(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Styliz
 def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """A plan's tensors, and the rest for JSON."""
     tensors = {
-        "plan.total_weights": plan.survey.total_weights,
+        "plan.total_weights": plan.survey.total_blend_weights,
         "plan.optimised": plan.optimised,
         "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not take twice
     }
     nothing = torch.empty(0)  # `asdict` would copy them
-    survey = replace(plan.survey, total_weights=nothing)
+    survey = replace(plan.survey, total_blend_weights=nothing)
     values = asdict(replace(plan, survey=survey, optimised=nothing, seen=nothing))
-    del values["optimised"], values["seen"], values["survey"]["total_weights"]
+    del values["optimised"], values["seen"], values["survey"]["total_blend_weights"]
     return tensors, values
 
 
@@ -301,7 +301,7 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     covered = tuple(values.pop("covered"))
     expected = values.pop("prediction")
     return Plan(
-        survey=Survey(total_weights=tensors["plan.total_weights"], regions=regions, **looked),
+        survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **looked),
         optimised=tensors["plan.optimised"],
         seen=tensors["plan.seen"],
         covered=covered,

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.errors import DivergedError
-from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.plan import Plan
@@ -113,7 +113,7 @@ class Stylizer:
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         start = seen.sh_dc
         if settings.warm_start:
-            start = warm_start(start, plan.survey.total_weights[plan.seen], style)
+            start = warm_start(start, plan.survey.total_blend_weights[plan.seen], style)
         self.sh_dc = start.clone().to(rasterizer.device).requires_grad_()
         self._adam = torch.optim.Adam([self.sh_dc], lr=settings.learning_rate, eps=ADAM_EPS)
         self._generator = torch.Generator().manual_seed(settings.seed)
@@ -138,7 +138,7 @@ class Stylizer:
         collectives: Collectives = ALONE,
     ) -> Self:
         """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised."""
-        weights = weights or load_weights("auto")
+        weights = weights or load_network_weights("auto")
         plan, workshop = make_plan(
             scene, cameras, settings, weights=weights, rasterizer=rasterizer, collectives=collectives
         )
@@ -378,7 +378,7 @@ class Stylizer:
         result = self.scene.sh_dc.clone()
         result[self.plan.seen] = self.sh_dc.detach().cpu()
         if self.settings.unseen == "neighbours":
-            weights = torch.where(self.plan.optimised, self.plan.survey.total_weights, 0.0)
+            weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
             result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
         return result
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sgsst_core.errors import RanksFailedError
+from worker.options import RunOptions
 from worker.ranks.cluster import Cluster
 from worker.ranks.ending import end_rank, end_ranks
 from worker.ranks.failure_policy import FailedAttempt, Failure, GiveUp, RaiseError, decide, first_line
@@ -45,8 +46,8 @@ class WorkerOptions:
         actor: what runs a rank.
     """
 
-    rank_timeout: float = 120.0
-    checkpoint_seconds: float = 60.0
+    rank_timeout: float = RunOptions().rank_timeout
+    checkpoint_seconds: float = RunOptions().checkpoint_seconds
     preview_folder: Path | None = None
     preview_seconds: float = 20.0
     actor: type[RankProcess] = RankProcess

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import NEAR
-from sgsst_core.features.network_weights import BackboneWeights, load_weights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult, resize_area
 from sgsst_core.loss.sos_reference import sos_reference
@@ -201,7 +201,7 @@ def vgg16() -> BackboneWeights:
     Raises:
         WeightsError: it is not installed.
     """
-    return load_weights("vgg16")
+    return load_network_weights("vgg16")
 
 
 class DecisionsOf(FeatureNetwork):

@@ -112,7 +112,7 @@ def _weights(full: bool) -> CaseResult:
     faint = math.log(1.1 * ALPHA_MIN / (1 - 1.1 * ALPHA_MIN))
     scene = _walls((2.0, 5), (3.0, 1), (faint, 5), (2.0, 5), (1.0, 5), (faint, 8))
     stylizer = _stylizer(scene, 2000 if full else 200, learning_rate=0.05)
-    total = stylizer.plan.survey.total_weights[stylizer.plan.seen]
+    total = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
     run(stylizer)
     hardly, well = total < HARDLY_SEEN, total > 1
     if float(total.min()) < ALPHA_MIN * TRANSMITTANCE_MIN:

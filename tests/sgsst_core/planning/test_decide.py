@@ -329,7 +329,7 @@ def test_the_same_probe_gives_the_same_plan() -> None:
     for field in dataclasses.fields(Plan):
         values = [getattr(plan, field.name) for plan in (one, other)]
         if field.name == "survey":
-            assert torch.equal(*(survey.total_weights for survey in values))
+            assert torch.equal(*(survey.total_blend_weights for survey in values))
         elif isinstance(values[0], torch.Tensor):
             assert torch.equal(*values)
         else:

@@ -91,7 +91,7 @@ def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: Backbon
 def test_pruning_stays_within_its_bound_and_is_made_up_for(tiny_weights: BackboneWeights) -> None:
     scene, views = behind(ball(600)), cameras(3)
     whole = make(scene, views, tiny_weights)
-    threshold = float(whole.plan.survey.total_weights.quantile(0.5))
+    threshold = float(whole.plan.survey.total_blend_weights.quantile(0.5))
     pruned = make(scene, views, tiny_weights, prune_weight=threshold)
     left_out = ~pruned.plan.seen
     assert 0.4 < float(left_out.double().mean()) < 0.6
@@ -172,7 +172,7 @@ def test_survey_finds_weights_regions_and_blind_views() -> None:
     found = survey(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
     assert found.covered == [0, 1]
     expected = sum(rasterizer.coverage(camera).double().sum() for camera in views)
-    assert float(found.total_weights.sum()) == pytest.approx(float(expected), rel=1e-5)
+    assert float(found.total_blend_weights.sum()) == pytest.approx(float(expected), rel=1e-5)
     coverage = rasterizer.coverage(views[0])
     outside = coverage.clone()
     outside[found.regions[0].slices] = 0

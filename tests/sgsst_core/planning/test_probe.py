@@ -58,9 +58,9 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
 def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     looked = survey(scene, cameras(3), make_rasterizer("cpu", scene))
-    threshold = float(looked.total_weights.quantile(0.5))
+    threshold = float(looked.total_blend_weights.quantile(0.5))
     probe = measure(equipped(tiny_weights, scene, prune_weight=threshold), looked, FREE)
-    left_out = looked.total_weights <= threshold
+    left_out = looked.total_blend_weights <= threshold
     assert probe.pruned_error == pruned_image_error(left_out, cameras(3), [0, 1, 2], make_rasterizer("cpu", scene))
 
 

@@ -48,7 +48,7 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
 
 
 def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: BackboneWeights) -> None:
-    weights = make(tiny_weights).plan.survey.total_weights
+    weights = make(tiny_weights).plan.survey.total_blend_weights
     errors = []
     for share in (0.2, 0.7):
         stylizer = make(tiny_weights, prune_weight=float(weights.quantile(share)))

@@ -11,7 +11,7 @@ import torch
 import torch.multiprocessing as multiprocessing
 from torch import Tensor
 
-from sgsst_core.features.network_weights import load_weights
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -28,7 +28,7 @@ def gradient(collectives: Collectives, name: str) -> Tensor:
     scene = wall(sh_degree=1) if name == "wall" else ball()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, keep=("ranks",))
     stylizer = Stylizer.planned(
-        scene, cameras(1, 320, 240), style(), settings, weights=load_weights("vgg16"), collectives=collectives
+        scene, cameras(1, 320, 240), style(), settings, weights=load_network_weights("vgg16"), collectives=collectives
     )
     return stylizer.gradient(0, range(stylizer.scale_count(0)))[0]
 
