@@ -112,7 +112,9 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
         last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
         assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
-        steps = [data["step"] for _, kind, data in seen if kind == "progress"]
+        told = [data for _, kind, data in seen if kind == "progress"]
+        steps = [data["step"] for data in told if data["stage"] != "planning"]  # those of planning are views
+        assert all(0 <= data["step"] <= data["total"] == 3 for data in told if data["stage"] == "planning")
         assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
         assert steps == sorted(steps)
         assert steps[-1] == STEPS
