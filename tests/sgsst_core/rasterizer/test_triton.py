@@ -40,6 +40,7 @@ from tests.small_scenes import cameras, style, wall
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 BACKGROUND = (1.0, 0.25, 0.5)
 #: Float32 moves a decision only within this relative distance of its cut.
 CLOSE = 2e-5
