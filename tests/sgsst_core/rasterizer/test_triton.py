@@ -206,7 +206,6 @@ def test_without_a_gpu_the_error_says_what_to_do() -> None:
     assert "set TRITON_INTERPRET=1" in ended.stderr
 
 
-@pytest.mark.slow
 def test_kernels_compile_for_real_targets_within_their_registers() -> None:
     """Spilled registers cost memory traffic in the innermost loop: none on NVIDIA, few on AMD."""
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
