@@ -1,0 +1,266 @@
+"""Tensors that say "cuda:0", compute on the CPU, and count what a GPU would have been asked for.
+
+Every operation of PyTorch on such a tensor passes through `dispatch`, which refuses to mix devices as CUDA does, and
+counts kernels, waits of the host and copies. What an operation launches is counted from its name: one kernel, but for
+those in `_KERNELS`, and none where it only makes a view or reserves memory. Libraries may launch a few more.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from tests.pretend_cuda.counts import Counts, calling_line
+
+DEVICE = torch.device("cuda", 0)
+#: Of this process.
+counts = Counts()
+#: Told of every operation while a graph is captured: it, its arguments and its result, all with the CPU's tensors.
+recorders: list[Callable[[Any, Any, Any, Any], None]] = []
+
+#: Operations without a kernel: they make a view, or reserve memory, or only ask.
+_NO_KERNEL = {
+    "view", "_unsafe_view", "_reshape_alias", "permute", "transpose", "t", "slice", "select", "unsqueeze", "squeeze",
+    "expand", "alias", "detach", "split", "split_with_sizes", "unbind", "as_strided", "diagonal", "lift_fresh", "unfold",
+    "empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided", "_local_scalar_dense", "is_same_size",
+    "record_stream", "is_pinned", "view_as_real", "sym_size", "sym_stride", "narrow",
+}  # fmt: skip
+#: Kernels of operations that launch several: a bias is added by itself, sorts take several passes.
+_KERNELS = {"sort": 6, "topk": 4, "nonzero": 3, "cumsum": 2, "cat": 1}
+#: Operations after which the host waits for the device, because the size or the value of their result is asked for.
+_WAITS = {
+    "_local_scalar_dense", "nonzero", "masked_select", "equal", "unique_consecutive", "_unique2", "unique_dim",
+    "bincount", "repeat_interleave", "is_nonzero", "linalg_lstsq", "histc",
+}  # fmt: skip
+#: Operations that take tensors of the CPU beside the device's.
+_MIXED = {"copy_", "_to_copy", "index", "index_put_", "index_put", "_index_put_impl_", "_pin_memory"}
+
+
+class PretendTensor(Tensor):
+    """A tensor on the pretend device: `inner`, on the CPU, holds its values."""
+
+    inner: Tensor
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    @staticmethod
+    def __new__(cls, inner: Tensor) -> PretendTensor:
+        wrapped = Tensor._make_wrapper_subclass(
+            cls,
+            inner.size(),
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            device=DEVICE,
+        )
+        wrapped.inner = inner
+        return wrapped
+
+    def __repr__(self, *_: Any, **__: Any) -> str:  # type: ignore[override]
+        return f"PretendTensor({self.inner})"
+
+    def numpy(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() first.")
+
+    __array__ = numpy
+
+    def tolist(self) -> Any:
+        return self.cpu().tolist()
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return dispatch(func, args, kwargs or {})
+
+
+def inner(value: Any) -> Any:
+    """The CPU's tensor in place of the device's; anything else as it is."""
+    return value.inner if isinstance(value, PretendTensor) else value
+
+
+def wait(line: str | None = None) -> None:
+    """Count a wait of the host for the device."""
+    if recorders:
+        raise RuntimeError("operation not permitted when stream is capturing: the host waits for the device")
+    counts.waits[line or calling_line()] += 1
+
+
+def launch(kernels: int = 1) -> None:
+    """Count kernels."""
+    counts.launches[calling_line()] += kernels
+
+
+def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """One operation of PyTorch, computed on the CPU and counted as CUDA would do it."""
+    name = func._schema.name.removeprefix("aten::")
+    leaves = tree_leaves((args, kwargs))
+    on_device = [leaf for leaf in leaves if isinstance(leaf, PretendTensor)]
+    asked = kwargs.get("device")
+    if asked is not None:
+        to_device = torch.device(asked).type == "cuda"
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    else:
+        to_device = bool(on_device)
+    if on_device:
+        _refuse_mixed(func, name, args, leaves)
+    if on_device or to_device:
+        _count(name, func, args, kwargs, to_device)
+    values, named = tree_map(inner, args), tree_map(inner, kwargs)
+    if name == "_to_copy" and named.get("non_blocking"):
+        named = {**named, "non_blocking": False}
+    result = func(*values, **named)
+    if recorders and (on_device or to_device):
+        for record in recorders:
+            record(func, values, named, result)
+    return _wrapped(func, result, leaves) if to_device else result
+
+
+def _wrapped(func: Any, result: Any, leaves: list[Any]) -> Any:
+    """The result on the device: an argument that was changed in place is the very same object."""
+    changed = {id(leaf.inner): leaf for leaf in leaves if isinstance(leaf, PretendTensor)}
+
+    def wrap(value: Any) -> Any:
+        if not isinstance(value, Tensor) or isinstance(value, PretendTensor):
+            return value
+        if func._schema.is_mutable and id(value) in changed:
+            before = changed[id(value)]
+            if before.shape != value.shape or before.stride() != value.stride():
+                raise NotImplementedError(f"the pretend device does not change a tensor's shape in place: {func}")
+            return before
+        return PretendTensor(value)
+
+    return tree_map(wrap, result)
+
+
+def _refuse_mixed(func: Any, name: str, args: Any, leaves: list[Any]) -> None:
+    host = [leaf for leaf in leaves if isinstance(leaf, Tensor) and not isinstance(leaf, PretendTensor)]
+    if name.startswith("index") and not isinstance(args[0], PretendTensor):
+        raise RuntimeError("indices should be either on cpu or on the same device as the indexed tensor (cpu)")
+    if name in _MIXED or func._schema.name.startswith("c10d::"):
+        return
+    if any(tensor.dim() for tensor in host):
+        shape = tuple(next(tensor for tensor in host if tensor.dim()).shape)
+        raise RuntimeError(
+            f"Expected all tensors to be on the same device, but found at least two devices, cuda:0 and cpu! ({func}, "
+            f"the CPU's has shape {shape})"
+        )
+
+
+def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: bool) -> None:
+    if name in _WAITS:
+        wait()
+    if name in ("index", "index_put_", "index_put", "_index_put_impl_"):
+        for index in args[1]:
+            if isinstance(index, PretendTensor) and index.dtype == torch.bool:
+                wait()  # how many are true
+            elif isinstance(index, Tensor) and not isinstance(index, PretendTensor):
+                _count_copy(index, waits=True)
+    if name == "_to_copy" and isinstance(args[0], PretendTensor) != to_device:
+        _count_copy(args[0], waits=not (kwargs.get("non_blocking") and _is_pinned(args[0])))
+    elif name == "copy_" and isinstance(args[0], PretendTensor) != isinstance(args[1], PretendTensor):
+        asynchronous = (args[2:3] or (kwargs.get("non_blocking"),))[0]
+        host = args[1] if isinstance(args[0], PretendTensor) else args[0]
+        _count_copy(args[1], waits=not (asynchronous and _is_pinned(host)))
+    elif name not in _NO_KERNEL and not func._schema.name.startswith("c10d::"):
+        kernels = _KERNELS.get(name, 1)
+        launch(kernels + (name == "convolution" and args[2] is not None))
+
+
+def _count_copy(source: Tensor, *, waits: bool) -> None:
+    """A copy between host and device. Of memory that is not pinned it holds the host up, whatever was asked for."""
+    counts.copies[calling_line()] += source.numel() * source.element_size()
+    if waits and not (source.dim() == 0 and not isinstance(source, PretendTensor)):
+        wait()
+
+
+def _is_pinned(tensor: Tensor) -> bool:
+    return isinstance(tensor, PretendTensor) or getattr(tensor, "pretend_pinned", False)
+
+
+class _Factories(TorchDispatchMode):
+    """Sends what makes new tensors on the device to `dispatch` too."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return dispatch(func, args, kwargs or {})
+
+
+class _Moves(TorchFunctionMode):
+    """What PyTorch cannot send to a device for which it was not built, before it gets that far."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func is Tensor.to:
+            return _to(*args, **kwargs)
+        if func is Tensor.cuda:
+            return _to(args[0], DEVICE)
+        if func is Tensor.cpu:
+            return _to(args[0], "cpu")
+        if func in (torch.tensor, torch.as_tensor) and _is_cuda(kwargs.get("device")):
+            return _to(func(*args, **{**kwargs, "device": "cpu"}), DEVICE)
+        if func is torch.as_tensor and args and isinstance(args[0], PretendTensor) and kwargs.get("device") is None:
+            return args[0].to(kwargs.get("dtype", args[0].dtype))
+        if func is Tensor.pin_memory:
+            pinned = args[0].clone()
+            pinned.pretend_pinned = True
+            return pinned
+        if func is Tensor.is_pinned:
+            return _is_pinned(args[0])
+        if func is Tensor.record_stream:
+            return None
+        return func(*args, **kwargs)
+
+
+def _is_cuda(device: Any) -> bool:
+    return device is not None and torch.device(device).type == "cuda"
+
+
+def _to(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    """`Tensor.to`, whose device may be the pretend one."""
+    copy = kwargs.pop("copy", False)
+    device, dtype, non_blocking, memory_format = torch._C._nn._parse_to(*args, **kwargs)
+    device = tensor.device if device is None else device
+    dtype = dtype or tensor.dtype
+    if device.type == tensor.device.type and dtype == tensor.dtype and not copy and memory_format is None:
+        return tensor
+    options: dict[str, Any] = {"dtype": dtype, "device": device, "non_blocking": non_blocking}
+    if memory_format is not None:
+        options["memory_format"] = memory_format
+    return dispatch(torch.ops.aten._to_copy.default, (tensor,), options)
+
+
+@contextmanager
+def modes() -> Iterator[None]:
+    """Within the block, and in threads that begin in it, tensors may be made on the pretend device."""
+    _let_tensors_be_on_cuda()
+    run = threading.Thread.run
+
+    def in_modes(thread: threading.Thread) -> None:
+        with _Factories(), _Moves():
+            run(thread)
+
+    threading.Thread.run = in_modes  # type: ignore[method-assign]
+    try:
+        with _Factories(), _Moves():
+            yield
+    finally:
+        threading.Thread.run = run  # type: ignore[method-assign]
+
+
+def _let_tensors_be_on_cuda() -> None:
+    """Give PyTorch a guard of CUDA devices where it was built without: that of the CPU, which does nothing.
+
+    Indexing and a few more operations ask for one before they get as far as `dispatch`. A guard is a pointer in a table
+    by kind of device (c10/core/impl/DeviceGuardImplInterface.h), for CUDA the second one.
+    """
+    library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / "libc10.so"))
+    guards = (ctypes.c_void_p * 2).in_dll(library, "_ZN3c104impl26device_guard_impl_registryE")
+    if not guards[1]:
+        guards[1] = guards[0]

@@ -1,0 +1,147 @@
+"""`torch.cuda` and Triton's launches for the pretend device: events, streams, memory, graphs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any
+from unittest import mock
+
+import torch
+from torch.utils._pytree import tree_leaves
+
+from tests.pretend_cuda import device
+from tests.pretend_cuda.counts import Counts
+
+#: Bytes of the pretend device's memory.
+MEMORY = 140 << 30
+
+
+class Stream:
+    """All streams are one: what is asked for is done at once."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.device = device.DEVICE
+
+    def wait_event(self, event: Event) -> None:
+        """Nothing is left to wait for."""
+
+    def wait_stream(self, stream: Stream) -> None:
+        """Likewise."""
+
+    def record_event(self, event: Event | None = None) -> Event:
+        """An event at this moment."""
+        event = event or Event()
+        event.record(self)
+        return event
+
+    def synchronize(self) -> None:
+        """The host waits."""
+        device.wait()
+
+    def query(self) -> bool:
+        """Whether all is done."""
+        return True
+
+
+class Event:
+    """A moment on the host's clock."""
+
+    def __init__(self, enable_timing: bool = False, blocking: bool = False, **_: Any) -> None:
+        self._timed = enable_timing
+        self._moment: float | None = None
+        self.read = False
+
+    def record(self, stream: Stream | None = None) -> None:
+        """Now."""
+        self._moment = time.perf_counter()
+
+    def wait(self, stream: Stream | None = None) -> None:
+        """The stream waits, not the host."""
+
+    def query(self) -> bool:
+        """Whether it has come."""
+        return self._moment is not None
+
+    def synchronize(self) -> None:
+        """The host waits."""
+        device.wait()
+
+    def elapsed_time(self, end: Event) -> float:
+        """Milliseconds; both events must have been recorded, with timing."""
+        if not (self._timed and end._timed):
+            raise ValueError("Both events must be created with argument 'enable_timing=True'.")
+        if self._moment is None or end._moment is None:
+            raise RuntimeError("Both events must be recorded before calculating elapsed time.")
+        return 1e3 * (end._moment - self._moment)
+
+
+def _set_device(to: Any) -> None:
+    """As `torch.cuda.set_device`: it takes a number or a device with one."""
+    torch.cuda._utils._get_device_index(to)
+
+
+def _count_launch(original: Any) -> Any:
+    def call(executor: Any, *args: Any, **kwargs: Any) -> Any:
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        if any(isinstance(tensor, device.PretendTensor) for tensor in tensors):
+            if not all(isinstance(tensor, device.PretendTensor) for tensor in tensors):
+                raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
+            device.launch()
+        values, named = [device.inner(arg) for arg in args], {name: device.inner(arg) for name, arg in kwargs.items()}
+        with _plainly():
+            result = original(executor, *values, **named)
+        for record in device.recorders:
+            record(lambda *a, **k: original(executor, *a, **k), values, named, None)
+        return result
+
+    return call
+
+
+@contextmanager
+def _plainly() -> Iterator[None]:
+    """Without the device's modes: what the interpreter computes with is its own."""
+    with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
+        yield
+
+
+@contextmanager
+def pretend_cuda() -> Iterator[Counts]:
+    """Within the block there is a CUDA device; what it is asked for is counted from nothing."""
+    from triton.runtime.interpreter import GridExecutor
+
+    properties = mock.Mock(total_memory=MEMORY, multi_processor_count=132, L2_cache_size=50 << 20, name="pretend")
+    one = Stream()
+    instead: dict[str, Any] = {
+        "_lazy_init": lambda: None,
+        "is_available": lambda: True,
+        "is_initialized": lambda: True,
+        "device_count": lambda: 1,
+        "current_device": lambda: 0,
+        "set_device": _set_device,
+        "synchronize": lambda *_: device.wait(),
+        "get_device_name": lambda *_: "pretend",
+        "get_device_properties": lambda *_: properties,
+        "get_device_capability": lambda *_: (9, 0),
+        "is_bf16_supported": lambda *_, **__: True,
+        "mem_get_info": lambda *_: (int(0.98 * MEMORY), MEMORY),
+        "memory_allocated": lambda *_: 0,
+        "max_memory_allocated": lambda *_: 0,
+        "reset_peak_memory_stats": lambda *_: None,
+        "empty_cache": lambda: None,
+        "current_stream": lambda *_: one,
+        "default_stream": lambda *_: one,
+        "stream": lambda *_: nullcontext(),
+        "device": lambda *_: nullcontext(),
+        "is_current_stream_capturing": lambda: bool(device.recorders),
+        "Stream": Stream,
+        "Event": Event,
+    }
+    device.counts.clear()
+    with (
+        mock.patch.multiple(torch.cuda, **instead),
+        mock.patch.object(GridExecutor, "__call__", _count_launch(GridExecutor.__call__)),
+        device.modes(),
+    ):
+        yield device.counts
