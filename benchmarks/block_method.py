@@ -16,7 +16,7 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import layer_statistics, merge_all
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import ScaleTarget
-from sgsst_core.loss.terms import content_loss, style_loss
+from sgsst_core.loss.terms import ContentDifference, style_loss
 from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count
 
 BLOCK = 512
@@ -59,7 +59,7 @@ def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: 
         for layer in STYLE_LAYERS:
             parts[layer].append(layer_statistics(features[layer][tile.owned_cells(layer, size)[1].slices]))
     maps = {layer: style_loss(merge_all(parts[layer]), style[layer])[1] for layer in STYLE_LAYERS}
-    cells = (size[0] // 8) * (size[1] // 8)
+    cells = torch.tensor(float((size[0] // 8) * (size[1] // 8)), dtype=torch.float64)
     result = torch.zeros_like(image)
     for tile in tiles:
         wanted = network.forward(content[tile.outer.slices], keep=False).features[CONTENT_LAYER]  # content forward
@@ -67,7 +67,7 @@ def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: 
 
         def pull(layer: str, features: Tensor, so_far: Tensor, wanted: Tensor = wanted) -> None:
             if layer == CONTENT_LAYER:
-                so_far += content_loss(features, wanted, cells, 1.0)[1]
+                so_far += ContentDifference.of(features, wanted, cells, 1.0).gradient()
             else:
                 maps[layer].add_to(so_far, features)
 

@@ -47,29 +47,35 @@ class LayerStatistics:
 
     @property
     def empty(self) -> bool:
-        """True when no position has any weight, so that mean and Gram matrix do not exist."""
+        """True when no position has any weight, so that mean and Gram matrix do not exist. Waits for the device."""
         return not float(self.count) > 0
 
+    @property
+    def divisor(self) -> Tensor:
+        """The count, or 1 where there is none: nothing divided by it is nothing, not NaN."""
+        return torch.where(self.count > 0, self.count, 1.0)
+
     def gram(self) -> Tensor:
-        """G = F^T F / n, [c, c]."""
-        return self.centred / self.count + torch.outer(self.mean, self.mean)
+        """G = F^T F / n, [c, c]; zeros where there is no position."""
+        return self.centred / self.divisor + torch.outer(self.mean, self.mean)
 
     def std(self) -> Tensor:
-        """Population standard deviation, [c]."""
+        """Population standard deviation, [c]; zeros where there is no position."""
         # Rounding of the merge may leave -1e-30 where the exact value is 0.
-        return (self.centred.diagonal().clamp_min(0) / self.count).sqrt()
+        return (self.centred.diagonal().clamp_min(0) / self.divisor).sqrt()
 
 
 def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
-    """Statistics of two disjoint sets of positions together (Chan et al. 1979)."""
-    if first.empty:
-        return second
-    if second.empty:
-        return first
+    """Statistics of two disjoint sets of positions together (Chan et al. 1979).
+
+    A set without positions, all of whose numbers are 0, adds nothing: no question of it, for which a device would have
+    to be waited for, is needed.
+    """
     count = first.count + second.count
+    share = second.count / torch.where(count > 0, count, 1.0)
     delta = second.mean - first.mean
-    mean = first.mean + delta * (second.count / count)
-    centred = first.centred + second.centred + torch.outer(delta, delta) * (first.count * (second.count / count))
+    mean = first.mean + delta * share
+    centred = first.centred + second.centred + torch.outer(delta, delta) * (first.count * share)
     return LayerStatistics(count, mean, centred)
 
 
@@ -118,10 +124,10 @@ class _ShiftedSums:
         self.second += weighted.T @ centred
 
     def statistics(self, shift: Tensor) -> LayerStatistics:
-        if not float(self.count) > 0:
-            return LayerStatistics.zero(self.first.shape[0], self.first.device)
-        offset = self.first / self.count
-        return LayerStatistics(self.count, shift + offset, self.second - torch.outer(offset, offset) * self.count)
+        some = self.count > 0
+        offset = self.first / torch.where(some, self.count, 1.0)
+        mean = torch.where(some, shift + offset, 0.0)
+        return LayerStatistics(self.count, mean, self.second - torch.outer(offset, offset) * self.count)
 
 
 def layer_statistics_reference(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:

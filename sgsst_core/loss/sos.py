@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
-from sgsst_core.features.partition import PartitionTile, Rectangle, covered_region
+from sgsst_core.features.partition import PartitionTile, Rectangle, covered_region, scaled_region
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import (
     CONTENT_LAYER,
@@ -24,7 +24,7 @@ from sgsst_core.features.vgg import (
     FeatureNetwork,
     layer_stride,
 )
-from sgsst_core.loss.terms import TERMS, LayerTarget, LossTerms, StyleGradient, content_loss, style_loss
+from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
 from sgsst_core.parallel.division import Piece, Size, divide, rounds
@@ -46,18 +46,31 @@ class SosResult:
     """What one evaluation gives.
 
     Attributes:
-        terms: the split loss of each scale that was evaluated.
+        scales: that were evaluated.
+        values: [scales, 4] float64, each scale's loss split into `TERMS`, still on the device.
         image_gradient: dE/dimage [H, W, 3], of which every rank has a part: they add up to the whole. None if only the
             loss was asked for.
     """
 
-    terms: dict[int, LossTerms]
+    scales: tuple[int, ...]
+    values: Tensor
     image_gradient: Tensor | None
 
     @property
+    def terms(self) -> dict[int, LossTerms]:
+        """The split loss of each scale. Waits for the device."""
+        return self.terms_from(self.values.flatten().tolist())
+
+    def terms_from(self, values: Sequence[float]) -> dict[int, LossTerms]:
+        """The split loss of each scale, from `values` as they were read, row by row."""
+        count = len(TERMS)
+        return {s: LossTerms.of(values[place * count :][:count]) for place, s in enumerate(self.scales)}
+
+    @property
     def loss(self) -> float:
-        """E, the mean over the scales that were evaluated."""
-        return sum(terms.total for terms in self.terms.values()) / len(self.terms)
+        """E, the mean over the scales that were evaluated. Waits for the device."""
+        terms = self.terms
+        return sum(part.total for part in terms.values()) / len(terms)
 
 
 @dataclass(frozen=True)
@@ -151,15 +164,26 @@ class SosLoss:
         """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
         return self._partition(self._piece(0, (height, width), coverage), coverage)
 
-    def share(self, sizes: Mapping[int, Size], coverage: Sequence[Tensor] | None = None) -> Share:
+    def share(
+        self,
+        sizes: Mapping[int, Size],
+        coverage: Sequence[Tensor] | None = None,
+        region: Rectangle | None = None,
+    ) -> Share:
         """Share out the work on some scales of a view.
 
         Args:
             sizes: (height, width) of each scale.
             coverage: from `position_weights`.
+            region: of the full-size view, that holds every covered pixel. Where it is given, the coverage is not looked
+                at, for which a device would have to be waited for: regions of coarser scales may be some cells larger.
         """
-        weights = {scale: coverage[scale] if coverage else None for scale in sizes}
-        pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
+        look = coverage if region is None else None
+        weights = {scale: look[scale] if look else None for scale in sizes}
+        if region is None or not self.leave_out:
+            pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
+        else:
+            pieces = tuple(Piece(scale, size, scaled_region(region, scale, size)) for scale, size in sizes.items())
         shares = divide(pieces, self.network.halo, self.speeds)
         own = shares[self.collectives.rank]
         return Share(
@@ -196,7 +220,9 @@ class SosLoss:
             passes = [_ScalePass(self, scaled[s], s, share.tiles[s], ViewTarget(), None) for s in scales]
             for pass_, merged in zip(passes, self._first_passes(passes, keep=False)[0], strict=True):
                 parts = zip(self.style_layers, self._wait(merged)[0], strict=True)
-                targets[pass_.scale] = {layer: LayerTarget.of(part) for layer, part in parts if not part.empty}
+                targets[pass_.scale] = {
+                    layer: LayerTarget.of(part) for layer, part in parts if min(pass_.size) >= layer_stride(layer)
+                }
         return targets
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
@@ -261,14 +287,14 @@ class SosLoss:
         sizes = self._sizes(_size(image), scales, image_scale)
         share = self._share_of(view, sizes)
         total = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=self.network.device)
-        terms: dict[int, LossTerms] = {}
+        terms: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):
             scaled = {scale: downscale(image.to(self.network.device), scale - image_scale) for scale in some}
             for pass_, pixel_gradient in self._round(scaled, style, view, share, gradient):
                 terms[pass_.scale] = pass_.terms
                 if pixel_gradient is not None:
                     add_upscaled_(total, pixel_gradient, pass_.scale - image_scale, 1.0 / len(sizes))
-        return SosResult(terms, total if gradient else None)
+        return SosResult(tuple(terms), torch.stack(list(terms.values())), total if gradient else None)
 
     def _share_of(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Share:
         if view.share is not None and view.share.tiles.keys() == sizes.keys():
@@ -290,24 +316,23 @@ class SosLoss:
         ]
         merged, kept = self._first_passes(passes, keep=gradient)
         for pass_, waiting in zip(passes, merged, strict=True):
-            parts, numbers = self._wait(waiting)
+            parts, pass_.terms = self._wait(waiting)
             with self.timer("statistics"):
                 statistics = dict(zip(self.style_layers, parts, strict=True))
-                pass_.terms = LossTerms(**dict(zip(TERMS, numbers, strict=True)))
                 self._compare(pass_, statistics, style[pass_.scale])
         yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
 
-    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], list[float]]:
+    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], Tensor]:
         with self.timer("communication"):
             return merged()
 
     def _compare(self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], style: ScaleTarget) -> None:
         """Style loss of one scale, added to its terms, and gradient maps, from the statistics of the whole scale."""
         for layer, part in statistics.items():
-            if layer in style and not part.empty:
+            if layer in style:
                 eps = torch.finfo(self.network.dtype).eps
                 layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=eps)
-                pass_.terms += layer_terms
+                pass_.terms = pass_.terms + layer_terms
 
     def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:
         """Pixel gradient [h, w, 3] of each scale: first of what was kept, which makes room for what was not."""
@@ -344,23 +369,25 @@ class SosLoss:
         kept: list[dict[PartitionTile, Activations]] = []
         fits = iter(self.tiling.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
-            statistics = [
-                LayerStatistics.zero(self.network.channels(layer), pass_.image.device) for layer in self.style_layers
-            ]
-            terms = LossTerms()
+            parts: list[list[LayerStatistics]] = []
+            terms = pass_.terms
             kept.append({})
             for tile in pass_.tiles:
                 keep_this = next(fits) and keep
                 activations = self._forward(pass_.image, tile, keep=keep_this)
                 with self.timer("statistics"):
-                    for place, layer in enumerate(self.style_layers):
-                        part = pass_.statistics(layer, tile, activations.features[layer])
-                        statistics[place] = merge(statistics[place], part)
-                    terms += pass_.tile_terms(tile, activations)
+                    own = [pass_.statistics(layer, tile, activations.features[layer]) for layer in self.style_layers]
+                    parts = [[merge(*pair) for pair in zip(parts[0], own, strict=True)]] if parts else [own]
+                    terms = terms + pass_.tile_terms(tile, activations)
                 if keep_this:
                     kept[-1][tile] = activations
-            merged.append(self.collectives.all_reduce_statistics(statistics, list(terms.values())))
+            statistics = parts[0] if parts else self._no_statistics(pass_.image.device)
+            merged.append(self.collectives.all_reduce_statistics(statistics, terms))
         return merged, kept
+
+    def _no_statistics(self, device: torch.device) -> list[LayerStatistics]:
+        """Of a scale of which no tile is this rank's."""
+        return [LayerStatistics.zero(self.network.channels(layer), device) for layer in self.style_layers]
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
         with self.timer("vgg_forward"):
@@ -384,17 +411,22 @@ class _ScalePass:
         self.tiles = tiles
         self.size = _size(image)
         self.maps: dict[str, StyleGradient] = {}
-        self.terms = LossTerms()
+        self.terms = torch.zeros(len(TERMS), dtype=torch.float64, device=image.device)
         self._coverage = view.coverage
         self._content_weight = loss.content_weight
         self._timer = loss.timer
         self._content = content
-        self._content_count = 0.0
         if content is not None:
-            stride = layer_stride(CONTENT_LAYER)
-            cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
-            weights = self.position_weights(CONTENT_LAYER, cells)
-            self._content_count = cells.pixels if weights is None else float(weights.sum(dtype=torch.float64))
+            self._content_count = self._all_content_positions()
+
+    def _all_content_positions(self) -> Tensor:
+        """How many cells of the content layer the whole scale has, or the sum of their weights: float64 scalar."""
+        stride = layer_stride(CONTENT_LAYER)
+        cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
+        weights = self.position_weights(CONTENT_LAYER, cells)
+        if weights is not None:
+            return weights.sum(dtype=torch.float64)
+        return torch.full((), cells.pixels, dtype=torch.float64, device=self.image.device)
 
     def position_weights(self, layer: str, cells: Rectangle) -> Tensor | None:
         """Weights [h, w] of some cells of a layer: the coverage, box-averaged to the cells; None for equal weights."""
@@ -407,16 +439,18 @@ class _ScalePass:
         view, own = tile.owned_cells(layer, self.size)
         return layer_statistics(features[own.slices], self.position_weights(layer, view))
 
-    def tile_terms(self, tile: PartitionTile, activations: Activations) -> LossTerms:
-        """The tile's share of the terms that are sums over positions; the others follow from the whole scale."""
-        return LossTerms(content=self.content_loss(tile, activations.features.get(CONTENT_LAYER))[0])
+    def tile_terms(self, tile: PartitionTile, activations: Activations) -> Tensor:
+        """The tile's share [4] of the terms that are sums over positions; the others follow from the whole scale."""
+        content = self._content_difference(tile, activations.features.get(CONTENT_LAYER))
+        nothing = torch.zeros_like(self.terms)
+        return nothing if content is None else torch.cat([nothing[1:], content.loss()[None]])
 
-    def content_loss(self, tile: PartitionTile, features: Tensor | None) -> tuple[float, Tensor | None]:
-        """The tile's share of the content loss and its gradient on owned cells; features are those of all its cells."""
-        if self._content is None or features is None or not self._content_count > 0:
-            return 0.0, None
+    def _content_difference(self, tile: PartitionTile, features: Tensor | None) -> ContentDifference | None:
+        """On owned cells; features are those of all the tile's cells. None where content does not count."""
+        if self._content is None or features is None:
+            return None
         view, own = tile.owned_cells(CONTENT_LAYER, self.size)
-        return content_loss(
+        return ContentDifference.of(
             features[own.slices],
             self._content[tile],
             self._content_count,
@@ -433,8 +467,8 @@ class _ScalePass:
                 if layer in self.maps:
                     weights = self.position_weights(layer, view)
                     self.maps[layer].add_to(gradient[own.slices], features[own.slices], weights)
-                elif layer == CONTENT_LAYER and (owned := self.content_loss(tile, features)[1]) is not None:
-                    gradient[own.slices] += owned
+                elif layer == CONTENT_LAYER and (content := self._content_difference(tile, features)) is not None:
+                    gradient[own.slices] += content.gradient()
 
         return add
 

@@ -10,7 +10,7 @@ With position weights a_p, n becomes their sum and the content mean is weighted 
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -81,6 +81,11 @@ class LossTerms(Mapping[str, float]):
     def __add__(self, other: LossTerms) -> LossTerms:
         return LossTerms(**{name: value + other[name] for name, value in self.items()})
 
+    @staticmethod
+    def of(values: Sequence[float]) -> LossTerms:
+        """Of all terms' values, in the order of `TERMS`."""
+        return LossTerms(**dict(zip(TERMS, values, strict=True)))
+
     def __truediv__(self, count: int) -> LossTerms:
         """Each term divided by a count: the mean of a sum."""
         return LossTerms(**{name: value / count for name, value in self.items()})
@@ -123,51 +128,80 @@ class StyleGradient:
 
 def style_loss(
     statistics: LayerStatistics, target: LayerTarget, *, feature_eps: float = 2.0**-23
-) -> tuple[LossTerms, StyleGradient]:
-    """One layer's style loss and its gradient with respect to the features.
+) -> tuple[Tensor, StyleGradient]:
+    """One layer's style loss and its gradient with respect to the features. Both are 0 where there is no position.
 
     Args:
-        statistics: of the view's features, not empty.
+        statistics: of the view's features.
         target: of the style.
         feature_eps: relative rounding of the features (2^-23 for float32, 2^-52 for float64).
+
+    Returns:
+        [4] float64, what the layer adds to each of `TERMS`; and the gradient.
 
     Where sigma is zero, or no more than the rounding of the mean, a channel is constant: its factor (F - mu)/sigma
     is taken as 0. The loss keeps the term, the gradient stays finite.
     """
     channels = statistics.mean.shape[0]
+    some = statistics.count > 0
     gram_error = statistics.gram() - target.gram
     mean_error = statistics.mean - target.mean
     std = statistics.std()
     std_error = std - target.std
     gram_weight = GRAM_WEIGHT / channels**2
-    terms = LossTerms(
-        gram=gram_weight * float(gram_error.square().mean()),
-        mean=MEAN_WEIGHT * float(mean_error.square().mean()),
-        std=STD_WEIGHT * float(std_error.square().mean()),
+    terms = torch.stack(
+        [
+            gram_weight * gram_error.square().mean(),
+            MEAN_WEIGHT * mean_error.square().mean(),
+            STD_WEIGHT * std_error.square().mean(),
+            torch.zeros_like(statistics.count),
+        ]
     )
     matrix = (4 * gram_weight / channels**2) * gram_error
     offset = matrix @ statistics.mean + (2 * MEAN_WEIGHT / channels) * mean_error
     alive = std > feature_eps * statistics.mean.abs()
     slope = torch.where(alive, std_error / torch.where(alive, std, 1.0), 0.0)
     matrix = matrix + torch.diag((2 * STD_WEIGHT / channels) * slope)
-    return terms, StyleGradient(matrix / statistics.count, statistics.mean, offset / statistics.count)
+    count = torch.where(some, statistics.count, torch.inf)
+    return torch.where(some, terms, 0.0), StyleGradient(matrix / count, statistics.mean, offset / count)
 
 
-def content_loss(
-    features: Tensor, content: Tensor, count: float, weight: float, position_weights: Tensor | None = None
-) -> tuple[float, Tensor]:
-    """Content loss of some positions and its gradient [h, w, c].
+@dataclass(frozen=True)
+class ContentDifference:
+    """How far some cells' content features are from what they should be: the content loss follows from it.
 
-    Args:
-        features, content: [h, w, c] at the same positions.
-        count: positions (or sum of position weights) of the whole view: the loss is a mean over the view.
-        weight: lambda_c.
-        position_weights: [h, w].
+    Attributes:
+        difference: [h, w, c], in float32 at least.
+        weighted: the same times the position weights.
+        factor: lambda_c / (n c), float64: the loss is a mean over the view's n positions (or their weights).
     """
-    precision = torch.promote_types(features.dtype, torch.float32)
-    difference = features.to(precision) - content.to(precision)
-    weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
-    factor = weight / (count * features.shape[-1])
-    # A dot product in float32 over a whole view would lose digits: rows first, then float64.
-    loss = factor * float((weighted * difference).sum(dim=(1, 2)).sum(dtype=torch.float64))
-    return loss, weighted * (2 * factor)
+
+    difference: Tensor
+    weighted: Tensor
+    factor: Tensor
+
+    @staticmethod
+    def of(
+        features: Tensor, content: Tensor, count: Tensor, weight: float, position_weights: Tensor | None = None
+    ) -> ContentDifference:
+        """Of features and content [h, w, c] at the same positions.
+
+        Args:
+            count: float64 scalar, positions (or sum of position weights) of the whole view; 0 gives no loss.
+            weight: lambda_c.
+            position_weights: [h, w].
+        """
+        precision = torch.promote_types(features.dtype, torch.float32)
+        difference = features.to(precision) - content.to(precision)
+        weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
+        divisor = torch.where(count > 0, count, torch.inf) * features.shape[-1]
+        return ContentDifference(difference, weighted, weight / divisor)
+
+    def loss(self) -> Tensor:
+        """These cells' share of the content loss, float64 scalar."""
+        # A dot product in float32 over a whole view would lose digits: rows first, then float64.
+        return self.factor * (self.weighted * self.difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
+
+    def gradient(self) -> Tensor:
+        """Its gradient with respect to the features, [h, w, c]."""
+        return self.weighted * (2 * self.factor)

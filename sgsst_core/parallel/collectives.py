@@ -17,7 +17,7 @@ from sgsst_core.rasterizer.arguments import Rows
 T = TypeVar("T")
 
 #: Waits for statistics under way: those of all ranks together, and the sums of the numbers that went with them.
-Merged = Callable[[], tuple[list[LayerStatistics], list[float]]]
+Merged = Callable[[], tuple[list[LayerStatistics], Tensor]]
 
 
 class Collectives(Protocol):
@@ -45,8 +45,8 @@ class Collectives(Protocol):
         """The sum over all ranks, the same on every rank. The argument may be overwritten."""
         ...
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Sequence[float]) -> Merged:
-        """Start merging the statistics of disjoint positions, layer by layer, and adding up some numbers.
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
+        """Start merging the statistics of disjoint positions, layer by layer, and adding up some float64 numbers [k].
 
         Returns at once; what it returns waits for the result, the same on every rank. No other exchange may be started
         before all results have been waited for, but for further ones of this kind.
@@ -95,8 +95,8 @@ class _Alone:
     def all_reduce(self, tensor: Tensor) -> Tensor:
         return tensor
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Sequence[float]) -> Merged:
-        return lambda: (list(parts), list(numbers))
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
+        return lambda: (list(parts), numbers)
 
     def all_gather(self, value: T) -> list[T]:
         return [value]

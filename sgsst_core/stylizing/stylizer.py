@@ -36,6 +36,7 @@ from sgsst_core.stylizing.evaluation import (
     mean_evaluation,
     mean_loss,
 )
+from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 from sgsst_core.stylizing.team import Team
@@ -43,11 +44,6 @@ from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import PhotoLoader, Views
 from sgsst_core.stylizing.warm_start import warm_start
 from sgsst_core.timing import Timer
-
-#: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
-ADAM_EPS = 1e-15
-#: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
-LARGEST_GRADIENT = 1e19
 
 
 class Stylizer:
@@ -99,6 +95,7 @@ class Stylizer:
         self.photos = photos
         self.style = style
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
+        self._style = style.to(self.network.device)
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
         #: The partition follows from it, and so does rounding: it is the same on all ranks.
@@ -114,8 +111,8 @@ class Stylizer:
         start = seen.sh_dc
         if settings.warm_start:
             start = warm_start(start, plan.survey.total_blend_weights[plan.seen], style)
-        self.sh_dc = start.clone().to(rasterizer.device).requires_grad_()
-        self._adam = torch.optim.Adam([self.sh_dc], lr=settings.learning_rate, eps=ADAM_EPS)
+        self.sh_dc = start.clone().to(rasterizer.device)
+        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.schedule = planned_phases(plan, settings)
@@ -242,7 +239,7 @@ class Stylizer:
         """The style's statistics for views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
-            self._style_targets[size] = self.loss.style_targets(self.style.to(self.network.device), size)
+            self._style_targets[size] = self.loss.style_targets(self._style, size)
         return self._style_targets[size]
 
     def run_step(self) -> StepRecord:
@@ -257,9 +254,10 @@ class Stylizer:
         if phase.scale is None:
             self._coarse = None  # phase 1 is over
         views = [self._next_view() for _ in range(self.settings.views_per_step)]
-        gradient, terms = self._mean_gradient(views, phase)
+        gradient, results = self._mean_gradient(views, phase)
         with self.timer("optimiser"):
-            self._update(gradient)
+            largest = self._optimiser.update(gradient, self.settings.learning_rate_at(self.share_done()))
+            terms = self._read(largest, results)
         self.step += 1
         with self.timer("communication"):
             self._team.check_drift(self.step, self.sh_dc)
@@ -281,10 +279,10 @@ class Stylizer:
         self.history.append(record)
         return record
 
-    def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, Evaluation]:
-        """dE/dsh_dc [n, 3] and loss, mean over some views: each group of ranks takes its own."""
+    def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult]]:
+        """dE/dsh_dc [n, 3], mean over some views, and what was found of those that this group of ranks took."""
         gradient: Tensor | None = None
-        evaluations = []
+        results = []
         self._cost = 0
         for index in views[self._team.own_group :: self._team.groups]:
             scales = phase.scales(self.scale_count(index))
@@ -295,16 +293,46 @@ class Stylizer:
             self._cost += target.share.cost(self.group.rank, self.network.halo)
             own, result = self._gradient(index, style, target, scales)
             gradient = own if gradient is None else gradient.add_(own)
-            evaluations.append(result.terms)
+            results.append(result)
         assert gradient is not None
         if len(views) > 1:
-            with self.timer("communication"):
-                every = self.collectives.all_gather(evaluations)[:: self.group.size]
-                evaluations = [terms for part in every for terms in part]
-                if self._team.groups > 1:  # all ranks of a group have the same gradient: count it once
+            if self._team.groups > 1:  # all ranks of a group have the same gradient: count it once
+                with self.timer("communication"):
                     gradient = self.collectives.all_reduce(gradient / self.group.size)
             gradient = gradient / len(views)
-        return gradient, mean_evaluation(evaluations)
+        return gradient, results
+
+    def _read(self, largest: Tensor, results: Sequence[SosResult]) -> Evaluation:
+        """Wait for the device, once in a step: loss of each scale, mean over all views of the step.
+
+        Args:
+            largest: magnitude in the gradient.
+            results: of this group's views.
+
+        Raises:
+            DivergedError: that magnitude was too large for a step to be made.
+        """
+        numbers = torch.cat([largest.double()[None], *(result.values.flatten() for result in results)]).tolist()
+        if is_too_large(numbers[0]):
+            raise self._diverged(numbers[0])
+        evaluations, place = [], 1
+        for result in results:
+            count = result.values.numel()
+            evaluations.append(result.terms_from(numbers[place : place + count]))
+            place += count
+        if self._team.groups > 1:
+            with self.timer("communication"):
+                every = self.collectives.all_gather(evaluations)[:: self.group.size]
+            evaluations = [terms for part in every for terms in part]
+        return mean_evaluation(evaluations)
+
+    def _diverged(self, largest: float) -> DivergedError:
+        return DivergedError(
+            f"Step {self.step + 1}: the colour gradient has grown to {largest:.3g}, which cannot be optimised; the "
+            f"largest colour coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a smaller "
+            f"--learning-rate than {self.settings.learning_rate:g}, or look for extreme coefficients with `sgsst "
+            "check`."
+        )
 
     def _balance(self) -> None:
         """Once in the phase on all scales, share the work out in proportion to the speeds that ranks have shown."""
@@ -312,20 +340,6 @@ class Stylizer:
         if speeds:
             self.loss.speeds = speeds
             self.views.share_anew()
-
-    def _update(self, gradient: Tensor) -> None:
-        largest = float(gradient.abs().max())
-        if not largest <= LARGEST_GRADIENT:
-            raise DivergedError(
-                f"Step {self.step + 1}: the colour gradient has grown to {largest:.3g}, which cannot be optimised; the "
-                f"largest colour coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a smaller "
-                f"--learning-rate than {self.settings.learning_rate:g}, or look for extreme coefficients with `sgsst "
-                "check`."
-            )
-        for group in self._adam.param_groups:
-            group["lr"] = self.settings.learning_rate_at(self.share_done())
-        self.sh_dc.grad = gradient.to(self.sh_dc.dtype)
-        self._adam.step()
 
     def _next_view(self) -> int:
         """Random views without replacement: every view once before any comes again."""
@@ -389,12 +403,11 @@ class Stylizer:
 
     def state(self) -> StylizerState:
         """A copy of all that a resumed run needs."""
-        adam = self._adam.state.get(self.sh_dc, {})
-        empty = torch.zeros_like(self.sh_dc)
+        first_moment, second_moment = self._optimiser.moments()
         return StylizerState(
             sh_dc=self.sh_dc.detach().cpu().clone(),
-            first_moment=adam.get("exp_avg", empty).detach().cpu().clone(),
-            second_moment=adam.get("exp_avg_sq", empty).detach().cpu().clone(),
+            first_moment=first_moment,
+            second_moment=second_moment,
             step=self.step,
             seconds=self.seconds,
             generator=self._generator.get_state().clone(),
@@ -410,11 +423,7 @@ class Stylizer:
         with torch.no_grad():
             self.sh_dc.copy_(state.sh_dc)
         if state.step:
-            self._adam.state[self.sh_dc] = {
-                "step": torch.tensor(float(state.step)),
-                "exp_avg": state.first_moment.to(self.sh_dc.device).clone(),
-                "exp_avg_sq": state.second_moment.to(self.sh_dc.device).clone(),
-            }
+            self._optimiser.load_moments(state.step, state.first_moment, state.second_moment)
         self.step = state.step
         self.seconds = state.seconds
         self._generator.set_state(state.generator)

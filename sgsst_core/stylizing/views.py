@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sgsst_core.budget import Shelf
 from sgsst_core.features.partition import PartitionTile, Rectangle
-from sgsst_core.loss.sos import ContentFeatures, SosLoss, ViewTarget
+from sgsst_core.loss.sos import ContentFeatures, Share, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide_rows
 from sgsst_core.rasterizer import Rasterizer, Rows
@@ -70,12 +70,15 @@ class Views:
             )
             for index, camera in enumerate(cameras)
         ]
+        self._regions = regions
+        self._sh_dc = scene.sh_dc.to(rasterizer.device)
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
         self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
         kept = memory // 2 if keep_content else 0
         self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept)
+        self._shares: dict[tuple[int, tuple[int, ...]], Share] = {}
         self.covered = covered
         self.weighted = weighted
         self.revive = revive
@@ -139,7 +142,7 @@ class Views:
         """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
         if self._photos is not None:
             return self._photos(index)
-        return self.render(index, self.colours(index, self.scene.sh_dc.to(self.rasterizer.device)))
+        return self.render(index, self.colours(index, self._sh_dc))
 
     def target(self, index: int, scales: Sequence[int]) -> ViewTarget:
         """What the view is compared with at some scales; kept where memory allows.
@@ -147,8 +150,7 @@ class Views:
         Features are computed only of scales that are asked for: phase 1 needs those of one.
         """
         coverage = self._coverage.get(index, lambda: self._position_weights(index)) if self.weighted else None
-        camera = self.cameras[index]
-        share = self.loss.share({s: (camera.height >> s, camera.width >> s) for s in scales}, coverage)
+        share = self._share(index, scales, coverage)
         target = ViewTarget(coverage=coverage, share=share)
         if self.loss.content_weight:
             image = functools.cache(lambda: self.content(index))
@@ -162,6 +164,17 @@ class Views:
     def share_anew(self) -> None:
         """Forget what belongs to the present division of the work, because another follows."""
         self._content.clear()
+        self._shares.clear()
+
+    def _share(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Share:
+        """How the work on some scales of a view is shared out: found once, because it takes looks at the coverage."""
+        key = (index, tuple(scales))
+        if key not in self._shares:
+            camera = self.cameras[index]
+            sizes = {scale: (camera.height >> scale, camera.width >> scale) for scale in scales}
+            known = self._regions[index] if self._regions and self.loss.network.device.type != "cpu" else None
+            self._shares[key] = self.loss.share(sizes, coverage, known)
+        return self._shares[key]
 
     def _position_weights(self, index: int) -> list[Tensor]:
         band, camera = self._own_band(index), self.cameras[index]

@@ -31,7 +31,8 @@ recorders: list[Callable[[Any, Any, Any, Any], None]] = []
 #: Operations without a kernel: they make a view, or reserve memory, or only ask.
 _NO_KERNEL = {
     "view", "_unsafe_view", "_reshape_alias", "permute", "transpose", "t", "slice", "select", "unsqueeze", "squeeze",
-    "expand", "alias", "detach", "split", "split_with_sizes", "unbind", "as_strided", "diagonal", "lift_fresh", "unfold",
+    "expand", "alias", "detach", "split", "split_with_sizes", "unbind", "as_strided", "diagonal", "lift_fresh",
+    "unfold",
     "empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided", "_local_scalar_dense", "is_same_size",
     "record_stream", "is_pinned", "view_as_real", "sym_size", "sym_stride", "narrow",
 }  # fmt: skip
@@ -47,26 +48,26 @@ _MIXED = {"copy_", "_to_copy", "index", "index_put_", "index_put", "_index_put_i
 
 
 class PretendTensor(Tensor):
-    """A tensor on the pretend device: `inner`, on the CPU, holds its values."""
+    """A tensor on the pretend device: `host`, on the CPU, holds its values."""
 
-    inner: Tensor
+    host: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
-    def __new__(cls, inner: Tensor) -> PretendTensor:
+    def __new__(cls, values: Tensor) -> PretendTensor:
         wrapped = Tensor._make_wrapper_subclass(
             cls,
-            inner.size(),
-            strides=inner.stride(),
-            storage_offset=inner.storage_offset(),
-            dtype=inner.dtype,
+            values.size(),
+            strides=values.stride(),
+            storage_offset=values.storage_offset(),
+            dtype=values.dtype,
             device=DEVICE,
         )
-        wrapped.inner = inner
+        wrapped.host = values
         return wrapped
 
     def __repr__(self, *_: Any, **__: Any) -> str:  # type: ignore[override]
-        return f"PretendTensor({self.inner})"
+        return f"PretendTensor({self.host})"
 
     def numpy(self, *_: Any, **__: Any) -> Any:
         raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() first.")
@@ -77,13 +78,13 @@ class PretendTensor(Tensor):
         return self.cpu().tolist()
 
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
         return dispatch(func, args, kwargs or {})
 
 
 def inner(value: Any) -> Any:
     """The CPU's tensor in place of the device's; anything else as it is."""
-    return value.inner if isinstance(value, PretendTensor) else value
+    return value.host if isinstance(value, PretendTensor) else value
 
 
 def wait(line: str | None = None) -> None:
@@ -113,19 +114,19 @@ def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         _refuse_mixed(func, name, args, leaves)
     if on_device or to_device:
         _count(name, func, args, kwargs, to_device)
-    values, named = tree_map(inner, args), tree_map(inner, kwargs)
+    plain, named = tree_map(inner, args), tree_map(inner, kwargs)
     if name == "_to_copy" and named.get("non_blocking"):
         named = {**named, "non_blocking": False}
-    result = func(*values, **named)
+    result = func(*plain, **named)
     if recorders and (on_device or to_device):
         for record in recorders:
-            record(func, values, named, result)
+            record(func, plain, named, result)
     return _wrapped(func, result, leaves) if to_device else result
 
 
 def _wrapped(func: Any, result: Any, leaves: list[Any]) -> Any:
     """The result on the device: an argument that was changed in place is the very same object."""
-    changed = {id(leaf.inner): leaf for leaf in leaves if isinstance(leaf, PretendTensor)}
+    changed = {id(leaf.host): leaf for leaf in leaves if isinstance(leaf, PretendTensor)}
 
     def wrap(value: Any) -> Any:
         if not isinstance(value, Tensor) or isinstance(value, PretendTensor):
@@ -164,25 +165,30 @@ def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: b
             elif isinstance(index, Tensor) and not isinstance(index, PretendTensor):
                 _count_copy(index, waits=True)
     if name == "_to_copy" and isinstance(args[0], PretendTensor) != to_device:
-        _count_copy(args[0], waits=not (kwargs.get("non_blocking") and _is_pinned(args[0])))
+        _count_copy(args[0], waits=not (kwargs.get("non_blocking") and _is_staged(args[0])))
     elif name == "copy_" and isinstance(args[0], PretendTensor) != isinstance(args[1], PretendTensor):
         asynchronous = (args[2:3] or (kwargs.get("non_blocking"),))[0]
         host = args[1] if isinstance(args[0], PretendTensor) else args[0]
-        _count_copy(args[1], waits=not (asynchronous and _is_pinned(host)))
+        _count_copy(args[1], waits=not (asynchronous and _is_staged(host)))
     elif name not in _NO_KERNEL and not func._schema.name.startswith("c10d::"):
         kernels = _KERNELS.get(name, 1)
         launch(kernels + (name == "convolution" and args[2] is not None))
 
 
 def _count_copy(source: Tensor, *, waits: bool) -> None:
-    """A copy between host and device. Of memory that is not pinned it holds the host up, whatever was asked for."""
+    """A copy between host and device; scalars of the CPU travel with a launch."""
     counts.copies[calling_line()] += source.numel() * source.element_size()
     if waits and not (source.dim() == 0 and not isinstance(source, PretendTensor)):
         wait()
 
 
+def _is_staged(host: Tensor) -> bool:
+    """Whether a copy without wait can be had: of pinned memory, and of so little that the driver takes it along."""
+    return _is_pinned(host) or (not isinstance(host, PretendTensor) and host.numel() * host.element_size() <= 1 << 16)
+
+
 def _is_pinned(tensor: Tensor) -> bool:
-    return isinstance(tensor, PretendTensor) or getattr(tensor, "pretend_pinned", False)
+    return getattr(tensor, "pretend_pinned", False)
 
 
 class _Factories(TorchDispatchMode):
@@ -246,7 +252,7 @@ def modes() -> Iterator[None]:
         with _Factories(), _Moves():
             run(thread)
 
-    threading.Thread.run = in_modes  # type: ignore[method-assign]
+    threading.Thread.run = in_modes  # type: ignore[method-assign, assignment]
     try:
         with _Factories(), _Moves():
             yield

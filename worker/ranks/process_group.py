@@ -129,11 +129,11 @@ class ProcessGroupCollectives:
         dist.all_reduce(tensor, group=self._group)
         return tensor
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Sequence[float]) -> Merged:
+    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
         """See `Collectives`."""
-        return self._background.submit(self._merge, list(parts), list(numbers)).result
+        return self._background.submit(self._merge, list(parts), numbers).result
 
-    def _merge(self, parts: list[LayerStatistics], numbers: list[float]) -> tuple[list[LayerStatistics], list[float]]:
+    def _merge(self, parts: list[LayerStatistics], numbers: Tensor) -> tuple[list[LayerStatistics], Tensor]:
         """Mean first, then second moments about it: sums of squares only, in which nothing can cancel.
 
         C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T, the pairwise update of
@@ -142,8 +142,7 @@ class ProcessGroupCollectives:
         if self._device.type == "cuda":
             torch.cuda.set_device(self._device)  # the current device belongs to a thread
         sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
-        extra = torch.tensor(numbers, dtype=torch.float64, device=sums[0].device)
-        flat = self.all_reduce(torch.cat([*sums, extra]))
+        flat = self.all_reduce(torch.cat([*sums, numbers]))
         *totals, added = flat.split([*(len(part) for part in sums), len(numbers)])
         means = [total[1:] / total[0].clamp_min(torch.finfo(total.dtype).tiny) for total in totals]
         moments = []
@@ -156,7 +155,7 @@ class ProcessGroupCollectives:
             LayerStatistics(total[0], mean, _symmetric(half, len(mean)))
             for total, mean, half in zip(totals, means, halves, strict=True)
         ]
-        return merged, added.tolist()
+        return merged, added
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""

@@ -119,7 +119,7 @@ def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:
 def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], target: LayerTarget) -> CaseResult:
     """Largest difference of loss and feature gradient between ways of adding up the same features."""
     results = {name: style_loss(merge_all(statistics), target) for name, statistics in parts.items()}
-    losses = [terms.total for terms, _ in results.values()]
+    losses = [float(terms.sum()) for terms, _ in results.values()]
     gradients = [gradient.apply(features) for _, gradient in results.values()]
     error = max(abs(loss / losses[0] - 1) for loss in losses)
     off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)

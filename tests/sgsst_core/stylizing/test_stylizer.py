@@ -113,7 +113,7 @@ def test_learning_rate_falls_exponentially_to_its_end(tiny_weights: BackboneWeig
     rates = []
     while stylizer.step < stylizer.total:
         stylizer.run_step()
-        rates.append(stylizer._adam.param_groups[0]["lr"])
+        rates.append(stylizer._optimiser._adam.param_groups[0]["lr"])
     assert rates == pytest.approx([0.1, 0.1**1.5, 0.01, 0.1**2.5, 0.001])
 
 

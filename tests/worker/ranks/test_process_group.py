@@ -54,9 +54,12 @@ def features(rank: int) -> Tensor:
 
 def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatistics, float]]:
     parts = [LayerStatistics.zero(5)] if collectives.rank == empty else [layer_statistics(features(collectives.rank))]
-    waiting = [collectives.all_reduce_statistics(parts, [0.5 * (turn + 1)]) for turn in range(3)]
+    waiting = [
+        collectives.all_reduce_statistics(parts, torch.tensor([0.5 * (turn + 1)], dtype=torch.float64))
+        for turn in range(3)
+    ]
     merged = [wait() for wait in waiting]
-    return [(statistics[0], number) for statistics, (number,) in merged]
+    return [(statistics[0], float(number)) for statistics, (number,) in merged]
 
 
 @pytest.mark.parametrize("empty", [None, 0, 2])
@@ -81,7 +84,7 @@ def test_nothing_at_all_stays_nothing() -> None:
 
 
 def merge_nothing(collectives: Collectives) -> LayerStatistics:
-    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], [0.0])()[0][0]
+    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], torch.zeros(1, dtype=torch.float64))()[0][0]
 
 
 def values(collectives: Collectives) -> dict[str, Any]:

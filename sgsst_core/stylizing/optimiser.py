@@ -1,0 +1,67 @@
+"""Adam on the DC colours, guarded against gradients that it cannot square."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+#: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
+ADAM_EPS = 1e-15
+#: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
+LARGEST_GRADIENT = 1e19
+
+
+class ColourOptimiser:
+    """Adam (Kingma and Ba 2015) on one tensor of colours.
+
+    On a GPU a step is one kernel, which looks itself whether it is to be made: the host need not wait to be told.
+
+    Args:
+        colours: [n, 3] float32, changed in place.
+        learning_rate: until `update` names another one.
+    """
+
+    def __init__(self, colours: Tensor, learning_rate: float) -> None:
+        self._colours = colours.requires_grad_()
+        self._fused = colours.is_cuda
+        self._adam = torch.optim.Adam([colours], lr=learning_rate, eps=ADAM_EPS, fused=self._fused)
+
+    def update(self, gradient: Tensor, learning_rate: float) -> Tensor:
+        """One step, but for a gradient [n, 3] that is beyond `LARGEST_GRADIENT` or not finite: then nothing changes.
+
+        Returns:
+            The largest magnitude in the gradient, a scalar on the colours' device. The caller looks whether it was too
+            large, when it next waits for the device anyway.
+        """
+        largest = gradient.abs().amax()
+        for group in self._adam.param_groups:
+            group["lr"] = learning_rate
+        self._colours.grad = gradient.to(self._colours.dtype)
+        if self._fused:
+            # PyTorch's way to tell a fused step that its gradient cannot be used, made for scaled half precision.
+            self._adam.found_inf = torch.logical_not(largest <= LARGEST_GRADIENT).float()  # type: ignore[attr-defined]
+            self._adam.step()
+        elif not is_too_large(float(largest)):
+            self._adam.step()
+        return largest
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """First and second moment [n, 3], on the CPU; zeros before the first step."""
+        state = self._adam.state.get(self._colours, {})
+        nothing = torch.zeros_like(self._colours)
+        first, second = (state.get(name, nothing).detach() for name in ("exp_avg", "exp_avg_sq"))
+        return first.cpu().clone(), second.cpu().clone()
+
+    def load_moments(self, step: int, first: Tensor, second: Tensor) -> None:
+        """Go on after so many steps, at least one, with their moments [n, 3]."""
+        device = self._colours.device
+        self._adam.state[self._colours] = {
+            "step": torch.tensor(float(step), device=device if self._fused else None),
+            "exp_avg": first.to(device).clone(),
+            "exp_avg_sq": second.to(device).clone(),
+        }
+
+
+def is_too_large(largest: float) -> bool:
+    """Whether a gradient of that largest magnitude (NaN included) cannot be used."""
+    return not largest <= LARGEST_GRADIENT
