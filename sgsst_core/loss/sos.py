@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
+from sgsst_core.features.fused_statistics import can_be_fused, fused_statistics
 from sgsst_core.features.partition import PartitionTile, Rectangle, covered_region, scaled_region
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import (
@@ -437,7 +438,8 @@ class _ScalePass:
     def statistics(self, layer: str, tile: PartitionTile, features: Tensor) -> LayerStatistics:
         """Of the cells that a tile owns; features are those of all its cells."""
         view, own = tile.owned_cells(layer, self.size)
-        return layer_statistics(features[own.slices], self.position_weights(layer, view))
+        owned, weights = features[own.slices], self.position_weights(layer, view)
+        return fused_statistics(owned, weights) if can_be_fused(owned) else layer_statistics(owned, weights)
 
     def tile_terms(self, tile: PartitionTile, activations: Activations) -> Tensor:
         """The tile's share [4] of the terms that are sums over positions; the others follow from the whole scale."""

@@ -17,7 +17,9 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from sgsst_core.features.fused_statistics import can_be_fused, has_kernels
 from sgsst_core.features.statistics import CHUNK_VALUES, LayerStatistics
+from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 
 #: What the loss of a scale is the sum of: names, as files and reports have them, to what people read. The order is that
 #: in which they are added up, shown and given their colours.
@@ -99,12 +101,13 @@ class StyleGradient:
     """dE/dF of one layer as an affine map of centred features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
 
     The map acts on centred features because at mean-to-sigma ratios of 1e4 the product matrix F and a separate
-    offset would cancel each other down to their last digits in float32.
+    offset would cancel each other down to their last digits in float32. In float64, but float32 where a GPU's kernels
+    made it, which is what it is applied in to float32 features anyway.
     """
 
-    matrix: Tensor  # [c, c] float64
-    mean: Tensor  # [c] float64
-    offset: Tensor  # [c] float64
+    matrix: Tensor  # [c, c]
+    mean: Tensor  # [c]
+    offset: Tensor  # [c]
 
     def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
         """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
@@ -114,6 +117,9 @@ class StyleGradient:
 
     def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
         """Add `apply` to a gradient [h, w, c] in place, chunk by chunk: nothing as large as the features is made."""
+        if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
+            fused_add_style_gradient(gradient, features, self.matrix, self.mean, self.offset, position_weights)
+            return
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
         height, width, channels = features.shape
@@ -143,6 +149,10 @@ def style_loss(
     is taken as 0. The loss keeps the term, the gradient stays finite.
     """
     channels = statistics.mean.shape[0]
+    if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
+        weights = (GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT)
+        fused = fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
+        return fused[0], StyleGradient(*fused[1:])
     some = statistics.count > 0
     gram_error = statistics.gram() - target.gram
     mean_error = statistics.mean - target.mean

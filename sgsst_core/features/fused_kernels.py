@@ -1,0 +1,117 @@
+"""GPU kernels of a layer's statistics: shifted moments of blocks of positions, and their sum in float64.
+
+Run in Triton's interpreter on the CPU too (TRITON_INTERPRET=1 before the first import). Nothing is added atomically:
+results repeat to the bit.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def load_centred(features, shift, row_step, column_step, width, position, channel, there):
+    """Features minus shift [P, C] float32 of some positions, row by row, and channels; minus shift where not there."""
+    place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
+    values = tl.load(features + place[:, None] + channel[None, :], mask=there[:, None], other=0.0).to(tl.float32)
+    return values - tl.load(shift + channel)[None, :]
+
+
+@triton.jit
+def load_weights(weights, row_step, column_step, width, position, there, WEIGHTED: tl.constexpr):
+    """Position weights [P] float32, 0 where no position is there."""
+    if WEIGHTED:
+        place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
+        return tl.load(weights + place, mask=there, other=0.0).to(tl.float32)
+    return there.to(tl.float32)
+
+
+@triton.jit
+def shifted_moments(
+    features, weights, shift, counts, firsts, seconds,
+    positions, width, row_step, column_step, weight_row_step, weight_column_step,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, SPAN: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
+    PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Moments about the shift of SPAN positions, for TILE x TILE pairs of channels, of which the upper ones are made.
+
+    Args:
+        features: [h, width, CHANNELS], float32 or bfloat16.
+        weights: [h, width] position weights, or anything where WEIGHTED is false.
+        shift: [CHANNELS] float32.
+        counts: [spans] float32, sum of a_p; written by the pair (0, 0).
+        firsts: [spans, CHANNELS] float32, sum of a_p x_p; written by pairs on the diagonal.
+        seconds: [spans, CHANNELS, CHANNELS] float32, sum of a_p x_p x_p^T; the lower pairs are not written.
+        positions: h * width.
+    """
+    tiles: tl.constexpr = CHANNELS // TILE
+    span, pair = tl.program_id(0), tl.program_id(1)
+    down, across = pair // tiles, pair % tiles
+    if down <= across:
+        own, other = down * TILE + tl.arange(0, TILE), across * TILE + tl.arange(0, TILE)
+        second = tl.zeros([TILE, TILE], tl.float32)
+        first = tl.zeros([TILE], tl.float32)
+        count = tl.zeros([P], tl.float32)
+        begin = span * SPAN
+        end = tl.minimum(begin + SPAN, positions)
+        while begin < end:
+            position = begin + tl.arange(0, P)
+            there = position < end
+            a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
+            left = load_centred(features, shift, row_step, column_step, width, position, own, there) * a[:, None]
+            right = load_centred(features, shift, row_step, column_step, width, position, other, there)
+            second += tl.dot(tl.trans(left), right, input_precision=PRECISION)
+            first += tl.sum(left, 0)
+            count += a
+            begin += P
+        row = seconds + (span.to(tl.int64) * CHANNELS + own)[:, None] * CHANNELS
+        tl.store(row + other[None, :], second)
+        if down == across:
+            tl.store(firsts + span.to(tl.int64) * CHANNELS + own, first)
+            if pair == 0:
+                tl.store(counts + span, tl.sum(count, 0))
+
+
+@triton.jit
+def add_moments(
+    counts, firsts, seconds, shift, count, mean, centred, spans,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
+):  # fmt: skip
+    """Count, mean and centred second moment of all spans, in float64; ENTRIES of the matrix a program.
+
+    Args:
+        counts, firsts, seconds, shift: of `shifted_moments`.
+        count: [] float64; mean: [CHANNELS]; centred: [CHANNELS, CHANNELS]; all 0 where no position has weight.
+    """
+    entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
+    i, j = entry // CHANNELS, entry % CHANNELS
+    # The lower pairs were not made: their mirror images were.
+    place = tl.where(i // TILE <= j // TILE, entry, j * CHANNELS + i)
+    n = tl.zeros([S], tl.float64)
+    down, across, second = (
+        tl.zeros([ENTRIES], tl.float64),
+        tl.zeros([ENTRIES], tl.float64),
+        tl.zeros([ENTRIES], tl.float64),
+    )
+    begin = tl.zeros([], tl.int32)
+    while begin < spans:
+        span = begin + tl.arange(0, S)
+        there = span < spans
+        row = (span.to(tl.int64) * CHANNELS)[:, None]
+        n += tl.load(counts + span, mask=there, other=0.0).to(tl.float64)
+        down += tl.sum(tl.load(firsts + row + i[None, :], mask=there[:, None], other=0.0).to(tl.float64), 0)
+        across += tl.sum(tl.load(firsts + row + j[None, :], mask=there[:, None], other=0.0).to(tl.float64), 0)
+        each = tl.load(seconds + row * CHANNELS + place[None, :], mask=there[:, None], other=0.0)
+        second += tl.sum(each.to(tl.float64), 0)
+        begin += S
+    total = tl.sum(n, 0)
+    some = total > 0
+    divisor = tl.where(some, total, 1.0)
+    tl.store(centred + entry, second - (down / divisor) * (across / divisor) * total)
+    own = tl.where(some, tl.load(shift + j).to(tl.float64) + across / divisor, 0.0)
+    tl.store(mean + j, own, mask=i == 0)
+    tl.store(count, total, mask=tl.program_id(0) == 0)

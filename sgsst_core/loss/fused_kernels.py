@@ -1,0 +1,90 @@
+"""GPU kernels of a layer's style loss and of its gradient with respect to the features.
+
+Run in Triton's interpreter on the CPU too (TRITON_INTERPRET=1 before the first import).
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from sgsst_core.features.fused_kernels import load_centred, load_weights
+
+
+@triton.jit
+def compare(
+    count, mean, centred, target_gram, target_mean, target_std, terms, matrix, own_mean, offset,
+    GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
+    ROWS: tl.constexpr,
+):  # fmt: skip
+    """`terms.style_loss`, in float64; ROWS channels a program.
+
+    Args:
+        count, mean, centred: of the view's statistics.
+        target_gram, target_mean, target_std: of the style.
+        terms: [CHANNELS, 4] float64, what each channel adds to each term.
+        matrix, own_mean, offset: [CHANNELS, CHANNELS], [CHANNELS], [CHANNELS] float32, of `terms.StyleGradient`.
+    """
+    i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+    j = tl.arange(0, CHANNELS)
+    entry = i[:, None] * CHANNELS + j[None, :]
+    n = tl.load(count)
+    some = n > 0
+    divisor = tl.where(some, n, 1.0)
+    share = tl.where(some, 1.0 / divisor, 0.0)
+    own, means = tl.load(mean + i), tl.load(mean + j)
+    gram_error = tl.load(centred + entry) / divisor + own[:, None] * means[None, :] - tl.load(target_gram + entry)
+    mean_error = own - tl.load(target_mean + i)
+    std = tl.sqrt(tl.maximum(tl.load(centred + i * CHANNELS + i), 0.0) / divisor)
+    std_error = std - tl.load(target_std + i)
+    slope = tl.where(std > EPS * tl.abs(own), std_error / tl.where(std > 0, std, 1.0), 0.0)
+    weight: tl.constexpr = GRAM / (CHANNELS * CHANNELS)
+    line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
+    drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
+    line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
+    tl.store(matrix + entry, (line * share).to(tl.float32))
+    tl.store(own_mean + i, own.to(tl.float32))
+    tl.store(offset + i, drawn.to(tl.float32))
+    present = tl.where(some, 1.0, 0.0).to(tl.float64)
+    squares = tl.sum(gram_error * gram_error, 1) / (CHANNELS * CHANNELS)
+    tl.store(terms + 4 * i, present * weight * squares)
+    tl.store(terms + 4 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error)
+    tl.store(terms + 4 * i + 2, present * (STD / CHANNELS) * std_error * std_error)
+    tl.store(terms + 4 * i + 3, 0.0 * own)
+
+
+@triton.jit
+def add_style_gradient(
+    features, weights, gradient, matrix, mean, offset,
+    positions, width, row_step, column_step, weight_row_step, weight_column_step, out_row_step, out_column_step,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """gradient_p += a_p (matrix (F_p - mean) + offset), for P positions and TILE channels a program.
+
+    Args:
+        features: [h, width, CHANNELS], float32 or bfloat16.
+        weights: [h, width] position weights, or anything where WEIGHTED is false.
+        gradient: [h, width, CHANNELS], in the features' type, changed in place.
+        matrix, mean, offset: of `compare`; the matrix is symmetric.
+        positions: h * width.
+    """
+    position = tl.program_id(0) * P + tl.arange(0, P)
+    there = position < positions
+    own = tl.program_id(1) * TILE + tl.arange(0, TILE)
+    sums = tl.zeros([P, TILE], tl.float32)
+    k = tl.zeros([], tl.int32)
+    while k < CHANNELS:
+        channel = k + tl.arange(0, TILE)
+        centred = load_centred(features, mean, row_step, column_step, width, position, channel, there)
+        part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :])
+        sums += tl.dot(centred, part, input_precision=PRECISION)
+        k += TILE
+    a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
+    sums = (sums + tl.load(offset + own)[None, :]) * a[:, None]
+    place = (position // width).to(tl.int64) * out_row_step + (position % width).to(tl.int64) * out_column_step
+    target = gradient + place[:, None] + own[None, :]
+    before = tl.load(target, mask=there[:, None], other=0.0)
+    tl.store(target, (before.to(tl.float32) + sums).to(before.dtype), mask=there[:, None])
