@@ -293,11 +293,11 @@ class SosLoss:
             parts, numbers = self._wait(waiting)
             with self.timer("statistics"):
                 statistics = dict(zip(self.style_layers, parts, strict=True))
-                pass_.terms = LossTerms(**dict(zip(TERMS, numbers, strict=True)))
+                pass_.terms = LossTerms(**dict(zip(TERMS, numbers.tolist(), strict=True)))
                 self._compare(pass_, statistics, style[pass_.scale])
         yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
 
-    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], list[float]]:
+    def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], Tensor]:
         with self.timer("communication"):
             return merged()
 
@@ -359,7 +359,8 @@ class SosLoss:
                     terms += pass_.tile_terms(tile, activations)
                 if keep_this:
                     kept[-1][tile] = activations
-            merged.append(self.collectives.all_reduce_statistics(statistics, list(terms.values())))
+            numbers = torch.tensor(list(terms.values()), dtype=torch.float64, device=pass_.image.device)
+            merged.append(self.collectives.all_reduce_statistics(statistics, numbers))
         return merged, kept
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
