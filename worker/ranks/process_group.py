@@ -59,13 +59,16 @@ def process_group(
         return
     patience = max(timeout, PREPARING)
     device, store = _meet(rank, size, address, with_index(device), patience)
-    backend = _backend(device)
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    # With its device named, NCCL connects all ranks here, not within the first exchange; gloo does not take the name.
-    named = device if "nccl" in backend else None
-    dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=named)
-    collectives = ProcessGroupCollectives(dist.group.WORLD, device, timeout)
+    dist.init_process_group(
+        _backend(device), store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device)
+    )
+    # Or else subgroups would be split off this group's connections, for which every rank is needed: even those that
+    # the job has left out by then.
+    world: Any = dist.group.WORLD
+    world.bound_device_id = None
+    collectives = ProcessGroupCollectives(world, device, timeout)
     try:
         yield collectives
     finally:
@@ -93,6 +96,14 @@ def _backend(device: torch.device) -> str:
     return "cpu:gloo,cuda:nccl" if device.type == "cuda" and dist.is_nccl_available() else "gloo"
 
 
+def _named(device: torch.device) -> torch.device | None:
+    """The device that a group is made for: NCCL then connects it at once, not within the first exchange.
+
+    Gloo does not take one.
+    """
+    return device if "nccl" in _backend(device) else None
+
+
 def with_index(device: torch.device | str) -> torch.device:
     """The device; a GPU with its number, without which it can neither be made the current one nor given to NCCL."""
     found = torch.device(device)
@@ -118,6 +129,7 @@ class ProcessGroupCollectives:
         self.size = dist.get_world_size(group)
         self._group = group
         self._device = device
+        self._named = _named(device)
         self._timeout = timeout
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._subgroups: list[ProcessGroupCollectives] = []
@@ -254,7 +266,7 @@ class ProcessGroupCollectives:
         own: Collectives | None = None
         for ranks in all_ranks:
             members = [dist.get_global_rank(self._group, rank) for rank in ranks]
-            group = dist.new_group(members, timeout=max(self._timeout, PREPARING))
+            group = dist.new_group(members, timeout=max(self._timeout, PREPARING), device_id=self._named)
             if self.rank in ranks:
                 own = ALONE if len(ranks) == 1 else self._of_group(group)
         return own
