@@ -5,6 +5,7 @@ Geometry is frozen, and so is what a view shows: ranks agree on it at the view's
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,7 +49,14 @@ class ShownGaussians:
         return gaussians_sent(self.count, self.total) < self.total
 
     def indices(self) -> Tensor:
-        """[count] int64, in rising order; nothing waits for the device."""
+        """[count] int64, in rising order."""
+        if self._bits.device.type == "cpu":  # an order of magnitude faster there
+            mask = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
+            return torch.from_numpy(np.flatnonzero(mask))
+        return self._device_indices()
+
+    def _device_indices(self) -> Tensor:
+        """`indices` on any device, for which nothing waits."""
         mask = (self._bits[:, None] >> _places(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
         return torch.nonzero_static(mask, size=self.count)[:, 0]
 

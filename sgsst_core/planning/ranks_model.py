@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 
 from sgsst_core.features.partition import choose_tile_size, computed_twice, kept_tiles, partition
-from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel.collectives import Collectives, Traffic
 from sgsst_core.parallel.division import Piece, divide, rounds
 from sgsst_core.parallel.shown import gaussians_sent
 
@@ -107,11 +107,28 @@ class IterationWork:
         """Seconds in which ranks wait for what others send. Statistics of all scales but the last travel meanwhile."""
         if ranks == 1:
             return 0.0
-        height, width = max(piece.size for piece in self.pieces)
-        image = 2 * link.all_gather(height * width * 12, ranks) if self.whole_image else 0.0
+        image = 2 * link.all_gather(self._image_bytes, ranks) if self.whole_image else 0.0
         statistics = link.all_reduce(_FIRST_BYTES, ranks) + link.all_reduce(_SECOND_BYTES, ranks)
-        sent = self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)
-        return image + statistics + link.all_reduce(int(12 * sent), ranks)
+        return image + statistics + link.all_reduce(self._gradient_bytes, ranks)
+
+    def sent(self, ranks: int) -> dict[Traffic, int]:
+        """Bytes that a rank sends for each purpose, of all scales; what `Collectives.sent` counts."""
+        twice = 2 * (ranks - 1) / ranks  # once to bring in what belongs together, once to share it out
+        statistics = len(self.pieces) * (_FIRST_BYTES + _SECOND_BYTES)
+        return {
+            "image": int(twice * self._image_bytes) if self.whole_image else 0,
+            "statistics": int(twice * statistics),
+            "gradient": int(twice * self._gradient_bytes),
+        }
+
+    @property
+    def _image_bytes(self) -> int:
+        height, width = max(piece.size for piece in self.pieces)
+        return 12 * height * width
+
+    @property
+    def _gradient_bytes(self) -> int:
+        return int(12 * (self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)))
 
     def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
         """Of one iteration of one view, on each of so many groups of ranks."""

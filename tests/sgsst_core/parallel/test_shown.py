@@ -13,7 +13,8 @@ from sgsst_core.parallel.shown import DENSE_SHARE, ShownGaussians, gaussians_sen
 def test_a_set_holds_what_its_mask_says(gaussians: int, share: float) -> None:
     mask = torch.rand(gaussians, generator=torch.Generator().manual_seed(gaussians)) < share
     shown = ShownGaussians(mask)
-    assert torch.equal(shown.indices(), mask.nonzero()[:, 0])
+    for found in (shown.indices(), shown._device_indices()):
+        assert torch.equal(found, mask.nonzero()[:, 0])
     assert (shown.count, shown.total) == (int(mask.sum()), gaussians)
     assert shown._bits.nbytes == ShownGaussians.nbytes(gaussians)
 

@@ -46,6 +46,17 @@ def test_a_gradient_travels_for_what_the_view_shows() -> None:
     assert sent(None) - sent(20_000) == pytest.approx(saved)
 
 
+def test_bytes_that_are_sent_are_those_that_ranks_wait_for_but_for_statistics_of_other_scales() -> None:
+    one_scale = replace(work(scales=1), shown=20_000)
+    link = Link(1e6, 0.0)
+    for ranks in (2, 3, 4):
+        sent = one_scale.sent(ranks)
+        assert one_scale.communication(ranks, link) == pytest.approx(sum(sent.values()) / 1e6, rel=1e-5)
+        assert replace(work(scales=3), shown=20_000).sent(ranks)["statistics"] == pytest.approx(3 * sent["statistics"])
+    assert set(work().sent(1).values()) == {0}
+    assert replace(work(), whole_image=False).sent(2)["image"] == 0
+
+
 def test_groups_add_up_whole_gradients() -> None:
     """What the views of a step show together is not known."""
     phases = [(0, [work()]), (10, [replace(work(), shown=1)])]
