@@ -6,7 +6,6 @@ be repeated bit for bit, and every rank receives the same bits.
 
 from __future__ import annotations
 
-import functools
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
@@ -133,6 +132,7 @@ class ProcessGroupCollectives:
         self._timeout = timeout
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._subgroups: list[ProcessGroupCollectives] = []
+        self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
         # Where statistics travel while the next scale is computed: a stream of a GPU, which waits for others while the
         # host goes on; one thread of a CPU. One, because exchanges meet by their order, the same on every rank.
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
@@ -215,13 +215,29 @@ class ProcessGroupCollectives:
         for part, mean in zip(parts, means, strict=True):
             away = part.mean - mean
             moment = part.centred + torch.outer(away, away) * part.count
-            moments.append(moment[_upper(len(mean), moment.device)])  # symmetric: one half travels
+            moments.append(moment[self._half(moment)])  # symmetric: one half travels
         halves = self.all_reduce(torch.cat(moments), "statistics").split([len(moment) for moment in moments])
         merged = [
-            LayerStatistics(total[0], mean, _symmetric(half, len(mean)))
+            LayerStatistics(total[0], mean, self._symmetric(half, len(mean)))
             for total, mean, half in zip(totals, means, halves, strict=True)
         ]
         return merged, added
+
+    def _half(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows [n] and columns [n] of one half of a symmetric matrix with its diagonal, made once."""
+        key = len(matrix), matrix.device
+        if key not in self._halves:
+            rows, columns = torch.triu_indices(len(matrix), len(matrix), device=matrix.device).unbind()
+            self._halves[key] = rows, columns
+        return self._halves[key]
+
+    def _symmetric(self, half: Tensor, channels: int) -> Tensor:
+        """The matrix [channels, channels] of one half."""
+        matrix = half.new_empty((channels, channels))
+        rows, columns = self._half(matrix)
+        matrix[rows, columns] = half
+        matrix[columns, rows] = half
+        return matrix
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""
@@ -286,19 +302,3 @@ def _keep_for(stream: torch.cuda.Stream, parts: Sequence[LayerStatistics], numbe
     """Memory of tensors of another stream is not given to others before this one has done with it."""
     for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centred))):
         tensor.record_stream(stream)
-
-
-@functools.lru_cache(maxsize=64)  # one for each number of channels: made once, not in every step
-def _upper(channels: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Rows [n] and columns [n] of one half of a symmetric matrix with its diagonal."""
-    rows, columns = torch.triu_indices(channels, channels, device=device).unbind()
-    return rows, columns
-
-
-def _symmetric(half: Tensor, channels: int) -> Tensor:
-    """The matrix [channels, channels] of one half."""
-    matrix = half.new_empty((channels, channels))
-    rows, columns = _upper(channels, half.device)
-    matrix[rows, columns] = half
-    matrix[columns, rows] = half
-    return matrix
