@@ -109,6 +109,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
     together = build(collectives)
     alone = build(ALONE) if collectives.rank == 0 else None
     steps: dict[str, list[dict[str, float]]] = {"together": [], "alone": []}
+    sent: dict[str, int] = {}
     for turn in range(rounds + 1):
         for name, stylizer in (("together", together), ("alone", alone)):
             collectives.all_gather(None)  # nobody else computes while one rank is alone
@@ -118,6 +119,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
                 if turn:
                     seconds = {"total": stylizer.seconds - before, **processor_seconds(used)}
                     steps[name].append({**record.parts, **seconds})
+                    sent = record.sent or sent
     waiting = collectives.all_gather([step["communication"] / step["total"] for step in steps["together"]])
     kernel = collectives.all_gather([step["processor_system"] for step in steps["together"]])
     peak = collectives.all_gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
@@ -139,6 +141,8 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "waiting_share_by_rank": [statistics.median(share) for share in waiting],
         "system_seconds_by_rank": [statistics.median(seconds) for seconds in kernel],
         "peak_gb_by_rank": peak,
+        "bytes_sent": sent,
+        "shown": together.plan.survey.shown,
         "steps": steps,
         "pieces": [[piece.scale, *piece.size] for piece in pieces],
         "halo": halo,
@@ -179,12 +183,14 @@ def modelled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) ->
         held=figures["held_pixels"],
         working=figures["working"],
         sharing=ranks,
+        shown=figures["shown"],
     )
     seconds = work.seconds(ranks, link)
     return {
         "model_seconds": seconds,
         "model_communication_share": work.communication(ranks, link) / seconds,
         "model_error": seconds / figures["seconds"] - 1,
+        "model_bytes_sent": work.sent(ranks),
     }
 
 

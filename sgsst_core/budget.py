@@ -55,6 +55,10 @@ class Shelf(Generic[K, V]):
             self.used += size
         return value
 
+    def holds(self, key: K, size: int) -> bool:
+        """Whether the value of a key is kept, or would be: there is room for so many bytes."""
+        return key in self._kept or self.used + size <= self._capacity
+
     def clear(self) -> None:
         """Keep nothing of what is there."""
         self._kept.clear()

@@ -53,6 +53,15 @@ def test_ray_starts_in_a_folder_and_on_an_address_of_our_own(option: str) -> Non
     )
 
 
+def test_a_process_group_forgets_its_device() -> None:
+    import torch.distributed as dist
+
+    assert isinstance(getattr(dist.ProcessGroup, "bound_device_id", None), property), (
+        "A process group no longer has bound_device_id. Find how groups of some ranks are made without the others, and "
+        "change `process_group` in worker/ranks/process_group.py; else GPU ranks hang once the plan has left some out."
+    )
+
+
 def test_a_process_group_can_be_told_how_long_to_wait() -> None:
     from torch.distributed import distributed_c10d
 

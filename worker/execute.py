@@ -15,7 +15,7 @@ from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.report.charts import write_loss_chart
 from sgsst_core.report.contact_sheet import write_contact_sheet
-from sgsst_core.report.document import bought, build_report, plan_json
+from sgsst_core.report.document import bought, build_report, plan_json, sent_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation
@@ -150,7 +150,8 @@ def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evalua
         findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near)
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
-        report["workers"] = {**job.workers, "seconds_lost": round(lost, 3)}
+        sent = sent_json(stylizer.history)
+        report["workers"] = {**job.workers, "bytes_sent": sent, "seconds_lost": round(lost, 3)}
         write_json(outputs.report, report)
         write_contact_sheet(outputs.sheet, stylizer)
         write_loss_chart(outputs.curves, report)

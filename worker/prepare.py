@@ -15,9 +15,10 @@ import torch
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import common_device
+from sgsst_core.planning.probe import common_device, rasterizer_problem
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
@@ -111,11 +112,15 @@ def prepare(
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
     """The plan of a resumed job; None where there is none, or where it was made for another device.
 
-    Nor can a plan made for fewer ranks say what more of them are good for.
+    Nor can a plan made for fewer ranks say what more of them are good for. A GPU's rasterizer is tried before it is
+    relied upon: its kernels may have to be compiled here, which takes longer than ranks wait for each other in a step.
     """
     if resumed is None or collectives.size > resumed.ranks:
         return None
-    return resumed.plan if resumed.plan.device == common_device(collectives) else None
+    plan = resumed.plan
+    if plan.device != common_device(collectives):
+        return None
+    return None if plan.rasterizer in GPU_RASTERIZERS and rasterizer_problem(collectives, plan.rasterizer) else plan
 
 
 def _workers_used(stylizer: Stylizer) -> dict[str, Any]:

@@ -6,8 +6,9 @@ rank" are the same bits, so that whatever follows from them is decided alike eve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Literal, Protocol, TypeVar, get_args
 
 from torch import Tensor
 
@@ -16,8 +17,13 @@ from sgsst_core.rasterizer.arguments import Rows
 
 T = TypeVar("T")
 
-#: Waits for statistics under way: those of all ranks together, and the sums of the numbers that went with them.
+#: Waits for statistics under way: those of all ranks together, and the sums [k] float64 of the numbers that went with
+#: them. On a GPU the device waits, not the caller.
 Merged = Callable[[], tuple[list[LayerStatistics], Tensor]]
+
+#: What tensors are sent for.
+Traffic = Literal["image", "statistics", "gradient"]
+TRAFFIC: tuple[Traffic, ...] = get_args(Traffic)
 
 
 class Collectives(Protocol):
@@ -33,6 +39,14 @@ class Collectives(Protocol):
     size: int
     local_size: int
 
+    @property
+    def sent(self) -> Mapping[Traffic, int]:
+        """Bytes of tensors that this rank has sent so far, as rings move them; of other values, all are small.
+
+        One count for this group, the one that it was made of, and those made of it.
+        """
+        ...
+
     def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
         """The image [H, ...] of every rank's band of rows [h, ...]; `bands` says which rows each has, in order."""
         ...
@@ -41,12 +55,16 @@ class Collectives(Protocol):
         """This rank's band [h, ...] of the sum over all ranks' images [H, ...]: the adjoint of `all_gather_rows`."""
         ...
 
-    def all_reduce(self, tensor: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         """The sum over all ranks, the same on every rank. The argument may be overwritten."""
         ...
 
+    def union(self, mask: Tensor) -> Tensor:
+        """[n] bool: where any rank's mask [n] bool is true; the same on every rank."""
+        ...
+
     def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
-        """Start merging the statistics of disjoint positions, layer by layer, and adding up some float64 numbers [k].
+        """Start merging the statistics of disjoint positions, layer by layer, and adding up numbers [k] float64.
 
         Returns at once; what it returns waits for the result, the same on every rank. No other exchange may be started
         before all results have been waited for, but for further ones of this kind.
@@ -85,6 +103,7 @@ class _Alone:
     """The collectives of one rank."""
 
     rank, size, local_size = 0, 1, 1
+    sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
 
     def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
         return band
@@ -92,8 +111,11 @@ class _Alone:
     def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
         return image
 
-    def all_reduce(self, tensor: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         return tensor
+
+    def union(self, mask: Tensor) -> Tensor:
+        return mask
 
     def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
         return lambda: (list(parts), numbers)

@@ -215,6 +215,7 @@ class _Deciding:
                     held=self.tiling.held * sharing,
                     working=self.tiling.working,
                     sharing=sharing,
+                    shown=self.base.survey.shown,
                 )
             )
         return found

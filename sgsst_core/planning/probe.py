@@ -32,7 +32,7 @@ from sgsst_core.planning.plan import Device
 from sgsst_core.planning.pruning import ImageError, distinct_views, pruned_image_error
 from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import Survey
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
@@ -205,11 +205,16 @@ def gpu_problems(collectives: Collectives) -> dict[str, str]:
     """
     problems: dict[str, str] = {}
     for name in GPU_RASTERIZERS:
-        problem = next(filter(None, collectives.all_gather(drawing_problem(name))), None)
+        problem = rasterizer_problem(collectives, name)
         if problem is None:
             break
         problems[name] = problem
     return problems
+
+
+def rasterizer_problem(collectives: Collectives, name: RasterizerName) -> str | None:
+    """Why one of the ranks cannot draw with a GPU rasterizer; None where all can."""
+    return next(filter(None, collectives.all_gather(drawing_problem(name))), None)
 
 
 def sharing_memory(collectives: Collectives, device: Device) -> int:

@@ -15,15 +15,17 @@ from dataclasses import dataclass
 import torch
 
 from sgsst_core.features.partition import choose_tile_size, computed_twice, kept_tiles, partition
-from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel.collectives import Collectives, Traffic
 from sgsst_core.parallel.division import Piece, divide, rounds
+from sgsst_core.parallel.shown import gaussians_sent
 
 #: Channels of the style layers: their statistics travel as n, mean and one half of C, in float64.
 _STYLE_CHANNELS = (64, 128, 256, 512, 512)
 _FIRST_BYTES = 8 * sum(c + 1 for c in _STYLE_CHANNELS)
 _SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
-#: Bytes on which a link is timed: enough to fill it, and no more than some views' images.
-_PROBE_BYTES = 4 << 20
+#: Bytes on which a link is timed, between processors and between GPUs: enough to fill it, and no more than some views'
+#: images.
+_PROBE_BYTES = {"cpu": 4 << 20, "cuda": 64 << 20}
 #: Further ranks must save at least this share of an iteration.
 LEAST_GAIN = 0.03
 
@@ -60,6 +62,7 @@ class IterationWork:
         raster: seconds of render and gradient on one rank.
         fixed: seconds that every rank needs, however many there are: comparing statistics, the optimiser.
         gaussians: that are optimised.
+        shown: that the view shows, for which alone its gradient travels; None for all.
         whole_image: the full-size image and its gradient are exchanged (phase 1 with kept weights needs neither).
         forward: seconds a pixel of a forward pass alone, for pixels whose activations do not stay in memory.
         held, working: pixels whose activations one rank alone can hold, and what a pass needs beside them as a share of
@@ -78,6 +81,7 @@ class IterationWork:
     held: float = math.inf
     working: float = 0.0
     sharing: int = 1
+    shown: float | None = None
 
     def computing(self, ranks: int, groups: int = 1) -> float:
         """Seconds of the rank with most work, where so many groups of ranks take a view each."""
@@ -103,10 +107,28 @@ class IterationWork:
         """Seconds in which ranks wait for what others send. Statistics of all scales but the last travel meanwhile."""
         if ranks == 1:
             return 0.0
-        height, width = max(piece.size for piece in self.pieces)
-        image = 2 * link.all_gather(height * width * 12, ranks) if self.whole_image else 0.0
+        image = 2 * link.all_gather(self._image_bytes, ranks) if self.whole_image else 0.0
         statistics = link.all_reduce(_FIRST_BYTES, ranks) + link.all_reduce(_SECOND_BYTES, ranks)
-        return image + statistics + link.all_reduce(self.gaussians * 12, ranks)
+        return image + statistics + link.all_reduce(self._gradient_bytes, ranks)
+
+    def sent(self, ranks: int) -> dict[Traffic, int]:
+        """Bytes that a rank sends for each purpose, of all scales; what `Collectives.sent` counts."""
+        twice = 2 * (ranks - 1) / ranks  # once to bring in what belongs together, once to share it out
+        statistics = len(self.pieces) * (_FIRST_BYTES + _SECOND_BYTES)
+        return {
+            "image": int(twice * self._image_bytes) if self.whole_image else 0,
+            "statistics": int(twice * statistics),
+            "gradient": int(twice * self._gradient_bytes),
+        }
+
+    @property
+    def _image_bytes(self) -> int:
+        height, width = max(piece.size for piece in self.pieces)
+        return 12 * height * width
+
+    @property
+    def _gradient_bytes(self) -> int:
+        return int(12 * (self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)))
 
     def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
         """Of one iteration of one view, on each of so many groups of ranks."""
@@ -117,19 +139,31 @@ def probe_link(collectives: Collectives, device: torch.device) -> Link:
     """Time sums over all ranks; the same result on every rank. One rank has nobody to send to."""
     if collectives.size == 1:
         return Link(math.inf, 0.0)
-    seconds = []
-    for size in (8, _PROBE_BYTES):
-        tensor = torch.zeros(size // 4, device=device)
-        for _ in range(3):  # the first one makes the connections
-            collectives.all_gather(None)
-            started = time.perf_counter()
-            float(collectives.all_reduce(tensor)[0])
-            last = time.perf_counter() - started
-        seconds.append(last)
-    short, long = (max(each) for each in zip(*collectives.all_gather(seconds), strict=True))
+    largest = _PROBE_BYTES[device.type]
+    short, long = (_slowest_sum(collectives, device, size) for size in (8, largest))
     steps = 2 * (collectives.size - 1)
-    moved = steps * _PROBE_BYTES / collectives.size
+    moved = steps * largest / collectives.size
     return Link(moved / max(long - short, 1e-9), short / steps)
+
+
+def _slowest_sum(collectives: Collectives, device: torch.device, size: int) -> float:
+    """Seconds of the rank that waits longest for the sum of tensors of so many bytes; the last of three counts."""
+    tensor = torch.zeros(size // 4, device=device)
+    seconds = 0.0
+    for _ in range(3):  # the first one makes the connections
+        _wait_for(device)
+        collectives.all_gather(None)
+        started = time.perf_counter()
+        collectives.all_reduce(tensor)
+        _wait_for(device)
+        seconds = time.perf_counter() - started
+    return max(collectives.all_gather(seconds))
+
+
+def _wait_for(device: torch.device) -> None:
+    """Until a device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 @dataclass(frozen=True)

@@ -47,12 +47,14 @@ class Survey:
         covered: indices of the views that see anything.
         regions: for each view, the rectangle that holds every covered pixel.
         uncovered_share: share of uncovered pixels in the views that see anything.
+        shown: Gaussians that such a view shows, their mean; None in surveys that did not count them.
     """
 
     total_blend_weights: Tensor
     covered: list[int]
     regions: list[Rectangle]
     uncovered_share: float
+    shown: float | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class _Look:
     uncovered: float  # pixels
     pixels: int
     covered: bool
+    shown: int  # Gaussians
 
 
 def survey(
@@ -98,7 +101,8 @@ def survey(
     weights = collectives.all_reduce(weights.to(rasterizer.device)).cpu()
     uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
     regions = [looks[index].region for index in range(len(cameras))]
-    return Survey(weights, covered, regions, uncovered_share)
+    shown = sum(looks[index].shown for index in covered) / len(covered)
+    return Survey(weights, covered, regions, uncovered_share, shown)
 
 
 def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
@@ -106,10 +110,13 @@ def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
     coverage = rasterizer.coverage(camera)
     seen = sees_something(coverage)
     uncovered = float((1 - coverage).sum(dtype=torch.float64))
+    shown = 0
     if seen:
         ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
-        weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
-    return _Look(covered_region(coverage), uncovered, coverage.numel(), seen)
+        own = rasterizer.colour_gradient(ones, camera)[:, 0].cpu()
+        weights += own.double()
+        shown = int((own > 0).sum())
+    return _Look(covered_region(coverage), uncovered, coverage.numel(), seen, shown)
 
 
 def _progress(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:

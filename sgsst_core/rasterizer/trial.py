@@ -1,10 +1,17 @@
 """Whether a GPU rasterizer works here: one Gaussian is drawn to see.
 
 A package that can be imported may still lack its compiled kernels, or have those of another CUDA, which shows at their
-first use: in the middle of a job, if nobody has tried before.
+first use: in the middle of a job, if nobody has tried before. gsplat compiles its kernels then, and processes that do
+so at the same time delete each other's files: they try one after the other.
 """
 
 from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 
@@ -15,7 +22,19 @@ from sgsst_core.scene.gaussians import Scene
 
 
 def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -> str | None:
-    """Why a rasterizer cannot draw on a device, in a few words; None where it can."""
+    """Why a rasterizer cannot draw on a device, in a few words; None where it can.
+
+    Takes minutes where kernels are compiled, here or by another process. Afterwards they are at hand.
+    """
+    try:
+        with one_at_a_time(build_folder()):
+            drawn = _draws(name, device)
+    except Exception as error:  # whatever it is, it cannot be used
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return None if drawn else "it draws nothing"
+
+
+def _draws(name: RasterizerName, device: torch.device | str) -> bool:
     gaussian = Scene(
         torch.tensor([[0.0, 0.0, 2.0]]),
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -25,11 +44,34 @@ def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -
         torch.zeros(1, 0, 3),
     )
     camera = Camera("trial", RASTER_TILE, RASTER_TILE, 16.0, 16.0, 8.0, 8.0, torch.eye(4, dtype=torch.float64))
+    rasterizer = make_rasterizer(name, gaussian, device=device)
+    image = rasterizer.render(torch.ones(1, 3), camera)
+    gradient = rasterizer.colour_gradient(torch.ones_like(image), camera)
+    return float(image.sum()) > 0 and float(gradient.sum()) > 0
+
+
+def build_folder() -> Path:
+    """Where PyTorch compiles extensions."""
+    from torch.utils.cpp_extension import get_default_build_root  # looks for compilers when it is imported
+
+    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root())
+
+
+@contextmanager
+def one_at_a_time(folder: Path) -> Iterator[None]:
+    """Wait until no other process is inside this block for the same folder, and keep others out until it ends.
+
+    The system lifts the lock of a process that dies. Where nothing can be written nothing can be compiled either, and
+    nobody waits.
+    """
     try:
-        rasterizer = make_rasterizer(name, gaussian, device=device)
-        image = rasterizer.render(torch.ones(1, 3), camera)
-        gradient = rasterizer.colour_gradient(torch.ones_like(image), camera)
-        drawn = float(image.sum()) > 0 and float(gradient.sum()) > 0
-    except Exception as error:  # whatever it is, it cannot be used
-        return (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return None if drawn else "it draws nothing"
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / "sgsst.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError:
+        yield
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)

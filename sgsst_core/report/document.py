@@ -12,6 +12,7 @@ from typing import Any
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.terms import LossTerms
+from sgsst_core.parallel.collectives import TRAFFIC
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version
@@ -153,6 +154,16 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
         "speed_up": one_rank / seconds["sos"] if one_rank and seconds["sos"] else None,
         "peak_bytes": peak_memory(),
     }
+
+
+def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None:
+    """Bytes that the first rank sends to others in a step of either phase, median by kind; None where it has nobody."""
+    found: dict[str, dict[str, int]] = {}
+    for stage in ("coarse", "sos"):
+        steps = [record.sent for record in history if record.stage == stage and record.sent]
+        if steps:
+            found[stage] = {kind: int(median(step.get(kind, 0) for step in steps)) for kind in TRAFFIC}
+    return found or None
 
 
 #: Losses relative to the start, for which the report says when they were reached.

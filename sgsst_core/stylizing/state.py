@@ -23,6 +23,7 @@ class StepRecord:
         terms: split loss by scale.
         parts: seconds of this step by what they went into.
         memory: bytes of physical memory that the process held after the step.
+        sent: bytes that this rank sent to others, by what for (`collectives.Traffic`); empty for one rank.
     """
 
     step: int
@@ -33,6 +34,7 @@ class StepRecord:
     terms: dict[int, LossTerms]
     parts: dict[str, float]
     memory: int
+    sent: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass

@@ -250,6 +250,7 @@ class Stylizer:
         """
         started = time.perf_counter()
         self.timer.seconds.clear()
+        sent = dict(self.collectives.sent)
         phase = self.phase
         if phase.scale is None:
             self._coarse = None  # phase 1 is over
@@ -275,6 +276,7 @@ class Stylizer:
             terms,
             dict(self.timer.seconds),
             self._process.memory_info().rss,
+            {kind: total - sent[kind] for kind, total in self.collectives.sent.items() if total > sent[kind]},
         )
         self.history.append(record)
         return record

@@ -13,6 +13,7 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.loss.sos import ContentFeatures, Share, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide_rows
+from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -74,7 +75,9 @@ class Views:
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
-        self._rest: Shelf[int, Tensor] = Shelf(memory // 4, _tensor_bytes)
+        shown = memory // 16 if collectives.size > 1 else 0
+        self._shown: Shelf[_ShownKey, ShownGaussians] = Shelf(shown)
+        self._rest: Shelf[int, Tensor] = Shelf(memory // 4 - shown, _tensor_bytes)
         self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
         kept = memory // 2 if keep_content else 0
         self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept)
@@ -119,17 +122,48 @@ class Views:
         """
         rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
         if rasterizer.scale:
-            gradient = rasterizer.colour_gradient(image_gradient, camera)
+            rows, band = image_gradient, None
         else:
+            band = self._own_band(index)
             with self.loss.timer("communication"):
                 rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
-            gradient = self._nothing(len(colours), 3)
-            if len(rows):
-                gradient = rasterizer.colour_gradient(rows, camera, self._own_band(index))
-        with self.loss.timer("communication"):
-            gradient = self.collectives.all_reduce(gradient)
+        some = len(rows) > 0
+        gradient = rasterizer.colour_gradient(rows, camera, band) if some else self._nothing(len(colours), 3)
+        gradient = self._sum(gradient, self._shown_by(index, rasterizer, rows, band))
         # After the sum: which colours are let through depends on the sign of their whole gradient.
         return view_colours_gradient(gradient, colours, revive=self.revive)
+
+    def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
+        """The sum [N, 3] of every rank's gradient [N, 3], which is 0 but for the Gaussians that the view shows."""
+        with self.loss.timer("communication"):
+            if shown is None or not shown.sparse:
+                return self.collectives.all_reduce(gradient)
+            indices = shown.indices()
+            return gradient.index_copy_(0, indices, self.collectives.all_reduce(gradient.index_select(0, indices)))
+
+    def _shown_by(self, index: int, rasterizer: Rasterizer, rows: Tensor, band: Rows | None) -> ShownGaussians | None:
+        """The Gaussians that any rank's part of a view shows; None where there is nobody to tell, or no room.
+
+        Agreed upon at the first visit, from the blend weights of the gradients themselves: those of another
+        rasterizer, or of the whole view in place of its bands, may differ by rounding at the least opacity.
+
+        Args:
+            rows: [h, w, 3], this rank's part of the image gradient, for its shape.
+            band: the rows that it belongs to.
+        """
+        key, size = (index, rasterizer.scale), ShownGaussians.nbytes(len(self.scene))
+        if self.collectives.size == 1 or not self._shown.holds(key, size):
+            return None
+
+        def look() -> ShownGaussians:
+            mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
+            with self.loss.timer("prepare"):
+                if len(rows):  # weights are never negative: their sum is 0 where all of them are
+                    mask = rasterizer.colour_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
+            with self.loss.timer("communication"):
+                return ShownGaussians(self.collectives.union(mask))
+
+        return self._shown.get(key, look, size)
 
     def _nothing(self, *shape: int) -> Tensor:
         """What a rank without rows has to add."""
@@ -186,6 +220,8 @@ class Views:
         return self.loss.content_features(image(), scale, tiles)
 
 
+#: View, and scale of the rasterizer.
+_ShownKey = tuple[int, int]
 #: View, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
 

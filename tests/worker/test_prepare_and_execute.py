@@ -11,6 +11,7 @@ import pytest
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import read_scene
 from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
 from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
 from tests.worker.ranks.faults import Fault, small_request
@@ -116,6 +117,22 @@ def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: Sty
     assert again.resumed.state.step == 4
     assert len(warnings) == 1
     assert "not a readable checkpoint" in warnings[0]
+
+
+def test_a_rasterizer_that_does_not_work_here_is_planned_anew(request_: StylizeRequest) -> None:
+    """The checkpoint of a machine with another GPU, or with a compiler."""
+    if drawing_problem("cuda") is None:
+        pytest.skip("it works")
+    job = prepare(request_)
+    go_on(job, steps=3)
+    path = request_.out.with_name("s.checkpoint.safetensors")
+    saved = load_checkpoint(path, job.fingerprint)
+    save_checkpoint(path, replace(saved, plan=replace(saved.plan, rasterizer="cuda")), job.fingerprint)
+    again = prepare(request_, resume=Resume(True))
+    assert again.resumed is not None
+    assert again.resumed.plan.rasterizer == "cuda"
+    assert again.stylizer.plan.rasterizer == saved.plan.rasterizer
+    assert go_on(again).stopped == "finished"
 
 
 def test_what_may_start_anew_does_so_without_a_checkpoint(request_: StylizeRequest) -> None:

@@ -1,7 +1,7 @@
 """The exchanges of `sgsst_core.parallel.collectives` over torch.distributed: NCCL between GPUs, gloo between CPUs.
 
-Sums are made in an order that depends on the number of ranks alone, so that a run can be repeated bit for bit, and
-every rank receives the same bits.
+Sums are made in an order that depends on the number of ranks and on the size of what is summed alone, so that a run can
+be repeated bit for bit, and every rank receives the same bits.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 from torch.distributed.distributed_c10d import _set_pg_timeout
+from torch.distributed.rendezvous import rendezvous
 
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
+from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Merged, Traffic
 from sgsst_core.rasterizer import Rows
 
 T = TypeVar("T")
@@ -55,20 +56,51 @@ def process_group(
     if size == 1:
         yield ALONE
         return
-    device = with_index(device)
+    patience = max(timeout, PREPARING)
+    device, store = _meet(rank, size, address, with_index(device), patience)
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    # Values that are not tensors (plans, decisions) travel between CPUs in any case.
-    backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     dist.init_process_group(
-        backend, init_method=f"tcp://{address}", rank=rank, world_size=size, timeout=max(timeout, PREPARING)
+        _backend(device), store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device)
     )
-    collectives = ProcessGroupCollectives(dist.group.WORLD, device, timeout)
+    # Or else subgroups would be split off this group's connections, for which every rank is needed: even those that
+    # the job has left out by then.
+    world: Any = dist.group.WORLD
+    world.bound_device_id = None
+    collectives = ProcessGroupCollectives(world, device, timeout)
     try:
         yield collectives
     finally:
         collectives.close()
         dist.destroy_process_group()
+
+
+def _meet(rank: int, size: int, address: str, device: torch.device, timeout: timedelta) -> tuple[torch.device, Any]:
+    """The device that this rank's tensors lie on, and the ranks' store: GPUs where every rank has one, else the CPU.
+
+    Ranks tell each other before they form a group, because they must all form it for the same back ends.
+    """
+    store, *_ = next(rendezvous(f"tcp://{address}", rank, size, timeout=timeout))
+    store.set_timeout(timeout)
+    store.set(f"device/{rank}", device.type)
+    types = {store.get(f"device/{other}") for other in range(size)}
+    return (device if len(types) == 1 else torch.device("cpu")), store
+
+
+def _backend(device: torch.device) -> str:
+    """Of torch.distributed. Values that are not tensors (plans, decisions) travel between CPUs in any case.
+
+    Without NCCL, gloo copies tensors of GPUs to the host and back.
+    """
+    return "cpu:gloo,cuda:nccl" if device.type == "cuda" and dist.is_nccl_available() else "gloo"
+
+
+def _named(device: torch.device) -> torch.device | None:
+    """The device that a group is made for: NCCL then connects it at once, not within the first exchange.
+
+    Gloo does not take one.
+    """
+    return device if "nccl" in _backend(device) else None
 
 
 def with_index(device: torch.device | str) -> torch.device:
@@ -86,16 +118,24 @@ class ProcessGroupCollectives:
         group: whose exchanges these are.
         device: of the tensors.
         timeout: see `process_group`.
+        sent: counter to go on with; None for one of its own.
     """
 
-    def __init__(self, group: Any, device: torch.device, timeout: timedelta) -> None:
+    def __init__(
+        self, group: Any, device: torch.device, timeout: timedelta, sent: dict[Traffic, int] | None = None
+    ) -> None:
         self.rank = dist.get_rank(group)
         self.size = dist.get_world_size(group)
         self._group = group
         self._device = device
+        self._named = _named(device)
         self._timeout = timeout
+        self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._subgroups: list[ProcessGroupCollectives] = []
-        # One thread: exchanges meet by their order, which must be the same on every rank.
+        self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
+        # Where statistics travel while the next scale is computed: a stream of a GPU, which waits for others while the
+        # host goes on; one thread of a CPU. One, because exchanges meet by their order, the same on every rank.
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
         self.local_size = self.all_gather(_machine()).count(_machine())
 
@@ -112,6 +152,7 @@ class ProcessGroupCollectives:
         padded = band.new_zeros((largest, *band.shape[1:]))
         padded[: len(band)] = band
         gathered = [torch.empty_like(padded) for _ in bands]
+        self.sent["image"] += (self.size - 1) * padded.nbytes
         dist.all_gather(gathered, padded, group=self._group)
         return torch.cat([part[: stop - start] for part, (start, stop) in zip(gathered, bands, strict=True)])
 
@@ -120,18 +161,45 @@ class ProcessGroupCollectives:
         own = bands[self.rank][1] - bands[self.rank][0]
         received = image.new_empty((self.size * own, *image.shape[1:]))
         rows = [stop - start for start, stop in bands]
+        self.sent["image"] += image.nbytes // max(len(image), 1) * (len(image) - own)
         dist.all_to_all_single(received, image.contiguous(), [own] * self.size, rows, group=self._group)
         return received.view(self.size, own, *image.shape[1:]).sum(dim=0)
 
-    def all_reduce(self, tensor: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         """See `Collectives`."""
+        return self._reduce(tensor, traffic)
+
+    def union(self, mask: Tensor) -> Tensor:
+        """See `Collectives`."""
+        return self._reduce(mask.to(torch.uint8), "gradient", dist.ReduceOp.MAX).bool()
+
+    def _reduce(self, tensor: Tensor, traffic: Traffic, operation: Any = dist.ReduceOp.SUM) -> Tensor:
         tensor = tensor.contiguous()
-        dist.all_reduce(tensor, group=self._group)
+        self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
+        dist.all_reduce(tensor, operation, group=self._group)
         return tensor
 
     def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
         """See `Collectives`."""
-        return self._background.submit(self._merge, list(parts), numbers).result
+        if self._stream is None:
+            return self._background.submit(self._merge, list(parts), numbers).result
+        return self._merge_on(self._stream, list(parts), numbers)
+
+    def _merge_on(self, stream: torch.cuda.Stream, parts: list[LayerStatistics], numbers: Tensor) -> Merged:
+        """Merge on a stream of the GPU, beside what the caller's stream is given meanwhile; the host does not wait."""
+        stream.wait_stream(torch.cuda.current_stream(self._device))
+        _keep_for(stream, parts, numbers)
+        with torch.cuda.stream(stream):
+            merged, added = self._merge(parts, numbers)
+        ended = stream.record_event()
+
+        def wait() -> tuple[list[LayerStatistics], Tensor]:
+            caller = torch.cuda.current_stream(self._device)
+            caller.wait_event(ended)
+            _keep_for(caller, merged, added)
+            return merged, added
+
+        return wait
 
     def _merge(self, parts: list[LayerStatistics], numbers: Tensor) -> tuple[list[LayerStatistics], Tensor]:
         """Mean first, then second moments about it: sums of squares only, in which nothing can cancel.
@@ -139,23 +207,37 @@ class ProcessGroupCollectives:
         C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T, the pairwise update of
         Chan et al. (1979) for many parts at once.
         """
-        if self._device.type == "cuda":
-            torch.cuda.set_device(self._device)  # the current device belongs to a thread
         sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
-        flat = self.all_reduce(torch.cat([*sums, numbers]))
+        flat = self.all_reduce(torch.cat([*sums, numbers]), "statistics")
         *totals, added = flat.split([*(len(part) for part in sums), len(numbers)])
         means = [total[1:] / total[0].clamp_min(torch.finfo(total.dtype).tiny) for total in totals]
         moments = []
         for part, mean in zip(parts, means, strict=True):
             away = part.mean - mean
             moment = part.centred + torch.outer(away, away) * part.count
-            moments.append(moment[_upper(len(mean), moment.device).unbind()])  # symmetric: one half travels
-        halves = self.all_reduce(torch.cat(moments)).split([len(moment) for moment in moments])
+            moments.append(moment[self._half(moment)])  # symmetric: one half travels
+        halves = self.all_reduce(torch.cat(moments), "statistics").split([len(moment) for moment in moments])
         merged = [
-            LayerStatistics(total[0], mean, _symmetric(half, len(mean)))
+            LayerStatistics(total[0], mean, self._symmetric(half, len(mean)))
             for total, mean, half in zip(totals, means, halves, strict=True)
         ]
         return merged, added
+
+    def _half(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows [n] and columns [n] of one half of a symmetric matrix with its diagonal, made once."""
+        key = len(matrix), matrix.device
+        if key not in self._halves:
+            rows, columns = torch.triu_indices(len(matrix), len(matrix), device=matrix.device).unbind()
+            self._halves[key] = rows, columns
+        return self._halves[key]
+
+    def _symmetric(self, half: Tensor, channels: int) -> Tensor:
+        """The matrix [channels, channels] of one half."""
+        matrix = half.new_empty((channels, channels))
+        rows, columns = self._half(matrix)
+        matrix[rows, columns] = half
+        matrix[columns, rows] = half
+        return matrix
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""
@@ -200,11 +282,14 @@ class ProcessGroupCollectives:
         own: Collectives | None = None
         for ranks in all_ranks:
             members = [dist.get_global_rank(self._group, rank) for rank in ranks]
-            group = dist.new_group(members, timeout=max(self._timeout, PREPARING))
+            group = dist.new_group(members, timeout=max(self._timeout, PREPARING), device_id=self._named)
             if self.rank in ranks:
-                own = ALONE if len(ranks) == 1 else ProcessGroupCollectives(group, self._device, self._timeout)
-        if isinstance(own, ProcessGroupCollectives):
-            self._subgroups.append(own)
+                own = ALONE if len(ranks) == 1 else self._of_group(group)
+        return own
+
+    def _of_group(self, group: Any) -> ProcessGroupCollectives:
+        own = ProcessGroupCollectives(group, self._device, self._timeout, self.sent)
+        self._subgroups.append(own)
         return own
 
 
@@ -213,15 +298,7 @@ def _machine() -> tuple[str, str]:
     return socket.gethostname(), os.environ.get("HOSTNAME", "")
 
 
-def _upper(channels: int, device: torch.device) -> Tensor:
-    """Places [2, n] of one half of a symmetric matrix with its diagonal."""
-    return torch.triu_indices(channels, channels, device=device)
-
-
-def _symmetric(half: Tensor, channels: int) -> Tensor:
-    """The matrix [channels, channels] of one half."""
-    matrix = half.new_empty((channels, channels))
-    rows, columns = _upper(channels, half.device).unbind()
-    matrix[rows, columns] = half
-    matrix[columns, rows] = half
-    return matrix
+def _keep_for(stream: torch.cuda.Stream, parts: Sequence[LayerStatistics], numbers: Tensor) -> None:
+    """Memory of tensors of another stream is not given to others before this one has done with it."""
+    for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centred))):
+        tensor.record_stream(stream)

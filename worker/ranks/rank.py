@@ -278,7 +278,9 @@ def _failure(error: BaseException) -> Outcome:
 
 
 def _raised_in_exchange(error: BaseException) -> bool:
-    """Whether an error was raised inside torch.distributed."""
+    """Whether an error was raised inside torch.distributed, or by its store of ranks."""
+    if type(error).__module__.startswith("torch.distributed"):
+        return True
     step = error.__traceback__
     while step is not None:
         if str(step.tb_frame.f_globals.get("__name__", "")).startswith("torch.distributed"):

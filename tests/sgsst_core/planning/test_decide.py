@@ -291,6 +291,15 @@ def test_early_stop_is_told_where_it_is_on() -> None:
 # --- ranks ---------------------------------------------------------------------------------------------------------
 
 
+def test_a_gradient_is_expected_to_travel_for_what_views_show() -> None:
+    def communication(**values: Any) -> float:
+        found = plan_of(probe(ranks=2, link=Link(1e3, 1e-3), **values), keep=("ranks",)).prediction
+        assert found is not None
+        return found.communication
+
+    assert communication() - communication(shown=2.5) == pytest.approx(12 * (5 - 2.5) / 1e3)
+
+
 def test_ranks_take_part_as_the_link_allows() -> None:
     fast = plan_of(probe(ranks=4, link=Link(1e12, 1e-9)))
     assert fast.ranks == 4

@@ -64,6 +64,15 @@ def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights
     assert probe.pruned_error == pruned_image_error(left_out, cameras(3), [0, 1, 2], make_rasterizer("cpu", scene))
 
 
+def test_the_survey_counts_what_a_view_shows() -> None:
+    scene, views = wall(), [*cameras(2), blind_camera()]
+    rasterizer = make_rasterizer("reference", scene)
+    ones = torch.ones(views[0].height, views[0].width, 3)
+    counts = [int((rasterizer.colour_gradient(ones, camera)[:, 0] > 0).sum()) for camera in views[:2]]
+    assert survey(scene, views, make_rasterizer("cpu", scene)).shown == sum(counts) / 2
+    assert 0 < sum(counts) < 2 * len(scene)
+
+
 def test_the_survey_tells_how_far_it_is() -> None:
     scene, told = wall(), list[PlanningProgress]()
     survey(scene, cameras(3), make_rasterizer("cpu", scene), show=told.append)

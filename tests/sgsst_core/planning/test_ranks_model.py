@@ -37,6 +37,33 @@ def test_kept_coarse_weights_need_no_image() -> None:
     assert difference == pytest.approx(2 * SLOW.all_gather(720 * 1280 * 12, 4))
 
 
+def test_a_gradient_travels_for_what_the_view_shows() -> None:
+    def sent(shown: float | None) -> float:
+        return replace(work(), shown=shown).communication(4, SLOW)
+
+    assert sent(None) == sent(60_000) == sent(40_000) == work().communication(4, SLOW)
+    saved = SLOW.all_reduce(12 * 50_000, 4) - SLOW.all_reduce(12 * 20_000, 4)
+    assert sent(None) - sent(20_000) == pytest.approx(saved)
+
+
+def test_bytes_that_are_sent_are_those_that_ranks_wait_for_but_for_statistics_of_other_scales() -> None:
+    one_scale = replace(work(scales=1), shown=20_000)
+    link = Link(1e6, 0.0)
+    for ranks in (2, 3, 4):
+        sent = one_scale.sent(ranks)
+        assert one_scale.communication(ranks, link) == pytest.approx(sum(sent.values()) / 1e6, rel=1e-5)
+        assert replace(work(scales=3), shown=20_000).sent(ranks)["statistics"] == pytest.approx(3 * sent["statistics"])
+    assert set(work().sent(1).values()) == {0}
+    assert replace(work(), whole_image=False).sent(2)["image"] == 0
+
+
+def test_groups_add_up_whole_gradients() -> None:
+    """What the views of a step show together is not known."""
+    phases = [(0, [work()]), (10, [replace(work(), shown=1)])]
+    found = choose_ranks(phases, 2, 2, SLOW)
+    assert found.seconds[2] - found.seconds[1] / 2 == pytest.approx(10 * SLOW.all_reduce(12 * 50_000, 2))
+
+
 def test_a_free_link_makes_every_rank_worth_it_and_a_slow_one_none() -> None:
     phases = [(10, [work()]), (20, [work()])]
     free = choose_ranks(phases, 1, 4, FREE)

@@ -46,7 +46,7 @@ def state() -> StylizerState:
         queue=[4, 0, 2],
         history=[
             StepRecord(1, "coarse", 1, 0.1, 3.0, {1: terms[1]}, {"render": 0.1}, 10**10),
-            StepRecord(2, "sos", 3, 0.3, 4.0, terms, {"render": 0.2, "loss": 1 / 3}, 10**9),
+            StepRecord(2, "sos", 3, 0.3, 4.0, terms, {"render": 0.2, "loss": 1 / 3}, 10**9, {"image": 7}),
         ],
         seconds_by_part={"render": 0.1},
         memory=12345,
@@ -126,7 +126,7 @@ def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Che
     assert stored.items() <= history[1].pop("terms")["0"].items()
     assert history[1] == {
         **{"step": 2, "stage": "sos", "view": 3, "seconds": 0.3, "loss": 4.0},
-        **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9},
+        **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9, "sent": {"image": 7}},
     }
     assert {"gram": 1.0, "mean": 2.0, "std": 1 / 3, "content": 0.0}.items() <= before["0"].items()
 

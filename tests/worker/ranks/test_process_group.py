@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from typing import Any
 
 import pytest
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 from sgsst_core.errors import RanksDriftedError, SceneError
@@ -18,9 +21,26 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
 from tests.sgsst_core.pictures import relative_error
 from tests.small_scenes import cameras, style, wall
-from tests.worker.ranks.spawn import on_ranks
+from tests.worker.ranks.spawn import free_port, on_ranks
+from worker.ranks.process_group import _backend, _meet
 
 HEIGHT = 70
+
+
+@pytest.mark.parametrize(("types", "expected"), [(("cuda", "cuda"), "cuda"), (("cuda", "cpu"), "cpu")])
+def test_ranks_meet_on_gpus_where_every_one_has_one(types: tuple[str, str], expected: str) -> None:
+    address, patience = f"127.0.0.1:{free_port()}", timedelta(seconds=60)
+    with ThreadPoolExecutor(2) as ranks:
+        devices = [torch.device(name, 0) if name == "cuda" else torch.device(name) for name in types]
+        meeting = [ranks.submit(_meet, rank, 2, address, device, patience) for rank, device in enumerate(devices)]
+        assert [met.result(60)[0].type for met in meeting] == [expected] * 2
+
+
+def test_nccl_is_taken_between_gpus_where_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there, expected in ((True, "cpu:gloo,cuda:nccl"), (False, "gloo")):
+        monkeypatch.setattr(dist, "is_nccl_available", lambda there=there: there)
+        assert _backend(torch.device("cuda", 0)) == expected
+        assert _backend(torch.device("cpu")) == "gloo"
 
 
 def image(rank: int, rows: int = HEIGHT) -> Tensor:
@@ -52,14 +72,15 @@ def features(rank: int) -> Tensor:
     return values
 
 
+def numbers(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
 def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatistics, float]]:
     parts = [LayerStatistics.zero(5)] if collectives.rank == empty else [layer_statistics(features(collectives.rank))]
-    waiting = [
-        collectives.all_reduce_statistics(parts, torch.tensor([0.5 * (turn + 1)], dtype=torch.float64))
-        for turn in range(3)
-    ]
+    waiting = [collectives.all_reduce_statistics(parts, numbers(0.5 * (turn + 1))) for turn in range(3)]
     merged = [wait() for wait in waiting]
-    return [(statistics[0], float(number)) for statistics, (number,) in merged]
+    return [(statistics[0], float(added)) for statistics, added in merged]
 
 
 @pytest.mark.parametrize("empty", [None, 0, 2])
@@ -84,7 +105,7 @@ def test_nothing_at_all_stays_nothing() -> None:
 
 
 def merge_nothing(collectives: Collectives) -> LayerStatistics:
-    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], torch.zeros(1, dtype=torch.float64))()[0][0]
+    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))()[0][0]
 
 
 def values(collectives: Collectives) -> dict[str, Any]:

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.distributed as dist
 
 from sgsst_core.planning.probe import make_network
 from sgsst_core.settings import make_settings
 from tests.networks import tiny_weights
 from worker.ranks.process_group import with_index
+from worker.ranks.rank import _failure
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -52,6 +54,12 @@ def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pyt
     assert with_index("cuda") == torch.device("cuda", 3)
     assert with_index("cuda:1") == torch.device("cuda", 1)
     assert with_index("cpu") == torch.device("cpu")
+
+
+def test_an_error_of_the_store_is_one_of_an_exchange() -> None:
+    """A rank that is lost while the others form their group."""
+    assert _failure(dist.DistStoreError("wait timeout")).echo
+    assert not _failure(RuntimeError("wait timeout")).echo
 
 
 def test_float32_is_not_rounded_to_tf32() -> None:

@@ -12,7 +12,9 @@ import torch.multiprocessing as multiprocessing
 from torch import Tensor
 
 from sgsst_core.features.network_weights import load_network_weights
+from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.ranks_model import probe_link
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.pictures import relative_error
@@ -61,6 +63,45 @@ def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_co
     for own in found:
         assert torch.equal(own, found[0])
     assert relative_error(found[0], expected) < 1e-5
+
+
+def merge_beside_other_work(rank: int, size: int, address: str, folder: str) -> None:
+    """Statistics of three scales under way at once, while the caller's stream overwrites what it may."""
+    with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
+        waiting = []
+        for turn in range(3):
+            part = layer_statistics(features(10 * turn + rank).to(f"cuda:{rank}"))
+            numbers = torch.tensor([turn + 0.5], dtype=torch.float64, device=part.mean.device)
+            waiting.append(collectives.all_reduce_statistics([part], numbers))
+            del part, numbers
+            for _ in range(20):
+                torch.randn(64, 64, dtype=torch.float64, device=f"cuda:{rank}")
+        merged = [wait() for wait in waiting]
+        found = [(parts[0].count, parts[0].mean, parts[0].centred, numbers) for parts, numbers in merged]
+        torch.save([[value.cpu() for value in values] for values in found], Path(folder) / f"{rank}.pt")
+        link = probe_link(collectives, torch.device("cuda"))
+        assert 1e8 < link.bandwidth < 1e13
+        assert 0 < link.latency < 1
+
+
+def features(seed: int) -> Tensor:
+    return 3.0 + torch.randn(30, 20, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
+def test_statistics_are_merged_beside_other_work(tmp_path: Path) -> None:
+    address = f"127.0.0.1:{free_port()}"
+    multiprocessing.spawn(  # type: ignore[attr-defined]
+        merge_beside_other_work, (2, address, str(tmp_path)), nprocs=2
+    )
+    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
+    for turn, (own, other) in enumerate(zip(first, second, strict=True)):
+        expected = layer_statistics_reference(torch.cat([features(10 * turn), features(10 * turn + 1)]))
+        for value, same in zip(own, other, strict=True):
+            assert torch.equal(value, same)
+        for value, reference in zip(own, (expected.count, expected.mean, expected.centred), strict=False):
+            assert relative_error(value, reference) < 1e-12
+        assert float(own[3]) == 2 * turn + 1
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")

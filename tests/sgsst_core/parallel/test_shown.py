@@ -1,0 +1,29 @@
+"""Sets of Gaussians, one bit each."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgsst_core.parallel.shown import DENSE_SHARE, ShownGaussians, gaussians_sent
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("gaussians", [0, 1, 7, 8, 9, 1001])
+def test_a_set_holds_what_its_mask_says(gaussians: int, share: float) -> None:
+    mask = torch.rand(gaussians, generator=torch.Generator().manual_seed(gaussians)) < share
+    shown = ShownGaussians(mask)
+    for found in (shown.indices(), shown._device_indices()):
+        assert torch.equal(found, mask.nonzero()[:, 0])
+    assert (shown.count, shown.total) == (int(mask.sum()), gaussians)
+    assert shown._bits.nbytes == ShownGaussians.nbytes(gaussians)
+
+
+def test_a_gradient_travels_whole_where_nearly_all_are_shown() -> None:
+    assert gaussians_sent(300, 1000) == 300
+    assert gaussians_sent(DENSE_SHARE * 1000 + 1, 1000) == 1000
+    assert gaussians_sent(2000, 1000) == 1000, "a survey counts pruned ones too"
+    mask = torch.arange(1000) < 600
+    assert ShownGaussians(mask).sparse
+    assert not ShownGaussians(torch.roll(mask, 500) | mask).sparse
+    assert not ShownGaussians(mask[:0]).sparse

@@ -1,0 +1,87 @@
+"""Trials of rasterizers that compile their kernels: one process of a machine at a time."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.rasterizer.trial import build_folder, drawing_problem, one_at_a_time
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def build(folder: Path) -> None:
+    """What fails where another process does the same at the same time, as a compiler that cleans up first."""
+    mark = folder / "building"
+    mark.touch(exist_ok=False)
+    time.sleep(0.05)
+    mark.unlink()
+
+
+def build_often(folder: Path, others: list[Path], own: Path) -> None:
+    own.touch()
+    while not all(other.exists() for other in others):
+        time.sleep(0.001)
+    for _ in range(5):
+        with one_at_a_time(folder):
+            build(folder)
+
+
+def test_processes_that_start_together_build_one_after_the_other(tmp_path: Path) -> None:
+    ready = [tmp_path / f"ready{number}" for number in range(2)]
+    processes = [SPAWN.Process(target=build_often, args=(tmp_path / "builds", ready, own)) for own in ready]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+    assert [process.exitcode for process in processes] == [0, 0]
+
+
+def hold(folder: Path, held: Path) -> None:
+    with one_at_a_time(folder):
+        held.touch()
+        time.sleep(300)
+
+
+def test_a_process_that_dies_keeps_nobody_out(tmp_path: Path) -> None:
+    process = SPAWN.Process(target=hold, args=(tmp_path, tmp_path / "held"))
+    process.start()
+    while not (tmp_path / "held").exists():
+        assert process.is_alive()
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    with one_at_a_time(tmp_path):
+        build(tmp_path)
+    process.join()
+
+
+def test_nobody_waits_where_nothing_can_be_built(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with one_at_a_time(tmp_path / "file" / "builds"), one_at_a_time(tmp_path / "file" / "builds"):
+        pass
+
+
+def try_to_draw(trying: Path, tried: Path) -> None:
+    trying.touch()
+    drawing_problem("none")  # type: ignore[arg-type]
+    tried.touch()
+
+
+def test_a_rasterizer_is_tried_when_no_other_process_tries_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    process = SPAWN.Process(target=try_to_draw, args=(tmp_path / "trying", tmp_path / "tried"))
+    with one_at_a_time(build_folder()):
+        process.start()
+        while not (tmp_path / "trying").exists():
+            assert process.is_alive()
+            time.sleep(0.01)
+        process.join(0.5)
+        assert not (tmp_path / "tried").exists()
+    process.join(60)
+    assert (tmp_path / "tried").exists()

@@ -1,0 +1,173 @@
+"""The sum of a gradient over ranks, of which only what the view shows travels, and the count of what is sent."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.terms import TERMS
+from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
+from sgsst_core.parallel.division import divide_rows
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.views import Views
+from tests.networks import CHANNELS, tiny_weights
+from tests.sgsst_core.pictures import relative_error
+from tests.small_scenes import cameras, style, wall
+from tests.worker.ranks.spawn import on_ranks
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+WIDTH, HEIGHT = 128, 96
+
+
+def make_views(collectives: Collectives, scene: Scene, camera: Camera, memory: int = 1 << 30) -> Views:
+    """Views of which nothing is kept with a memory of 0."""
+    loss = SosLoss(FeatureNetwork(tiny_weights(), (*STYLE_LAYERS, CONTENT_LAYER)), collectives=collectives)
+    rasterizer = make_rasterizer("cpu", scene)
+    return Views(scene, [camera], rasterizer, loss, covered=[0], weighted=False, memory=memory, collectives=collectives)
+
+
+def pixels(camera: Camera, seed: int) -> Tensor:
+    return torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
+    """Colour gradients [N, 3] of two visits, of which all values travel, or those of shown Gaussians alone."""
+    found: dict[str, Any] = {}
+    for name, memory in (("whole", 0), ("shown", 1 << 30)):
+        views = make_views(collectives, scene, camera, memory)
+        colours = views.colours(0, scene.sh_dc)
+        sent = [dict(collectives.sent)]
+        found[name] = []
+        for visit in range(2):
+            own = pixels(camera, 10 * visit + collectives.rank)
+            found[name].append(views.gradient(0, own, colours))
+            sent.append(dict(collectives.sent))
+        found[f"bytes {name}"] = [
+            {kind: after[kind] - before[kind] for kind in after} for before, after in itertools.pairwise(sent)
+        ]
+    return found
+
+
+def shown_of(scene: Scene, camera: Camera) -> Tensor:
+    """[N] bool."""
+    ones = torch.ones(camera.height, camera.width, 3)
+    return make_rasterizer("cpu", scene).colour_gradient(ones, camera)[:, 0] > 0
+
+
+def upper(scene: Scene) -> Scene:
+    """What projects into the upper half of the views; y points down."""
+    return scene.subset(scene.means[:, 1] < -0.5)
+
+
+@pytest.mark.parametrize(
+    ("scene", "height"),
+    [
+        pytest.param(wall(sh_degree=1), HEIGHT, id="wall"),
+        pytest.param(upper(wall()), HEIGHT, id="nothing in the lower band"),
+        pytest.param(wall(), 15, id="no rows for one rank"),
+    ],
+)
+def test_what_the_view_shows_gives_the_bits_of_the_whole_gradient(scene: Scene, height: int) -> None:
+    camera = cameras(1, WIDTH, height)[0]
+    shown = int(shown_of(scene, camera).sum())
+    assert 0 < shown < 0.7 * len(scene)
+    results = on_ranks(2, both_ways, scene, camera)
+    for found in results:
+        for whole, packed, first in zip(found["whole"], found["shown"], results[0]["shown"], strict=True):
+            assert packed.any()
+            assert torch.equal(whole, packed)
+            assert torch.equal(packed, first)
+        assert [sent["gradient"] for sent in found["bytes whole"]] == [12 * len(scene)] * 2
+        assert [sent["gradient"] for sent in found["bytes shown"]] == [len(scene) + 12 * shown, 12 * shown]
+
+
+def test_a_band_that_shows_nothing_is_one() -> None:
+    """What the second of the cases above stands for."""
+    scene, camera = upper(wall()), cameras(1, WIDTH, HEIGHT)[0]
+    first, second = divide_rows(HEIGHT, 2)
+    rasterizer = make_rasterizer("cpu", scene)
+    assert rasterizer.coverage(camera, first).any()
+    assert not rasterizer.coverage(camera, second).any()
+
+
+def test_rings_of_more_ranks_add_in_other_orders() -> None:
+    """A value's place decides at which rank the ring begins to add: rounding, and no more."""
+    scene, camera = wall(), cameras(1, WIDTH, HEIGHT)[0]
+    results = on_ranks(4, both_ways, scene, camera)
+    for found in results:
+        for whole, packed, first in zip(found["whole"], found["shown"], results[0]["shown"], strict=True):
+            assert relative_error(packed, whole) < 1e-6
+            assert torch.equal(packed, first)
+            assert torch.equal(packed == 0, whole == 0)
+
+
+def test_the_whole_gradient_travels_where_nearly_all_is_shown() -> None:
+    camera = cameras(1, WIDTH, HEIGHT)[0]
+    scene = wall().subset(shown_of(wall(), camera))
+    for found in on_ranks(2, both_ways, scene, camera):
+        for whole, packed in zip(found["whole"], found["shown"], strict=True):
+            assert torch.equal(whole, packed)
+        assert [sent["gradient"] for sent in found["bytes shown"]] == [13 * len(scene), 12 * len(scene)]
+
+
+def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
+    bands = divide_rows(HEIGHT, collectives.size)
+    start, stop = bands[collectives.rank]
+    collectives.all_gather_rows(torch.zeros(stop - start, WIDTH, 3), bands)
+    collectives.reduce_scatter_rows(torch.zeros(HEIGHT, WIDTH, 3), bands)
+    collectives.all_reduce(torch.zeros(1000, 3))
+    collectives.union(torch.zeros(300, dtype=torch.bool))
+    pair = collectives.split_group(collectives.size // 2)
+    pair.all_reduce(torch.zeros(500), "statistics")
+    return dict(collectives.sent)
+
+
+def test_bytes_are_counted_as_rings_move_them() -> None:
+    for rank, sent in enumerate(on_ranks(4, exchange_everything)):
+        bands = divide_rows(HEIGHT, 4)
+        rows = [stop - start for start, stop in bands]
+        image = 3 * max(rows) + sum(rows) - rows[rank]
+        assert sent == {"image": 12 * WIDTH * image, "gradient": 6 * (12_000 + 300) // 4, "statistics": 2000}
+
+
+def test_one_rank_sends_nothing() -> None:
+    stylizer = Stylizer.planned(wall(), cameras(1), style(), make_settings(steps_coarse=0), weights=tiny_weights())
+    assert stylizer.run_step().sent == {}
+    assert set(ALONE.sent.values()) == {0}
+
+
+def run_two_steps(collectives: Collectives) -> dict[str, Any]:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=4, coarsest_side=40, keep=("ranks", "unseen"))
+    camera = cameras(1, WIDTH, HEIGHT)
+    stylizer = Stylizer.planned(wall(), camera, style(), settings, weights=tiny_weights(), collectives=collectives)
+    scales = stylizer.scale_count(0)
+    return {
+        "steps": [stylizer.run_step().sent for _ in range(2)],
+        "scales": scales,
+        "shown": stylizer.plan.survey.shown,
+    }
+
+
+def test_a_step_says_what_it_sent() -> None:
+    """Two ranks send half of what they add up, twice, and their half of the image, twice."""
+    layer = CHANNELS + 1 + CHANNELS * (CHANNELS + 1) // 2
+    statistics = 8 * (len(STYLE_LAYERS) * layer + len(TERMS))
+    for found in on_ranks(2, run_two_steps):
+        assert found["shown"] == int(shown_of(wall(), cameras(1, WIDTH, HEIGHT)[0]).sum())
+        assert found["steps"][1] == {
+            "image": 12 * WIDTH * HEIGHT,
+            "statistics": found["scales"] * statistics,
+            "gradient": 12 * found["shown"],
+        }
