@@ -184,10 +184,11 @@ def test_made_by_its_name() -> None:
 
 def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
     """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
-    settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=24)
+    settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=16)
+    views = cameras(2, 32, 32)  # so small that a step in the interpreter takes seconds
     losses = {}
     for name in ("cpu", "triton"):
-        stylizer = Stylizer.planned(wall(), cameras(2), style(), settings, weights=tiny_weights, rasterizer=name)
+        stylizer = Stylizer.planned(wall(), views, style(), settings, weights=tiny_weights, rasterizer=name)
         assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == name
         losses[name] = [stylizer.run_step().loss for _ in range(3)]
     assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-4)
