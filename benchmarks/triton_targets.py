@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from triton.compiler import ASTSource
 
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
+from sgsst_core.rasterizer import triton_kept_kernels as kept_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
 
 TARGETS = {
@@ -42,35 +44,63 @@ _TYPES = {
     **dict.fromkeys(("image_gradient", "out"), "*fp32"),
     **dict.fromkeys(("camera", "values", "depths"), "*fp64"),
     **dict.fromkeys(("counts", "tiles", "ranks", "slots"), "*i32"),
-    **dict.fromkeys(("order", "first_slots", "starts", "gaussians"), "*i64"),
+    **dict.fromkeys(("order", "first_slots", "starts", "gaussians", "ends"), "*i64"),
+    **dict.fromkeys(("masks", "slot_pieces", "block_pieces", "slot_starts", "block_starts"), "*i32"),
+    **dict.fromkeys(("piece_gaussians", "piece_slots"), "*i32"),
     **dict.fromkeys(("total", "visible", "width", "first_row", "last_row", "across"), "i32"),
 }
-#: Kernel, its constants, its warps, and arguments of another type than in `_TYPES`.
-KERNELS: dict[str, tuple[dict[str, Any], int, dict[str, str]]] = {
-    "project": (
+_FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (kept_kernels.HALF_SCALE, "*fp16")}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kernel as `sgsst_core.rasterizer` compiles it; `types`: of arguments, where another one than in `_TYPES`."""
+
+    kernel: Any
+    constants: dict[str, Any]
+    warps: int
+    types: dict[str, str] = field(default_factory=dict)
+
+
+def _of_kept_weights(form: str) -> dict[str, Target]:
+    scale, weights = _FORMS[form]
+    types = {"weights": weights, "gaussians": "*i32"}
+    read = {"SCALE": scale, "P": kept_kernels.PIECES.value}
+    keep = Target(kept_kernels.keep_pieces, {**_CUTS, "SCALE": scale}, 8, {"weights": weights})
+    return {
+        f"keep_pieces_{form}": keep,
+        f"apply_pieces_{form}": Target(kept_kernels.apply_pieces, read, 1, types),
+        f"piece_gradients_{form}": Target(kept_kernels.piece_gradients, read, 1, types),
+    }
+
+
+_ADDED = {"BLOCK": kernels.ADDED.value, "SLOTS": kernels.SLOTS.value}
+KERNELS: dict[str, Target] = {
+    "project": Target(
+        kernels.project,
         {"EPS2D": EPS2D, "MARGIN": FRUSTUM_MARGIN, "SUPPORT": 8.0, "POWER": 0.85, "BLOCK": _BLOCK},
         4,
-        {},
     ),
-    "list_tiles": ({"SUPPORT": 8.0, "BLOCK": _BLOCK}, 4, {}),
-    "render": (_CUTS, 8, {}),
-    "slot_gradients": (_CUTS, 8, {}),
-    "add_slots": ({"BLOCK": _BLOCK}, 4, {"slots": "*fp32"}),
+    "list_tiles": Target(kernels.list_tiles, {"SUPPORT": 8.0, "BLOCK": _BLOCK}, 4),
+    "render": Target(kernels.render, _CUTS, 8),
+    "slot_gradients": Target(kernels.slot_gradients, _CUTS, 8),
+    "add_slots": Target(kernels.add_slots, _ADDED, 4, {"slots": "*fp32"}),
+    "count_pieces": Target(kept_kernels.count_pieces, _CUTS, 8),
+    **_of_kept_weights("float32"),
+    **_of_kept_weights("half"),
 }
 
 
 def compile_kernel(name: str, target: str) -> dict[str, Any]:
     """Registers, spilled bytes or registers, shared memory and seconds of one kernel for one target."""
-    constants, warps, types = KERNELS[name]
-    kernel = getattr(kernels, name)
+    found = KERNELS[name]
     signature = {
-        argument: "constexpr" if argument in constants else {**_TYPES, **types}[argument]
-        for argument in kernel.arg_names
+        argument: "constexpr" if argument in found.constants else {**_TYPES, **found.types}[argument]
+        for argument in found.kernel.arg_names
     }
+    source = ASTSource(found.kernel, signature, constexprs=found.constants)
     started = time.perf_counter()
-    compiled = triton.compile(
-        ASTSource(kernel, signature, constexprs=constants), target=TARGETS[target], options={"num_warps": warps}
-    )
+    compiled = triton.compile(source, target=TARGETS[target], options={"num_warps": found.warps})
     seconds = time.perf_counter() - started
     used = _of_nvidia(compiled.asm["cubin"]) if "cubin" in compiled.asm else _of_amd(compiled.asm["amdgcn"])
     return {**used, "shared_bytes": compiled.metadata.shared, "seconds": round(seconds, 2)}
@@ -107,7 +137,7 @@ def main() -> int:
     table = {name: {target: compile_kernel(name, target) for target in TARGETS} for name in KERNELS}
     for name, targets in table.items():
         for target, used in targets.items():
-            print(f"{name:<16}{target:<8}" + "  ".join(f"{key} {value}" for key, value in used.items()), flush=True)
+            print(f"{name:<24}{target:<8}" + "  ".join(f"{key} {value}" for key, value in used.items()), flush=True)
     if arguments.name:
         write_result(arguments.name, {"triton": triton.__version__, "kernels": table})
     return 0

@@ -58,15 +58,12 @@ def precision_of(ratio: float | None) -> Precision:
 GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
 
 
-def rasterizer_anew(device: Device, problems: Mapping[str, str], settings: Settings) -> RasterizerName:
-    """The rasterizer that computes blend weights anew in every call.
-
-    On a GPU the first of `GPU_RASTERIZERS` that works, unless weights are to be kept: those are computed on the CPU,
-    wherever they are applied.
+def rasterizer_anew(device: Device, problems: Mapping[str, str]) -> RasterizerName:
+    """The rasterizer that computes blend weights anew: on a GPU the first of `GPU_RASTERIZERS` that works.
 
     Args:
         problems: why GPU rasterizers cannot be used, by their name; those that can are not in it.
     """
-    if device == "cuda" and settings.kept_weights in ("auto", "none"):
+    if device == "cuda":
         return next((name for name in GPU_RASTERIZERS if name not in problems), "cpu")
     return "cpu"

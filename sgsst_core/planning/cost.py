@@ -30,12 +30,21 @@ class RasterCost:
         kept_seconds: the same with kept weights; None where not even one view's fit the memory.
         bytes: of the kept weights of all views, float32; None where they would not be kept anyway.
         half_bytes: the same, half precision.
+        keeping_seconds: of making a view's kept weights; None where that was not measured, on the CPU.
     """
 
     seconds: float
     kept_seconds: float | None = None
     bytes: int | None = None
     half_bytes: int | None = None
+    keeping_seconds: float | None = None
+
+    @property
+    def least_visits(self) -> float | None:
+        """Visits of a view from which on kept weights save time; None where they never do, or it was not measured."""
+        if self.kept_seconds is None or self.keeping_seconds is None or self.kept_seconds >= self.seconds:
+            return None
+        return self.keeping_seconds / (self.seconds - self.kept_seconds)
 
 
 def pieces_of(size: Size, tiling: Tiling, region: Rectangle | None, *, coarsest: bool = False) -> tuple[Piece, ...]:

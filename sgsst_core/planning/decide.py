@@ -14,7 +14,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
-from sgsst_core.planning.choices import optimised_gaussians, precision_of, rendered_gaussians
+from sgsst_core.planning.choices import GPU_RASTERIZERS, optimised_gaussians, precision_of, rendered_gaussians
 from sgsst_core.planning.cost import Work, content_bytes, image_bytes, pieces_of
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
@@ -23,8 +23,8 @@ from sgsst_core.settings import KeptWeights, Settings
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
 UNCOVERED_SHARE = 0.01
-#: Building a view's kept weights costs about three renders with gradient, and each use of them saves two thirds of one:
-#: with fewer visits they do not pay.
+#: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
+#: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
 LEAST_VISITS = 5
 #: What measuring between steps and the report take beside the iterations: libraries, LPIPS, another set of raster lists
 #: (measured on jobs of 10 to 100 small views).
@@ -95,6 +95,7 @@ class _Deciding:
             memory_limit=probe.machine.memory_limit,
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
+            anew=next((name for name in GPU_RASTERIZERS if name == probe.rasterizer), "cpu"),
             precision=precision_of(probe.network.precision_ratio),
             kept_weights=form,
             coarse_weights=self._keeps_coarse(form, steps_coarse / views),
@@ -108,14 +109,22 @@ class _Deciding:
             return "none"
         if form != "auto":
             return form
-        if visits < LEAST_VISITS:
+        if not self._keeping_pays(visits):
             return "none"
-        exactly = raster.bytes <= self.budget or self.settings.preset == "paper" or raster.half_bytes >= raster.bytes
+        exactly = raster.bytes <= self.budget or self.settings.preset == "paper"
         return "float32" if exactly else "half"
+
+    def _keeping_pays(self, visits: float) -> bool:
+        """Whether kept blend weights save more time in so many visits of each view than it takes to make them."""
+        raster = self.probe.raster
+        if self.probe.rasterizer not in GPU_RASTERIZERS:
+            return visits >= LEAST_VISITS
+        return raster.least_visits is not None and visits >= raster.least_visits
 
     def _keeps_coarse(self, form: KeptWeights, visits: float) -> bool:
         """Whether phase 1, with so many visits of each view, keeps the weights of the coarsest scale only."""
-        if form == "none" or self.settings.kept_weights != "auto" or self.probe.machine.device != "cpu":
+        on_cpu = self.probe.machine.device == "cpu" and self.probe.rasterizer not in GPU_RASTERIZERS
+        if form == "none" or self.settings.kept_weights != "auto" or not on_cpu:
             return False
         size = self.probe.raster.bytes if form == "float32" else self.probe.raster.half_bytes
         return visits >= LEAST_VISITS and size is not None and size > self.budget

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
-from sgsst_core.planning.choices import precision_of, pruned_gaussians
-from sgsst_core.planning.cost import OPTIMISER_BYTES, Work
+from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
+from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
@@ -132,11 +132,12 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     if plan.device != "cuda":
         return []
     names = {"cuda": "gsplat", "triton": "Triton"}
-    where = {"cached": "kept blend weights on the GPU", "cpu": "on the CPU"}
-    how = where.get(plan.rasterizer) or f"{names.get(plan.rasterizer, plan.rasterizer)} on the GPU"
+    how = f"{names[plan.anew]} on the GPU" if plan.anew in names else "on the CPU"
+    if plan.rasterizer == "cached":
+        how += ", with kept blend weights"
     failed = [f"{names[name]} cannot be used: {problem}" for name, problem in probe.machine.problems.items()]
-    if plan.rasterizer in names:
-        failed.append(f"{names[plan.rasterizer]} works here")
+    if plan.anew in names:
+        failed.append(f"{names[plan.anew]} works here")
     return [Decision("rasterizer", how, "; ".join(failed) or "asked for")]
 
 
@@ -146,25 +147,45 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
     if plan.kept_weights == "none":
         visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
         reason = f"a view comes {visits:.1f} times"
-        if "none" in (settings.kept_weights, *settings.keep):
+        if settings.kept_weights == "none" or "blend-weights" in settings.keep:
             reason = "asked for"
         elif raster.bytes is None:
-            reason = "the GPU's rasterizer keeps none"
+            reason = "gsplat keeps none"
+        elif plan.anew in GPU_RASTERIZERS:
+            reason = _why_not_on_a_gpu(raster, reason)
         return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
     room = f"{budget / 1e9:.1f} GB are there for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
     size, error = raster.bytes or 0, "none"
     if plan.kept_weights == "half":
         size = raster.half_bytes or 0
-        error = "each weight is off by at most 1/4096 of itself: 0.06 of 255 levels in a pixel"
+        error = "each weight is off by at most 1/2048 of itself: 0.12 of 255 levels in a pixel"
     part = "all" if size <= budget else f"{budget / size:.0%} of the views'"
     decision = f"{part} kept in {'half precision' if plan.kept_weights == 'half' else 'float32'}"
     if plan.coarse_weights:
         decision += "; in phase 1 only those of the coarsest scale"
     share = min(1.0, budget / max(size, 1))
     reason = f"they take {size / 1e9:.2f} GB of all views; {room}"
+    if plan.anew in GPU_RASTERIZERS and raster.kept_seconds is not None:
+        reason += f"; {_against(raster)}"
     return Decision(
         "blend weights", decision, reason, seconds=saved * share if saved is not None else None, error=error
+    )
+
+
+def _why_not_on_a_gpu(raster: RasterCost, visits: str) -> str:
+    """Why no weights are kept there, as was measured."""
+    if raster.kept_seconds is None:
+        return "those of one view do not fit"
+    if raster.least_visits is None:
+        return f"kept ones are not faster here: {_against(raster)}"
+    return f"{visits}, and keeping pays from {raster.least_visits:.1f} on: {_against(raster)}"
+
+
+def _against(raster: RasterCost) -> str:
+    """Kept weights against new ones, as was measured."""
+    return (
+        f"{1e3 * (raster.kept_seconds or 0):.3g} ms a view were measured, {1e3 * raster.seconds:.3g} ms computed anew"
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from sgsst_core.planning.survey import Survey
+from sgsst_core.rasterizer import RasterizerName
 from sgsst_core.settings import KeptWeights, Precision
 
 Device = Literal["cpu", "cuda"]
@@ -67,6 +68,7 @@ class Plan:
         memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
         device: on which the feature network computes.
         rasterizer: that renders; "cached" keeps blend weights in the form `kept_weights`.
+        anew: rasterizer that computes blend weights, and every time those that are not kept.
         precision: of the feature network.
         kept_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
@@ -85,6 +87,7 @@ class Plan:
     memory_limit: int
     device: Device = "cpu"
     rasterizer: str = "cpu"
+    anew: RasterizerName = "cpu"
     precision: Precision = "float32"
     kept_weights: KeptWeights = "none"
     coarse_weights: bool = False

@@ -35,7 +35,9 @@ from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.kept_weights import Precision as WeightPrecision
 from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, Settings
@@ -46,6 +48,8 @@ PROBE_SIDE = 384
 SAMPLED_VIEWS = 3
 
 _DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+#: Of kept blend weights, the exact one first.
+_FORMS: tuple[WeightPrecision, ...] = ("float32", "half")
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,7 @@ def equip(
         ranks=collectives.size,
         problems=problems,
     )
-    name = rasterizer or rasterizer_anew(device, problems, settings)
+    name = rasterizer or rasterizer_anew(device, problems)
     whole = make_rasterizer(name, scene, background=settings.background, near=settings.near)
     return Workshop(scene, tuple(cameras), settings, machine, network, ratio, whole)
 
@@ -325,21 +329,41 @@ def _convolution_seconds(dtype: torch.dtype, device: Device) -> float:
 
 def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> RasterCost:
     """Count and time blend weights on a few of some views, evenly spread; `budget`: bytes for kept ones."""
-    scene, settings, rasterizer = workshop.scene, workshop.settings, workshop.rasterizer
+    scene, rasterizer = workshop.scene, workshop.rasterizer
     count = min(SAMPLED_VIEWS, len(cameras))
     sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
-    seconds = sum(_raster_seconds(rasterizer, len(scene), camera) for camera in sample) / count
-    if rasterizer.device.type == "cuda":
-        return RasterCost(seconds)
-    device = workshop.machine.device
-    cpu = rasterizer if isinstance(rasterizer, CpuRasterizer) else CpuRasterizer(scene, near=settings.near)
-    cached = CachedRasterizer(scene, device=device, cpu=cpu)
-    half = CachedRasterizer(scene, device=device, precision="half", cpu=cpu)
-    sizes = [cached.operator_bytes(camera) for camera in sample]
-    middle, middle_size = sample[count // 2], sizes[count // 2]
-    kept = _raster_seconds(cached, len(scene), middle) if middle_size <= budget else None
-    total = sum(sizes) * len(cameras) // count
-    return RasterCost(seconds, kept, total, total * half.operator_bytes(middle) // max(middle_size, 1))
+    seconds = [_raster_seconds(rasterizer, len(scene), camera) for camera in sample]
+    mean = sum(seconds) / count
+    if rasterizer.name == "cuda":
+        return RasterCost(mean)
+    anew = rasterizer
+    if not isinstance(anew, CpuRasterizer | TritonRasterizer):
+        anew = CpuRasterizer(scene, near=workshop.settings.near)
+    cached = CachedRasterizer(scene, anew=anew)
+    sizes = [[counted.nbytes(form) for form in _FORMS] for counted in map(cached.count, sample)]
+    total, half = (sum(column) * len(cameras) // count for column in zip(*sizes, strict=True))
+    middle = count // 2
+    fitting = [form for form, size in zip(_FORMS, sizes[middle], strict=True) if size <= budget]
+    if not fitting:
+        return RasterCost(mean, None, total, half)
+    keeping = None
+    if isinstance(anew, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
+        keeping = _keeping_seconds(cached, sample[middle], fitting[0])
+    cached = CachedRasterizer(scene, precision=fitting[0], anew=anew)
+    kept = _raster_seconds(cached, len(scene), sample[middle])
+    # Of the mean view, as the seconds it is compared with.
+    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping)
+
+
+def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPrecision) -> float:
+    """Of making a view's kept weights for the second time: the first one compiles."""
+    seconds = 0.0
+    for _ in range(2):
+        started = time.perf_counter()
+        cached.count(camera).keep(form)
+        _wait_for(cached.device)
+        seconds = time.perf_counter() - started
+    return seconds
 
 
 def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera) -> float:

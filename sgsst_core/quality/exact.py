@@ -16,7 +16,6 @@ from torch import Tensor
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import LayerTarget
-from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.evaluation import Evaluation, evaluate
@@ -81,11 +80,10 @@ class ExactTwin:
         )
         self.shown = stylizer.plan.survey.total_blend_weights > 0
         scene = stylizer.scene.subset(self.shown).without_zero_bands()
-        name = own if (own := stylizer.views.rasterizer.name) in GPU_RASTERIZERS else "cpu"
         self.views = Views(
             scene,
             stylizer.views.cameras,
-            make_rasterizer(name, scene, background=settings.background, near=settings.near),
+            make_rasterizer(stylizer.plan.anew, scene, background=settings.background, near=settings.near),
             self.loss,
             covered=stylizer.plan.survey.covered,
             weighted=stylizer.plan.weighted,

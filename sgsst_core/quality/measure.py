@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut, moments
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -68,7 +67,6 @@ class Measurements:
         if self._held_out is None:
             stylizer = self._stylizer
             scene = stylizer.scene.without_zero_bands()
-            name = own if (own := stylizer.views.rasterizer.name) in GPU_RASTERIZERS else "cpu"
             settings = stylizer.settings
             source = self.exact if stylizer.network.dtype != torch.float32 else stylizer
             first = stylizer.measured[0]["held_out"] if stylizer.measured else None
@@ -76,7 +74,7 @@ class Measurements:
                 stylizer.views.cameras,
                 stylizer.views.covered,
                 scene,
-                make_rasterizer(name, scene, background=settings.background, near=settings.near),
+                make_rasterizer(stylizer.plan.anew, scene, background=settings.background, near=settings.near),
                 source.loss,
                 source.style_targets,
                 weighted=stylizer.plan.weighted,

@@ -63,12 +63,13 @@ def make_rasterizer(
     """The rasterizer called `name` (`reference`, `cpu`, `cached`, `triton` or `cuda`) for a scene.
 
     Args:
-        name: `cpu` computes blend weights in every call, `cached` keeps them (its options `precision` and `max_bytes`),
-            `triton` runs on GPUs, `cuda` is gsplat, `reference` is slow and float64.
+        name: `cpu` computes blend weights in every call, `cached` keeps them (its options `precision`, `max_bytes` and
+            `anew`), `triton` runs on GPUs, `cuda` is gsplat, `reference` is slow and float64.
         scene: its geometry must not change while the rasterizer lives.
         background: three values added where Gaussians leave pixels uncovered.
         near: near plane in world units.
-        device: for `cached`, `triton` and `cuda`; None is the CPU for the first and the current GPU for the others.
+        device: for `cached`, `triton` and `cuda`; None is the CPU for the first (or what its option `anew` runs on) and
+            the current GPU for the others.
         options: of the implementation's own constructor.
 
     Raises:

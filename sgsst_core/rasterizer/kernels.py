@@ -349,18 +349,3 @@ def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
             slot = item_slots[item]
             for channel in range(3):
                 slot_gradients[slot, channel] = sum_lanes(sums, (item - begin) * 3 + channel)
-
-
-@compiled(parallel=True)
-def locate_weights(strips, width, first_row, pixels, gaussians):
-    """Which pixel of the band and which Gaussian each kept weight [32 P] belongs to; padding lies in no pixel."""
-    item_starts, piece_starts, item_gaussians, _, piece_items, _ = strips
-    across = (width + _LAST) // _TILE * _STRIPS
-    for strip in numba.prange(item_starts.size - 1):
-        x, y = strip % across * STRIP, strip // across * _TILE
-        for part in range(BLOCKS):
-            for piece in range(piece_starts[strip * BLOCKS + part], piece_starts[strip * BLOCKS + part + 1]):
-                for i in range(PIECE):
-                    row = y + part * BLOCK_ROWS + i // STRIP - first_row
-                    pixels[piece * PIECE + i] = row * width + x + i % STRIP
-                    gaussians[piece * PIECE + i] = item_gaussians[item_starts[strip] + piece_items[piece]]

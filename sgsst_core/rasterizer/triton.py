@@ -103,7 +103,7 @@ class TritonRasterizer:
         self.scene = scene
         self.near = near
         self.alpha_max = alpha_max
-        self._background = torch.tensor(background, dtype=torch.float32, device=self.device)
+        self.background = torch.tensor(background, dtype=torch.float32, device=self.device)
         self._geometry = [
             tensor.to(self.device).float().contiguous()
             for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
@@ -140,15 +140,12 @@ class TritonRasterizer:
         if not visible:
             return gradient
         slots = torch.zeros((len(lists.ranks), 3), device=self.device)
-        across, tiles = _tiles_of(camera, band)
+        across, tiles = tiles_of(camera, band)
         kernels.slot_gradients[(tiles,)](
             lists.ranks, lists.slots, lists.starts, lists.values, pixels, slots, camera.width, *band, across,
-            **self._cuts(),
+            **self.cuts(),
         )  # fmt: skip
-        blocks = (-(-visible // kernels.PROJECTED.value),)
-        kernels.add_slots[blocks](
-            slots, lists.first_slots, lists.gaussians, gradient, visible, BLOCK=kernels.PROJECTED.value
-        )
+        add_slots_(gradient, slots, lists.first_slots, lists.gaussians)
         return gradient
 
     def _render(self, colours: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
@@ -159,15 +156,16 @@ class TritonRasterizer:
         height = band[1] - band[0]
         image = torch.empty((height, camera.width, 3), device=self.device)
         transmittance = torch.empty((height, camera.width), device=self.device)
-        across, tiles = _tiles_of(camera, band)
+        across, tiles = tiles_of(camera, band)
         kernels.render[(tiles,)](
-            lists.ranks, lists.starts, lists.gaussians, lists.values, colours, self._background, image, transmittance,
+            lists.ranks, lists.starts, lists.gaussians, lists.values, colours, self.background, image, transmittance,
             camera.width, *band, across,
-            **self._cuts(),
+            **self.cuts(),
         )  # fmt: skip
         return image, transmittance
 
-    def _cuts(self) -> dict[str, float | int]:
+    def cuts(self) -> dict[str, float | int]:
+        """What the kernels that blend are compiled with."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         return {
@@ -211,6 +209,23 @@ class TritonRasterizer:
         return DeviceLists(order, values[order], starts, ranks[slots], slots.to(torch.int32), first_slots)
 
 
+def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: Tensor) -> None:
+    """Write the sum of each Gaussian's slots, in a fixed order, into its row of `gradient`.
+
+    Args:
+        gradient: [N, 3] float32.
+        slots: [E, 3] float32; the slots of one Gaussian lie side by side.
+        first_slots: [V + 1] integers, rank -> first slot.
+        gaussians: [V] integers, rank -> row of `gradient`.
+    """
+    from sgsst_core.rasterizer import triton_kernels as kernels
+
+    block = kernels.ADDED.value
+    kernels.add_slots[(-(-len(gaussians) // block),)](
+        slots, first_slots, gaussians, gradient, len(gaussians), BLOCK=block, SLOTS=kernels.SLOTS.value
+    )
+
+
 def _usable_device(device: torch.device | str | None) -> torch.device:
     """The device, with its index.
 
@@ -246,7 +261,7 @@ def _numbers(camera: Camera, near: float) -> list[float]:
     return [*pose, camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height), near]
 
 
-def _tiles_of(camera: Camera, band: Rows) -> tuple[int, int]:
+def tiles_of(camera: Camera, band: Rows) -> tuple[int, int]:
     """Raster tiles across the view, and in the rows of tiles that a band touches."""
     across = tile_grid(camera)[0]
     return across, across * (-(-band[1] // RASTER_TILE) - band[0] // RASTER_TILE)

@@ -17,6 +17,8 @@ import triton.language as tl
 
 #: Gaussians that one program projects, and that it blends at a time.
 PROJECTED, BLENDED = tl.constexpr(128), tl.constexpr(32)
+#: Gaussians whose slots one program adds up, and slots of each that it reads at a time.
+ADDED, SLOTS = tl.constexpr(32), tl.constexpr(16)
 _TILE: tl.constexpr = tl.constexpr(16)
 _PIXELS: tl.constexpr = tl.constexpr(256)
 _LN2: tl.constexpr = tl.constexpr(0.6931471805599453)
@@ -214,7 +216,7 @@ def list_tiles(
 
 
 @triton.jit
-def _weights(
+def blend_weights(
     ranks, values, k, end, x0, y0, transmittance,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
@@ -262,7 +264,7 @@ def render(
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     going = tl.max(left, 0)
     while (k < end) & (going > 0):
-        weights, left = _weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
         j = k + tl.arange(0, K)
         there = j < end
         gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
@@ -299,7 +301,7 @@ def slot_gradients(
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     going = tl.max(left, 0)
     while (k < end) & (going > 0):
-        weights, left = _weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
         j = k + tl.arange(0, K)
         there = j < end
         slot = out + 3 * tl.load(slots + j, mask=there, other=0).to(tl.int64)
@@ -311,21 +313,25 @@ def slot_gradients(
 
 
 @triton.jit
-def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr):
-    """Add up each Gaussian's slots [E, 3], in order and in float64, into its row of `out` [N, 3]."""
+def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, SLOTS: tl.constexpr):
+    """Add up each Gaussian's slots [E, 3], in a fixed order and in float64, into its row of `out` [N, 3].
+
+    SLOTS at a time: a Gaussian that fills the view has a slot in every tile.
+    """
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = rank < visible
-    slot = tl.load(first_slots + rank, mask=there, other=0)
-    end = tl.load(first_slots + rank + 1, mask=there, other=0)
-    channel = tl.arange(0, 4)
-    sums = tl.zeros([BLOCK, 4], tl.float64)
+    slot = tl.load(first_slots + rank, mask=there, other=0).to(tl.int64)
+    end = tl.load(first_slots + rank + 1, mask=there, other=0).to(tl.int64)
+    red, green = tl.zeros([BLOCK, SLOTS], tl.float64), tl.zeros([BLOCK, SLOTS], tl.float64)
+    blue = tl.zeros([BLOCK, SLOTS], tl.float64)
     while tl.max(end - slot, 0) > 0:
-        own = (slot < end)[:, None] & (channel < 3)[None, :]
-        sums += tl.load(slots + 3 * slot[:, None] + channel[None, :], mask=own, other=0.0).to(tl.float64)
-        slot += 1
-    gaussian = tl.load(gaussians + rank, mask=there, other=0)
-    tl.store(
-        out + 3 * gaussian[:, None] + channel[None, :],
-        sums.to(tl.float32),
-        mask=there[:, None] & (channel < 3)[None, :],
-    )
+        j = slot[:, None] + tl.arange(0, SLOTS)[None, :]
+        own = j < end[:, None]
+        red += tl.load(slots + 3 * j, mask=own, other=0.0).to(tl.float64)
+        green += tl.load(slots + 3 * j + 1, mask=own, other=0.0).to(tl.float64)
+        blue += tl.load(slots + 3 * j + 2, mask=own, other=0.0).to(tl.float64)
+        slot += SLOTS
+    row = out + 3 * tl.load(gaussians + rank, mask=there, other=0).to(tl.int64)
+    tl.store(row, tl.sum(red, 1).to(tl.float32), mask=there)
+    tl.store(row + 1, tl.sum(green, 1).to(tl.float32), mask=there)
+    tl.store(row + 2, tl.sum(blue, 1).to(tl.float32), mask=there)

@@ -174,19 +174,20 @@ class Stylizer:
             return whole, None
         if plan.rasterizer != "cached":
             return make_rasterizer(plan.rasterizer, seen, **options), None
-        cpu = whole if isinstance(whole, CpuRasterizer) else CpuRasterizer(seen, **options)
+        anew = whole if whole and whole.name == plan.anew else make_rasterizer(plan.anew, seen, **options)
         budget = int(self.memory * MEMORY_SHARES["rasterizer"])
         share = budget // 4 if plan.coarse_weights else 0
         cached = make_rasterizer(
             "cached",
             seen,
-            device=plan.device,
             max_bytes=budget - share,
             precision="half" if plan.kept_weights == "half" else "float32",
-            cpu=cpu,
-            **options,
+            anew=anew,
         )
-        return cached, CoarseRasterizer(cpu, max_bytes=share) if plan.coarse_weights else None
+        coarse = None
+        if plan.coarse_weights and isinstance(anew, CpuRasterizer):
+            coarse = CoarseRasterizer(anew, max_bytes=share)
+        return cached, coarse
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
         plan, settings = self.plan, self.settings

@@ -85,7 +85,7 @@ def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: Backbon
     assert make(scene, views, tiny_weights, steps_sos=30, kept_weights="none").views.rasterizer.name == "cpu"
     decision = next(d for d in little.plan.decisions if d.item == "blend weights")
     assert "half precision" in decision.decision
-    assert "1/4096" in decision.error
+    assert "1/2048" in decision.error
 
 
 def test_pruning_stays_within_its_bound_and_is_made_up_for(tiny_weights: BackboneWeights) -> None:

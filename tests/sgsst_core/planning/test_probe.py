@@ -116,7 +116,7 @@ def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneW
         assert bool(plan.seen.all()) is handed_on
         assert used.network is workshop.network
         rasterizer = used.views.rasterizer
-        own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer._cpu  # type: ignore[attr-defined]
+        own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer.anew  # type: ignore[attr-defined]
         assert (own is workshop.rasterizer) is handed_on
         assert used.run_step().loss == fresh.run_step().loss
         assert torch.equal(used.sh_dc, fresh.sh_dc)

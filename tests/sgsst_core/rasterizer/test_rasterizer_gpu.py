@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import replace
 
 import pytest
 import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
@@ -65,21 +62,6 @@ def test_bands_put_together_are_the_whole() -> None:
     assert torch.allclose(parts, cuda.render(colours, view), atol=1e-5)
     gradient = torch.stack([cuda.colour_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
     assert relative_error(gradient, cuda.colour_gradient(pixels, view)) < 1e-4
-
-
-@pytest.mark.gpu
-@needs_gpu
-def test_cached_on_the_gpu_agrees_with_cpu() -> None:
-    scene, view = cloud(800, seed=4), camera(130, 75)
-    colours, pixels = colours_of(scene), pixels_like(view)
-    cpu, cached = (
-        CpuRasterizer(scene, background=(1, 1, 1)),
-        CachedRasterizer(scene, background=(1, 1, 1), device="cuda"),
-    )
-    assert torch.allclose(cached.render(colours, view).cpu(), cpu.render(colours, view), atol=1e-5)
-    assert torch.allclose(cached.coverage(view, (3, 40)).cpu(), cpu.coverage(view, (3, 40)), atol=1e-6)
-    assert relative_error(cached.colour_gradient(pixels, view).cpu(), cpu.colour_gradient(pixels, view)) < 1e-5
-    assert cached.render(colours, replace(view, name="same content")).device.type == "cuda"
 
 
 @pytest.mark.skipif(HAS_GSPLAT, reason="gsplat is installed")

@@ -184,10 +184,11 @@ def test_made_by_its_name() -> None:
 
 def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
     """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
-    settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=24)
+    settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=16)
+    views = cameras(2, 32, 32)  # so small that a step in the interpreter takes seconds
     losses = {}
     for name in ("cpu", "triton"):
-        stylizer = Stylizer.planned(wall(), cameras(2), style(), settings, weights=tiny_weights, rasterizer=name)
+        stylizer = Stylizer.planned(wall(), views, style(), settings, weights=tiny_weights, rasterizer=name)
         assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == name
         losses[name] = [stylizer.run_step().loss for _ in range(3)]
     assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-4)
@@ -213,7 +214,7 @@ def test_kernels_compile_for_real_targets_within_their_registers() -> None:
     ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     lines = re.findall(r"^(\w+) +(\w+) +registers (\d+) +spilled (\d+)", ended.stdout, flags=re.M)
-    assert len(lines) == 5 * 4
+    assert len(lines) == 12 * 4
     for kernel, target, registers, spilled in lines:
         assert int(registers) <= 256, (kernel, target)
         assert int(spilled) <= (128 if target.startswith("gfx") else 0), (kernel, target)

@@ -1,0 +1,114 @@
+"""Kept blend weights on the CPU: runs of weights by half raster tile, applied with vector instructions.
+
+In the same order as `cpu`, and so with the same result. See `kernels` for the layout.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.compiled import kernel_threads
+from sgsst_core.constants import RASTER_TILE
+from sgsst_core.rasterizer import kernels
+from sgsst_core.rasterizer.arguments import Rows
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.kept_weights import Precision
+from sgsst_core.scene.camera import Camera
+
+_ITEM_BYTES = 20  # a Gaussian's index, a slot, a gradient
+_PIECE_BYTES = 4  # an item
+
+
+def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
+
+
+class CountedStrips:
+    """What a band's weights will need, counted before they are kept: costs about one render.
+
+    Attributes:
+        items: [strips].
+        pieces: [4 strips], of 32 weights.
+        slot_items: [E], items of every pair of Gaussian and raster tile.
+    """
+
+    def __init__(self, rasterizer: CpuRasterizer, camera: Camera, band: Rows) -> None:
+        self.rasterizer, self.camera, self.band = rasterizer, camera, band
+        self.lists = lists = rasterizer.lists(camera)
+        strips = (len(lists.starts) - 1) * (RASTER_TILE // kernels.STRIP)
+        sizes = (strips, strips * kernels.BLOCKS, len(lists.ranks))
+        self.items, self.pieces, self.slot_items = (np.zeros(size, dtype=np.int64) for size in sizes)
+        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
+        counts = (self.items, self.pieces, self.slot_items)
+        with kernel_threads():
+            kernels.count_weights(*tiles, band, camera.width, rasterizer.alpha_max, *counts)
+
+    def nbytes(self, precision: Precision) -> int:
+        """Bytes that the weights would take."""
+        pixels = (self.band[1] - self.band[0]) * self.camera.width
+        index = self.items.nbytes + self.pieces.nbytes + 4 * pixels + _ITEM_BYTES * int(self.items.sum())
+        piece = _PIECE_BYTES + kernels.PIECE * (4 if precision == "float32" else 2)
+        return index + int(self.pieces.sum()) * piece
+
+    def keep(self, precision: Precision) -> WeightStrips:
+        """Compute the weights once more, and keep them."""
+        return WeightStrips(self, precision)
+
+
+class WeightStrips:
+    """Blend weights of one band of a view.
+
+    Weights are kept for the rows that a Gaussian reaches in a strip of 8 columns by 16 rows, one run of 8 a row,
+    float32 or float16.
+    """
+
+    def __init__(self, counted: CountedStrips, precision: Precision) -> None:
+        rasterizer, lists, band = counted.rasterizer, counted.lists, counted.band
+        self.first_row = band[0]
+        self.background = rasterizer.background
+        self.gaussians = lists.projection.gaussians
+        self.nbytes = counted.nbytes(precision)
+        self._total = len(rasterizer.scene)
+        slot_starts = _offsets(counted.slot_items)
+        self.first_slots = slot_starts[lists.first_slots]
+        items, pieces = int(counted.items.sum()), int(counted.pieces.sum())
+        weights: NDArray[np.float32] | NDArray[np.uint16]
+        if precision == "float32":
+            weights = np.empty(pieces * kernels.PIECE, dtype=np.float32)
+        else:
+            weights = np.empty(pieces * kernels.PIECE, dtype=np.uint16)
+        self.strips = kernels.Strips(
+            item_starts=_offsets(counted.items),
+            piece_starts=_offsets(counted.pieces),
+            gaussians=np.empty(items, dtype=np.int32),
+            slots=np.empty(items, dtype=np.int32),
+            items=np.empty(pieces, dtype=np.int32),
+            weights=weights,
+        )
+        transmittance = np.ones((band[1] - band[0], counted.camera.width), dtype=np.float32)
+        self.transmittance = torch.from_numpy(transmittance)
+        # Used by one thread at a time: see `kernel_threads`.
+        self._slot_gradients = np.empty((items, 3), dtype=np.float32)
+        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values, self.gaussians)
+        with kernel_threads():
+            kernels.keep_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
+
+    def render(self, colours: Tensor) -> Tensor:
+        """Image [h, width, 3] of colours [N, 3], over the background."""
+        transmittance = self.transmittance.numpy()
+        image = np.empty((*transmittance.shape, 3), dtype=np.float32)
+        with kernel_threads():
+            kernels.apply_weights(self.strips, colours.numpy(), self.background, transmittance, self.first_row, image)
+        return torch.from_numpy(image)
+
+    def colour_gradient(self, image_gradient: Tensor) -> Tensor:
+        """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3]."""
+        gradient = np.zeros((self._total, 3), dtype=np.float32)
+        pixels = image_gradient.numpy()
+        with kernel_threads():
+            kernels.apply_transposed_weights(self.strips, pixels, self.first_row, self._slot_gradients)
+            kernels.add_slots(self._slot_gradients, self.first_slots, self.gaussians, gradient)
+        return torch.from_numpy(gradient)

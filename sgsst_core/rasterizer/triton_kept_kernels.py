@@ -1,0 +1,190 @@
+"""GPU kernels of kept blend weights: count, keep, apply, transpose.
+
+A raster tile is cut into 16 blocks of 4 x 4 pixels. A piece is one Gaussian in one block: 16 weights, row by row, and
+two indices. The pieces of a block lie one after the other, front to back, so that a program reads nothing but what it
+needs, in one stream, and adds it up in registers. Blocks of 4 x 4 hold least padding together with indices: on trained
+scenes larger ones take up to a third more bytes, and smaller ones no fewer.
+
+Weights are those of `triton_kernels.blend_weights`. They are computed twice, by two kernels that the compiler may round
+differently: which blocks hold a weight is decided once, by `count_pieces`, and `keep_pieces` follows its masks. As
+float16 they are multiplied by `HALF_SCALE`, which keeps the least of them (4e-7) among the normal numbers: each is off
+by at most 2^-11 of itself.
+
+Nothing is added atomically: results repeat to the bit.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from sgsst_core.rasterizer.triton_kernels import blend_weights
+
+#: Blocks of a raster tile, weights of a piece, pieces that one program reads at a time.
+BLOCKS, PIECE, PIECES = tl.constexpr(16), tl.constexpr(16), tl.constexpr(16)
+#: 0.99 times it is in the range of float16, and the least weight a normal number.
+HALF_SCALE = 2.0**14
+_TILE: tl.constexpr = tl.constexpr(16)
+_PIXELS: tl.constexpr = tl.constexpr(256)
+_SIDE: tl.constexpr = tl.constexpr(4)
+
+
+@triton.jit
+def _tile_pixels(tile, width, first_row, last_row, across):
+    """Of a raster tile: its corner, which of its 256 pixels are in the band, and their places in it."""
+    x0, y0 = tile % across * _TILE, tile // across * _TILE
+    pixel = tl.arange(0, _PIXELS)
+    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
+    inside = (x < width) & (y >= first_row) & (y < last_row)
+    return x0, y0, inside, (y - first_row).to(tl.int64) * width + x
+
+
+@triton.jit
+def _block_pixels(block, width, first_row, last_row, across):
+    """Which of the 16 pixels of a band's block are in the band, and their places in it."""
+    tile = first_row // _TILE * across + block // BLOCKS
+    pixel = tl.arange(0, PIECE)
+    x = tile % across * _TILE + block % _SIDE * _SIDE + pixel % _SIDE
+    y = tile // across * _TILE + block % BLOCKS // _SIDE * _SIDE + pixel // _SIDE
+    inside = (x < width) & (y >= first_row) & (y < last_row)
+    return inside, (y - first_row).to(tl.int64) * width + x
+
+
+@triton.jit
+def _by_block(weights, K: tl.constexpr):
+    """Weights [K, 256] of a tile's pixels as [K, 16, 16]: block, pixel of the block."""
+    split = tl.reshape(weights, [K, _SIDE, _SIDE, _SIDE, _SIDE])  # rows of blocks, rows, columns of blocks, columns
+    return tl.reshape(tl.permute(split, (0, 1, 3, 2, 4)), [K, BLOCKS, PIECE])
+
+
+@triton.jit
+def count_pieces(
+    ranks, slots, starts, values, masks, slot_pieces, block_pieces, ends, width, first_row, last_row, across,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+):  # fmt: skip
+    """Which blocks each pair of Gaussian and raster tile has weights in; one program a raster tile of the band.
+
+    Args:
+        masks: [E] int32 zeros, a bit for each block.
+        slot_pieces: [E] int32 zeros, pieces by the pair's slot.
+        block_pieces: [16 tiles] int32, pieces of every block of the band's tiles, written.
+        ends: [tiles] int64, the entry at which the band's tiles are finished, written.
+    """
+    tile = first_row // _TILE * across + tl.program_id(0)
+    x0, y0, inside, _ = _tile_pixels(tile, width, first_row, last_row, across)
+    block = tl.arange(0, BLOCKS)
+    left = tl.where(inside, 1.0, 0.0)
+    pieces = tl.zeros([BLOCKS], tl.int32)
+    k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    going = tl.max(left, 0)
+    while (k < end) & (going > 0):
+        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        found = (tl.max(_by_block(weights, K), 2) > 0).to(tl.int32)  # [K, 16]
+        j = k + tl.arange(0, K)
+        there = j < end
+        tl.store(masks + j, tl.sum(found << block[None, :], 1), mask=there)
+        tl.store(slot_pieces + tl.load(slots + j, mask=there, other=0), tl.sum(found, 1), mask=there)
+        pieces += tl.sum(found, 0)
+        going = tl.max(left, 0)
+        k += K
+    tl.store(block_pieces + tl.program_id(0) * BLOCKS + block, pieces)
+    tl.store(ends + tl.program_id(0), tl.minimum(k, end))
+
+
+@triton.jit
+def keep_pieces(
+    ranks, slots, starts, values, gaussians, masks, ends, slot_starts, block_starts, piece_gaussians, piece_slots,
+    weights, transmittances, width, first_row, last_row, across,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr, SCALE: tl.constexpr,
+):  # fmt: skip
+    """Fill the pieces that `count_pieces` counted, and the final transmittance [h, width] of the band.
+
+    Args:
+        slot_starts: [E + 1], where the pieces of each pair begin among those of its Gaussian.
+        block_starts: [16 tiles + 1], where the pieces of each block of the band begin.
+        piece_gaussians: [P] int32 indices into the scene, written.
+        piece_slots: [P], where each piece's gradient goes, written.
+        weights: [16 P] float32, or float16 times SCALE, written.
+    """
+    tile = first_row // _TILE * across + tl.program_id(0)
+    x0, y0, inside, place = _tile_pixels(tile, width, first_row, last_row, across)
+    block = tl.arange(0, BLOCKS)
+    left = tl.where(inside, 1.0, 0.0)
+    piece = tl.load(block_starts + tl.program_id(0) * BLOCKS + block).to(tl.int64)
+    k, end = tl.load(starts + tile), tl.load(ends + tl.program_id(0))
+    while k < end:
+        blended, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        j = k + tl.arange(0, K)
+        there = j < end
+        found = (tl.load(masks + j, mask=there, other=0)[:, None] >> block[None, :]) & 1  # [K, 16]
+        kept = found > 0
+        target = piece[None, :] + tl.cumsum(found, 0) - found
+        gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
+        first_slot = tl.load(slot_starts + tl.load(slots + j, mask=there, other=0), mask=there, other=0)
+        slot = first_slot[:, None] + tl.cumsum(found, 1) - found
+        tl.store(piece_gaussians + target, tl.broadcast_to(gaussian[:, None], [K, BLOCKS]).to(tl.int32), mask=kept)
+        tl.store(piece_slots + target, slot.to(piece_slots.dtype.element_ty), mask=kept)
+        cells = weights + PIECE * target[:, :, None] + tl.arange(0, PIECE)[None, None, :]
+        scaled = (_by_block(blended, K) * SCALE).to(weights.dtype.element_ty)
+        tl.store(cells, scaled, mask=tl.broadcast_to(kept[:, :, None], [K, BLOCKS, PIECE]))
+        piece += tl.sum(found, 0)
+        k += K
+    tl.store(transmittances + place, tl.abs(left), mask=inside)
+
+
+@triton.jit
+def _load_pieces(weights, k, end, P: tl.constexpr):
+    """Weights [P, 16] of the next P pieces of a block, their places [P] and which of them there are [P]."""
+    j = k.to(tl.int64) + tl.arange(0, P)
+    there = j < end
+    cells = weights + PIECE * j[:, None] + tl.arange(0, PIECE)[None, :]
+    return tl.load(cells, mask=there[:, None], other=0.0).to(tl.float32), j, there
+
+
+@triton.jit
+def apply_pieces(
+    block_starts, gaussians, weights, colours, background, transmittances, image, width, first_row, last_row, across,
+    SCALE: tl.constexpr, P: tl.constexpr,
+):  # fmt: skip
+    """Image [h, width, 3] of kept weights; one program a block."""
+    inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
+    k, end = tl.load(block_starts + tl.program_id(0)), tl.load(block_starts + tl.program_id(0) + 1)
+    red, green, blue = (
+        tl.zeros([P, PIECE], tl.float32),
+        tl.zeros([P, PIECE], tl.float32),
+        tl.zeros([P, PIECE], tl.float32),
+    )
+    while k < end:
+        kept, j, there = _load_pieces(weights, k, end, P)
+        colour = colours + 3 * tl.load(gaussians + j, mask=there, other=0).to(tl.int64)
+        red += kept * tl.load(colour, mask=there, other=0.0)[:, None]
+        green += kept * tl.load(colour + 1, mask=there, other=0.0)[:, None]
+        blue += kept * tl.load(colour + 2, mask=there, other=0.0)[:, None]
+        k += P
+    left = tl.load(transmittances + place, mask=inside, other=0.0)
+    tl.store(image + 3 * place, tl.sum(red, 0) * (1.0 / SCALE) + left * tl.load(background), mask=inside)
+    tl.store(image + 3 * place + 1, tl.sum(green, 0) * (1.0 / SCALE) + left * tl.load(background + 1), mask=inside)
+    tl.store(image + 3 * place + 2, tl.sum(blue, 0) * (1.0 / SCALE) + left * tl.load(background + 2), mask=inside)
+
+
+@triton.jit
+def piece_gradients(
+    block_starts, slots, weights, image_gradient, out, width, first_row, last_row, across,
+    SCALE: tl.constexpr, P: tl.constexpr,
+):  # fmt: skip
+    """dL/dcolour of every piece in its own slot [P, 3]; one program a block."""
+    inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
+    red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
+    green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)
+    blue = tl.load(image_gradient + 3 * place + 2, mask=inside, other=0.0)
+    k, end = tl.load(block_starts + tl.program_id(0)), tl.load(block_starts + tl.program_id(0) + 1)
+    while k < end:
+        kept, j, there = _load_pieces(weights, k, end, P)
+        slot = out + 3 * tl.load(slots + j, mask=there, other=0).to(tl.int64)
+        tl.store(slot, tl.sum(kept * red[None, :], 1) * (1.0 / SCALE), mask=there)
+        tl.store(slot + 1, tl.sum(kept * green[None, :], 1) * (1.0 / SCALE), mask=there)
+        tl.store(slot + 2, tl.sum(kept * blue[None, :], 1) * (1.0 / SCALE), mask=there)
+        k += P

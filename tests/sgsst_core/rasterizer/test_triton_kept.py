@@ -1,0 +1,252 @@
+"""Kept weights on GPUs against `reference` and `triton`: on a GPU where there is one, else in Triton's interpreter."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.probe import equip, measure
+from sgsst_core.planning.ranks_model import Link
+from sgsst_core.planning.survey import survey
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.kept_weights import Precision
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
+from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
+from tests.small_scenes import ball, cameras, style
+
+pytest.importorskip("triton")
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+pytestmark = [pytest.mark.usefixtures("one_thread"), *([pytest.mark.gpu] if DEVICE == "cuda" else [])]
+BACKGROUND = (1.0, 0.25, 0.5)
+#: Float32 moves a decision only within this relative distance of its cut.
+CLOSE = 2e-5
+#: Of images and gradients, relative to exact weights; each weight of the second is off by at most 2^-11.
+ERRORS: dict[Precision, float] = {"float32": 5e-6, "half": 2**-11}
+
+CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
+    "turned": lambda: (cloud(120, seed=1), camera(33, 20, pose=turned_pose())),
+    "opaque": lambda: (
+        replace(cloud(200, seed=2, log_scale=-1.5), opacities=torch.full((200,), 7.0)),
+        camera(18, 17),
+    ),
+    "thin": lambda: (replace(cloud(60, seed=5, log_scale=-1.5), opacities=torch.full((60,), -4.0)), camera(20, 17)),
+    "huge": lambda: (cloud(40, seed=3, log_scale=3.0), camera(33, 17)),
+    "most tiles empty": lambda: (cloud(40, seed=4, log_scale=-7.0), camera(50, 33)),
+    "one pixel": lambda: (cloud(60, seed=6), camera(1, 1)),
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
+    return CASES[request.param]()
+
+
+def on_device(scene: Scene) -> TritonRasterizer:
+    return TritonRasterizer(scene, background=BACKGROUND, device=DEVICE)
+
+
+def kept_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
+    return CachedRasterizer(scene, anew=on_device(scene), **options)
+
+
+def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
+    scene, view = case
+    reference, anew = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
+    band = reference.near_cutoff(view, CLOSE)
+    colours, pixels = colours_of(scene), pixels_like(view)
+    pixels[band] = 0
+    image, coverage = reference.render(colours, view), reference.coverage(view)
+    gradient = reference.colour_gradient(pixels, view)
+    for precision, error in ERRORS.items():
+        kept = CachedRasterizer(scene, precision=precision, anew=anew)
+        assert_close_outside_band(kept.render(colours, view).cpu(), image, band, tolerance=2 * error + 1e-5)
+        assert_close_outside_band(kept.coverage(view).cpu(), coverage, band, tolerance=1e-5)
+        assert relative_error(kept.colour_gradient(pixels, view).cpu(), gradient) < error + 5e-6
+        assert kept.is_kept(view)
+
+
+def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
+    """Down to the least weights: a faint Gaussian behind opaque ones."""
+    scene, view = cloud(150, seed=7, log_scale=-1.0), camera(18, 17)
+    anew = on_device(scene)
+    exact, half = (CachedRasterizer(scene, anew=anew).count(view).keep(form) for form in ERRORS)
+    weights = exact.weights.double()  # type: ignore[attr-defined]
+    rounded = half.weights.double() / half.scale  # type: ignore[attr-defined]
+    # On a GPU the exact ones come from another kernel, which may round differently.
+    assert bool(((rounded - weights).abs() <= (2**-11 + 1e-6) * weights).all())
+    assert 0 < float(weights[weights > 0].min()) < 1e-5
+    assert half.weights.dtype == torch.float16  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("precision", ERRORS)
+def test_gradient_is_the_transpose_and_repeats_to_the_bit(precision: Precision) -> None:
+    scene, view = cloud(120, seed=15), camera(33, 20)
+    kept, colours, pixels = kept_on_device(scene, precision=precision), colours_of(scene), pixels_like(view)
+    gradient = kept.colour_gradient(pixels, view)
+    black = kept.render(torch.zeros_like(colours), view).cpu().double()
+    image = kept.render(colours, view).cpu().double() - black
+    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colours).sum()), rel=1e-5)
+    assert torch.equal(kept.colour_gradient(pixels, view), gradient)
+    assert torch.equal(kept_on_device(scene, precision=precision).colour_gradient(pixels, view), gradient)
+
+
+def test_bands_put_together_are_the_whole() -> None:
+    scene, view = cloud(100, seed=14), camera(20, 35)
+    colours, pixels, anew = colours_of(scene), pixels_like(view), on_device(scene)
+    whole, parts = (CachedRasterizer(scene, anew=anew) for _ in range(2))
+    bands = [(0, 16), (16, 21), (21, 35)]
+    image, gradient = whole.render(colours, view), whole.colour_gradient(pixels, view)
+    # A block that a band cuts may have fewer pieces, which are then added up in other groups.
+    together = torch.cat([parts.render(colours, view, rows) for rows in bands])
+    assert float((together - image).abs().max()) < 1e-6
+    assert torch.equal(together[:16], image[:16])
+    assert torch.equal(torch.cat([parts.coverage(view, rows) for rows in bands]), whole.coverage(view))
+    own = [parts.colour_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
+    assert relative_error(torch.stack(own).sum(0), gradient) < 1e-6
+    # and a band that the whole view's weights serve is the same
+    assert torch.equal(whole.render(colours, view, (16, 21)), image[16:21])
+    assert relative_error(whole.colour_gradient(pixels[16:21], view, (16, 21)), own[1]) < 1e-6
+
+
+@pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
+def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
+    kept, view = kept_on_device(scene), camera(20, 18)
+    assert torch.equal(kept.render(colours_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert not kept.coverage(view).any()
+    gradient = kept.colour_gradient(pixels_like(view), view)
+    assert gradient.shape == (len(scene), 3)
+    assert not gradient.any()
+    assert kept.kept_bytes == kept.operator_bytes(view)
+
+
+def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() -> None:
+    scene = cloud(100, seed=20)
+    views = [camera(20, 17), camera(20, 17, pose=turned_pose(0.1)), camera(17, 20, pose=turned_pose(0.2))]
+    colours, pixels, anew = colours_of(scene), pixels_like(views[0]), on_device(scene)
+    for precision in ERRORS:
+        sizes = [CachedRasterizer(scene, precision=precision, anew=anew).operator_bytes(view) for view in views[:2]]
+        budget = sum(sizes)
+        kept = CachedRasterizer(scene, precision=precision, anew=anew, max_bytes=budget)
+        for view in views:
+            kept.coverage(view)
+        assert [kept.is_kept(view) for view in views] == [True, True, False]
+        assert kept.kept_bytes == budget
+    assert torch.equal(kept.render(colours, views[2]), anew.render(colours, views[2]))
+    gradient = kept.colour_gradient(pixels_like(views[2]), views[2])
+    assert torch.equal(gradient, anew.colour_gradient(pixels_like(views[2]), views[2]))
+    band = (3, 16)
+    assert kept.operator_bytes(views[2], band) < kept.operator_bytes(views[2])
+    alone = CachedRasterizer(scene, anew=anew)
+    alone.colour_gradient(pixels[3:16], views[0], band)
+    assert alone.kept_bytes == alone.operator_bytes(views[0], band)
+
+
+def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
+    scene, view = cloud(120, seed=21), camera(33, 20)
+    weights: Any = kept_on_device(scene).count(view).keep("float32")
+    assert bool((weights.weights.view(-1, 16).amax(1) > 0).all())
+    pieces = len(weights.piece_slots)
+    assert torch.equal(weights.piece_slots.sort().values.cpu(), torch.arange(pieces, dtype=torch.int32))
+    lengths = weights.first_slots.diff().long()
+    owners = torch.repeat_interleave(weights.gaussians, lengths)
+    assert torch.equal(owners[weights.piece_slots.long()], weights.piece_gaussians)
+
+
+@contextmanager
+def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Names of the calls that wait for a device, where it is one."""
+    found: list[str] = []
+
+    def noted(name: str) -> Callable[..., Any]:
+        original = getattr(Tensor, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            found.append(name)
+            return original(*arguments, **options)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for name in ("item", "tolist", "nonzero", "__bool__", "__int__", "__float__", "__index__"):
+            patch.setattr(Tensor, name, noted(name))
+        yield found
+
+
+def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wait of the lists is for their length, that of the weights for the number of pieces."""
+    scene, view = cloud(60, seed=22), camera(20, 17)
+    kept, colours, pixels = kept_on_device(scene), colours_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
+    kept.anew.lists(view)
+    with waits(monkeypatch) as found:
+        kept.coverage(view)
+    assert found == ["__int__"]
+    with waits(monkeypatch) as found:
+        kept.colour_gradient(kept.render(colours, view) + pixels, view)
+    assert not found
+
+
+def test_made_by_its_name() -> None:
+    scene = cloud(10)
+    anew = make_rasterizer("triton", scene, device=DEVICE)
+    rasterizer: Any = make_rasterizer("cached", scene, anew=anew)
+    assert (rasterizer.device, rasterizer.anew) == (anew.device, anew)
+    if DEVICE == "cuda":
+        on_gpu: Any = make_rasterizer("cached", scene, device="cuda")
+        assert isinstance(on_gpu.anew, TritonRasterizer)
+
+
+# --- plan and job --------------------------------------------------------------------------------------------------
+
+
+#: So small that a step in the interpreter takes seconds.
+VIEWS = cameras(2, 32, 24)
+
+
+def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) -> None:
+    scene = ball(60)
+    workshop = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
+    found = measure(workshop, survey(scene, VIEWS, workshop.rasterizer), Link(float("inf"), 0.0)).raster
+    planned: dict[Precision, int | None] = {"float32": found.bytes, "half": found.half_bytes}
+    for precision, size in planned.items():
+        kept = CachedRasterizer(scene, precision=precision, anew=workshop.rasterizer)  # type: ignore[arg-type]
+        for view in VIEWS:
+            kept.coverage(view)
+        assert kept.kept_bytes == size
+    assert found.kept_seconds is not None
+    assert found.keeping_seconds is not None
+    assert min(found.seconds, found.kept_seconds, found.keeping_seconds) > 0
+
+
+def test_a_job_goes_on_with_the_lists_of_its_plan(tiny_weights: BackboneWeights) -> None:
+    scene, losses = ball(60), {}
+    settings = make_settings("preview", steps_coarse=0, steps_sos=1, kept_weights="half")
+    for name in ("cpu", "triton"):
+        plan, workshop = make_plan(scene, VIEWS[:1], settings, weights=tiny_weights, rasterizer=name)
+        inputs = (plan, scene, VIEWS[:1], style(), settings)
+        used, resumed = (Stylizer(*inputs, weights=tiny_weights, workshop=shop) for shop in (workshop, None))
+        rasterizers: list[Any] = [stylizer.views.rasterizer for stylizer in (used, resumed)]
+        assert rasterizers[0].anew is workshop.rasterizer
+        for each in rasterizers:
+            assert (each.name, each.precision, each.anew.name) == ("cached", "half", name)
+        losses[name] = used.run_step().loss
+    assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-3)
