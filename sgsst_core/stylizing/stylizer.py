@@ -88,7 +88,7 @@ class Stylizer:
     ) -> None:
         self.plan = plan
         self.settings = settings
-        self.timer = Timer()
+        self.timer = Timer(plan.device)
         self.seconds = 0.0
         self.seconds_by_part: dict[str, float] = {}
         self.step = 0
@@ -252,7 +252,7 @@ class Stylizer:
             DivergedError: the gradient has left the range of float32; the colours are those before the step.
         """
         started = time.perf_counter()
-        self.timer.seconds.clear()
+        self.timer.clear()
         phase = self.phase
         if phase.scale is None:
             self._coarse = None  # phase 1 is over
@@ -263,6 +263,7 @@ class Stylizer:
         self.step += 1
         with self.timer("communication"):
             self._team.check_drift(self.step, self.sh_dc)
+        self.timer.read()
         if phase.scale is None:
             self._balance()
         self.seconds += time.perf_counter() - started
