@@ -31,6 +31,8 @@ HALO = {"vgg16": 64, "vgg19": 80}
 ALIGNMENT = 16
 #: Its newer names are not declared.
 _CUDNN: Any = torch.backends.cudnn
+#: Relative rounding of what is multiplied in TF32, as `torch.finfo` has those of other formats.
+_TF32_EPS = 2.0**-10
 #: Values of a tensor up to which cuDNN's fused convolution, which knows no way around, can count in 32 bits.
 _FUSED_VALUES = 2**31
 #: Side of the picture on which fused convolutions are tried, and by how much of their largest value they may differ
@@ -131,6 +133,7 @@ class FeatureNetwork:
 
     Attributes:
         precision: in which convolutions are asked for: "tf32", or the name of `dtype`.
+        rounding: of features, relative.
     """
 
     def __init__(
@@ -150,6 +153,7 @@ class FeatureNetwork:
         self.device = torch.device(device)
         self.tf32 = tf32
         self.precision = "tf32" if tf32 else str(dtype).removeprefix("torch.")
+        self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
         #: A CPU takes longer to find positions of maxima again than to keep them; a GPU has less memory than speed.
         self._keeps_positions = self.device.type == "cpu"
         self.halo = HALO[weights.name]

@@ -15,7 +15,7 @@ from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
 from sgsst_core.planning.choices import optimised_gaussians, precision_of, rendered_gaussians
-from sgsst_core.planning.cost import Work, content_bytes, image_bytes, pieces_of
+from sgsst_core.planning.cost import OPTIMISER_BYTES, Work, content_bytes, image_bytes, pieces_of
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
@@ -95,7 +95,7 @@ class _Deciding:
             memory_limit=probe.machine.memory_limit,
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
-            precision=precision_of(probe.network.precision_ratio),
+            precision=precision_of(settings.precision, probe.network.precision_ratio),
             kept_weights=form,
             coarse_weights=self._keeps_coarse(form, steps_coarse / views),
             measured=self.measured,
@@ -132,7 +132,7 @@ class _Deciding:
             *decisions.of_schedule(plan, settings, [self.tiling.scale_count(size) for size in self.sizes]),
         ]
         found += [ranks] if ranks else []
-        return (*found, *decisions.of_precision(probe.network.precision_ratio))
+        return (*found, *decisions.of_precision(probe, settings))
 
     # --- what is expected ------------------------------------------------------------------------------------------
 
@@ -145,22 +145,25 @@ class _Deciding:
         raster = self.probe.raster
         return raster.kept_seconds if self.base.kept_weights != "none" and raster.kept_seconds else raster.seconds
 
-    def _peak_bytes(self) -> int:
-        """Of a rank, but for activations."""
+    def _peak_bytes(self, activations: int) -> tuple[int, int | None]:
+        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes."""
         probe, raster = self.probe, self.probe.raster
         memory, ranks = probe.machine.memory, probe.machine.ranks
         kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[self.base.kept_weights] or 0
         content = 0 if "content" in self.settings.keep else self._content_bytes(self.base.covered)
-        peak = probe.process_bytes + image_bytes(probe.sizes)
-        peak += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
-        return peak + (MEASURING_BYTES if self.measured else 0)
+        process = probe.process_bytes + (MEASURING_BYTES if self.measured else 0)
+        computing = image_bytes(probe.sizes) + activations
+        computing += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
+        if probe.machine.device == "cpu":
+            return process + computing, None
+        return process, probe.device_bytes + computing + int(self.base.seen.sum()) * OPTIMISER_BYTES
 
     def _one_rank(self) -> tuple[Prediction, int, None]:
         network, raster = self.probe.network, self._raster_seconds
         coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
-        peak = self._peak_bytes() + int(self.work.peak * network.held_bytes)
+        peak, on_device = self._peak_bytes(int(self.work.peak * network.held_bytes))
         seconds = (self.work.seconds(network.rate) + raster, coarse.seconds(network.rate) + raster)
-        return Prediction(*seconds, peak), 1, None
+        return Prediction(*seconds, peak, device_bytes=on_device), 1, None
 
     def _several_ranks(self) -> tuple[Prediction, int, Decision]:
         """What is expected of the ranks that take part, how many that are, and why."""
@@ -186,12 +189,14 @@ class _Deciding:
         largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
         sharing = self.probe.machine.sharing
         memory = self.activations * sharing / min(choice.ranks, sharing)  # of fewer ranks, each has more
+        peak, on_device = self._peak_bytes(int(min(largest * (network.held_bytes + network.working_bytes), memory)))
         return Prediction(
             mean(work.seconds(each, link, groups) for work in sos),
             mean(work.seconds(each, link, groups) for work in coarse),
-            self._peak_bytes() + int(min(largest * (network.held_bytes + network.working_bytes), memory)),
+            peak,
             mean(work.communication(each, link) for work in sos),
             mean(work.seconds(1, link) for work in sos) * groups,
+            on_device,
         )
 
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:

@@ -44,6 +44,7 @@ class Prediction:
         peak_bytes: of physical memory of a rank, at any time.
         communication: seconds of an SOS iteration in which a rank waits for what others send.
         seconds_one_rank: of an SOS iteration on one rank; None where there is only one.
+        device_bytes: of a GPU's memory, at any time; None where a CPU computes.
     """
 
     seconds: float
@@ -51,6 +52,7 @@ class Prediction:
     peak_bytes: int
     communication: float = 0.0
     seconds_one_rank: float | None = None
+    device_bytes: int | None = None
 
 
 @dataclass(frozen=True)

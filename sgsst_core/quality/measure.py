@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
 from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut, moments
@@ -70,7 +68,7 @@ class Measurements:
             scene = stylizer.scene.without_zero_bands()
             name = own if (own := stylizer.views.rasterizer.name) in GPU_RASTERIZERS else "cpu"
             settings = stylizer.settings
-            source = self.exact if stylizer.network.dtype != torch.float32 else stylizer
+            source = self.exact if stylizer.network.precision != "float32" else stylizer
             first = stylizer.measured[0]["held_out"] if stylizer.measured else None
             self._held_out = HeldOut(
                 stylizer.views.cameras,

@@ -23,6 +23,7 @@ class StepRecord:
         terms: split loss by scale.
         parts: seconds of this step by what they went into.
         memory: bytes of physical memory that the process held after the step.
+        device_memory: most bytes of the GPU's memory that its tensors have held so far; None on a CPU.
     """
 
     step: int
@@ -33,6 +34,7 @@ class StepRecord:
     terms: dict[int, LossTerms]
     parts: dict[str, float]
     memory: int
+    device_memory: int | None = None
 
 
 @dataclass

@@ -14,7 +14,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
@@ -98,6 +98,7 @@ class Stylizer:
         self.weights = weights
         self.photos = photos
         self.style = style
+        forget_device_peak(plan.device)
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
@@ -278,6 +279,7 @@ class Stylizer:
             terms,
             dict(self.timer.seconds),
             self._process.memory_info().rss,
+            device_peak(self.network.device),
         )
         self.history.append(record)
         return record

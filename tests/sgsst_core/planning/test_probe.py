@@ -12,7 +12,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import Workshop, convolution_ratio, equip, measure
+from sgsst_core.planning.probe import Workshop, equip, measure
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.planning.pruning import pruned_image_error
 from sgsst_core.planning.ranks_model import Link
@@ -47,6 +47,8 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     )
     assert 0 < probe.network.rate.forward < 10 * probe.network.rate.both
     assert probe.network.precision_ratio is None
+    assert probe.network.gradient_error is None
+    assert probe.device_bytes == 0
     assert probe.raster.bytes is not None
     assert probe.raster.half_bytes is not None
     assert 0 < probe.raster.half_bytes < probe.raster.bytes
@@ -117,7 +119,3 @@ def test_a_rasterizer_that_is_named_is_measured_and_used(tiny_weights: BackboneW
     settings = make_settings(kept_weights="none")
     stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
     assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"
-
-
-def test_both_precisions_are_timed() -> None:
-    assert convolution_ratio("cpu") > 0
