@@ -28,8 +28,8 @@ def error_of(network: FeatureNetwork, weights: BackboneWeights, side: int = 384)
 
 
 def test_ten_bits_have_an_error_of_a_thousandth_but_for_flips(vgg16_weights: BackboneWeights) -> None:
-    """Most of what a lower precision costs are ReLUs and maxima that decide otherwise. Their number follows the rounding,
-    and the error goes down as the root of it.
+    """Most of what a lower precision costs are ReLUs and maxima that decide otherwise. Their number follows the
+    rounding, and the error goes down as the root of it.
     """
     flipping = error_of(RoundedToTf32(vgg16_weights), vgg16_weights)
     deciding = error_of(RoundedToTf32(vgg16_weights, decisions=FeatureNetwork(vgg16_weights)), vgg16_weights)
