@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sgsst_core.features import vgg
 from sgsst_core.features.network_weights import BackboneWeights
@@ -235,3 +237,44 @@ def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, mon
         network.forward(picture())
         first_block = 2
         assert len(calls) == sum(isinstance(step, vgg._Convolution) for step in network._steps) - first_block
+
+
+class Launches(TorchDispatchMode):
+    """Counts what computes: neither views nor empty memory."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if not func.is_view and "empty" not in func.__name__:
+            self.names[func.overloadpacket.__name__] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights) -> None:
+    """One for a convolution with its ReLU, one for a pool; backward two for each."""
+    network = FeatureNetwork(tiny_weights, tf32=True)
+    network._keeps_positions = False
+    pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
+    convolved, image = len(network._steps) - pools, picture()
+    with operator_on_cpu(fused):
+        fuse(network)
+        with Launches() as forward:
+            kept = network.forward(image)
+        with Launches() as backward:
+            network.backward(kept, lambda *_: None)
+    assert forward.names == {
+        "cudnn_convolution_relu": convolved,
+        "max_pool2d_with_indices": pools,
+        "mul": 1,  # the input's normalisation
+        "add": 1,
+    }
+    assert backward.names == {
+        "threshold_backward": convolved,
+        "convolution": convolved,
+        "max_pool2d_with_indices": pools,
+        "max_pool2d_with_indices_backward": pools,
+        "zeros_like": 1,  # the deepest layer's gradient, to which the loss adds
+        "mul": 1,
+    }
