@@ -103,18 +103,18 @@ def has_tf32(device: torch.device | str) -> bool:
 
 
 @contextmanager
-def convolutions(device: torch.device, *, tf32: bool = False) -> Iterator[None]:
-    """A block in which convolutions of float32 on a GPU are whole float32 or TF32, and cuDNN tries its algorithms.
+def convolutions(device: torch.device, *, tf32: bool = False, search: bool = False) -> Iterator[None]:
+    """A block in which convolutions of float32 on a GPU are whole float32 or TF32.
 
-    It tries them at the first convolution of each shape, and takes the fastest. What holds outside is as before
-    afterwards; on a CPU nothing changes.
+    With `search`, cuDNN tries all of its algorithms at the first convolution of each shape and stays with the fastest;
+    without, with the one that it expects to be. What holds outside is as before afterwards; on a CPU nothing changes.
     """
     if device.type != "cuda":
         yield
         return
     before = _CUDNN.benchmark, _CUDNN.conv.fp32_precision
     try:
-        _CUDNN.benchmark, _CUDNN.conv.fp32_precision = True, "tf32" if tf32 else "ieee"
+        _CUDNN.benchmark, _CUDNN.conv.fp32_precision = search, "tf32" if tf32 else "ieee"
         yield
     finally:
         _CUDNN.benchmark, _CUDNN.conv.fp32_precision = before
@@ -134,6 +134,8 @@ class FeatureNetwork:
     Attributes:
         precision: in which convolutions are asked for: "tf32", or the name of `dtype`.
         rounding: of features, relative.
+        search: cuDNN tries its algorithms on pictures of every new size, which takes about ten passes. Off, unless set:
+            it pays for sizes that come back often enough.
     """
 
     def __init__(
@@ -153,6 +155,7 @@ class FeatureNetwork:
         self.device = torch.device(device)
         self.tf32 = tf32
         self.precision = "tf32" if tf32 else str(dtype).removeprefix("torch.")
+        self.search = False
         self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
         #: A CPU takes longer to find positions of maxima again than to keep them; a GPU has less memory than speed.
         self._keeps_positions = self.device.type == "cpu"
@@ -218,7 +221,7 @@ class FeatureNetwork:
         # [h, w, 3] seen as [1, 3, h, w] is already in channels-last order: no copy.
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         kept = Activations({}, size=(height, width))
-        with convolutions(self.device, tf32=self.tf32):
+        with convolutions(self.device, tf32=self.tf32, search=self.search):
             self._forward_steps(x, kept, keep)
         for layer in self.layers:
             if layer not in kept.features:
@@ -264,7 +267,7 @@ class FeatureNetwork:
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
         """
-        with convolutions(self.device, tf32=self.tf32):
+        with convolutions(self.device, tf32=self.tf32, search=self.search):
             gradient = self._backward_steps(kept, feature_gradient)
         if gradient is None:
             return torch.zeros((*kept.size, 3), dtype=self._input_dtype, device=self.device)

@@ -26,6 +26,8 @@ UNCOVERED_SHARE = 0.01
 #: Building a view's kept weights costs about three renders with gradient, and each use of them saves two thirds of one:
 #: with fewer visits they do not pay.
 LEAST_VISITS = 5
+#: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few per cent.
+LEAST_PASSES = 200
 #: What measuring between steps and the report take beside the iterations: libraries, LPIPS, another set of raster lists
 #: (measured on jobs of 10 to 100 small views).
 MEASURING_BYTES = 400 << 20
@@ -96,10 +98,17 @@ class _Deciding:
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
             precision=precision_of(settings.precision, probe.network.precision_ratio),
+            search=probe.machine.device == "cuda" and self._passes_of_a_size(steps_coarse, weighted) >= LEAST_PASSES,
             kept_weights=form,
             coarse_weights=self._keeps_coarse(form, steps_coarse / views),
             measured=self.measured,
         )
+
+    def _passes_of_a_size(self, steps_coarse: int, weighted: bool) -> int:
+        """How often pictures of one size go through the network; weighted views are cut to what each of them covers."""
+        views = self.probe.distinct
+        sizes = len(views) if weighted else len({self.probe.sizes[index] for index in views})
+        return (steps_coarse + self.settings.steps_sos) * self.settings.views_per_step // sizes
 
     def _kept_form(self, visits: float) -> KeptWeights:
         """How blend weights are kept: exactly where they fit, in half precision where only that fits, where it pays."""
@@ -128,6 +137,7 @@ class _Deciding:
             *decisions.of_views(probe, plan, settings, self.work, shared),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
+            *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),
             decisions.of_blend_weights(probe, plan, settings, self.budget),
             *decisions.of_schedule(plan, settings, [self.tiling.scale_count(size) for size in self.sizes]),
         ]

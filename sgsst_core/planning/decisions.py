@@ -140,6 +140,16 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     return [Decision("rasterizer", how, "; ".join(failed) or "asked for")]
 
 
+def of_search(plan: Plan, passes: int) -> list[Decision]:
+    """On a GPU, how cuDNN chooses its algorithms; passes: of pictures of one size through the network."""
+    if plan.device != "cuda":
+        return []
+    reason = f"pictures of one size go through the network about {passes:,} times"
+    if plan.search:
+        return [Decision("convolutions", "cuDNN tries its algorithms", reason, error="runs may round differently")]
+    return [Decision("convolutions", "cuDNN's algorithms are not tried first", reason)]
+
+
 def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:
     """Whether blend weights are kept, in `budget` bytes."""
     raster = probe.raster

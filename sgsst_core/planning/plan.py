@@ -70,6 +70,7 @@ class Plan:
         device: on which the feature network computes.
         rasterizer: that renders; "cached" keeps blend weights in the form `kept_weights`.
         precision: of the feature network.
+        search: cuDNN tries its algorithms before it chooses (`FeatureNetwork.search`).
         kept_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         measured: the prediction counts what measuring between steps and the report take.
@@ -88,6 +89,7 @@ class Plan:
     device: Device = "cpu"
     rasterizer: str = "cpu"
     precision: Precision = "float32"
+    search: bool = False
     kept_weights: KeptWeights = "none"
     coarse_weights: bool = False
     measured: bool = False

@@ -101,7 +101,8 @@ def gradient_error(
         return None
     colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
     image = rasterizer.render(colours.to(rasterizer.device), camera).to(network.device)
-    image = downscale(image, max(0, math.ceil(math.log2(max(image.shape[:2]) / side))))
+    longer, shorter = max(image.shape[:2]), min(image.shape[:2])
+    image = downscale(image, min(max(0, math.ceil(math.log2(longer / side))), shorter.bit_length() - 1))
     exact = FeatureNetwork(weights, network.layers, torch.float32, network.device)
     gradients = []
     for each in (network, exact):

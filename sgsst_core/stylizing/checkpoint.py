@@ -33,7 +33,7 @@ from sgsst_core.stylizing.state import StepRecord, StylizerState
 
 #: Raised whenever the meaning of a stored value changes.
 FORMAT_VERSION = "5"
-#: Its predictions count the memory of a GPU as the process's, and nothing else is said of it.
+#: Its predictions count the memory of a GPU as the process's, nothing else is said of it, and cuDNN tries nothing.
 _ONE_MEMORY = "4"
 #: Its plans do not say which network and rasterizer run; see `_completed`.
 _PLANS_WITHOUT_DEVICE = "3"

@@ -100,6 +100,7 @@ class Stylizer:
         self.style = style
         forget_device_peak(plan.device)
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
+        self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
         #: The partition follows from it, and so does rounding: it is the same on all ranks.

@@ -94,16 +94,22 @@ def _flags() -> Iterator[None]:
     cudnn.benchmark, cudnn.allow_tf32, matmul.allow_tf32 = before
 
 
+def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextManager[None]:
+    return convolutions(CUDA, **flags)
+
+
+@pytest.mark.parametrize("search", [False, True])
 @pytest.mark.parametrize("tf32", [False, True])
-def test_tf32_holds_in_the_network_alone(
-    tiny_weights: BackboneWeights, tf32: bool, monkeypatch: pytest.MonkeyPatch
+def test_flags_hold_in_the_network_alone(
+    tiny_weights: BackboneWeights, tf32: bool, search: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The network computes on the CPU here, and takes itself to be on a GPU for the flags."""
     use_whole_float32()
     network = Watched(tiny_weights, tf32=tf32)
-    monkeypatch.setattr(vgg, "convolutions", lambda device, *, tf32: convolutions(CUDA, tf32=tf32))
+    network.search = search
+    monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
     pixel_gradient(network)
-    assert network.flags == {("tf32" if tf32 else "ieee", True)}
+    assert network.flags == {("tf32" if tf32 else "ieee", search)}
     assert not CUDNN.allow_tf32
     assert not CUDNN.benchmark
     assert not torch.backends.cuda.matmul.allow_tf32
@@ -113,7 +119,7 @@ def test_tf32_holds_in_the_network_alone(
 def test_statistics_are_summed_in_whole_float32(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loss is asked for in the middle of the backward pass."""
     use_whole_float32()
-    monkeypatch.setattr(vgg, "convolutions", lambda device, *, tf32: convolutions(CUDA, tf32=tf32))
+    monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
     network = FeatureNetwork(tiny_weights, tf32=True)
     seen = []
     network.backward(network.forward(picture()), lambda *_: seen.append(torch.backends.cuda.matmul.fp32_precision))
@@ -123,7 +129,8 @@ def test_statistics_are_summed_in_whole_float32(tiny_weights: BackboneWeights, m
 @pytest.mark.parametrize("before", ["ieee", "tf32", "none"])
 def test_flags_come_back_after_an_error(before: str) -> None:
     CUDNN.conv.fp32_precision = before
-    with contextlib.suppress(KeyError), convolutions(CUDA, tf32=True):
+    with contextlib.suppress(KeyError), convolutions(CUDA, tf32=True, search=True):
+        assert CUDNN.benchmark
         assert CUDNN.conv.fp32_precision == "tf32"
         raise KeyError
     assert CUDNN.conv.fp32_precision == before
@@ -132,7 +139,7 @@ def test_flags_come_back_after_an_error(before: str) -> None:
 
 def test_nothing_is_set_on_a_cpu() -> None:
     before = CUDNN.benchmark, CUDNN.conv.fp32_precision
-    with convolutions(torch.device("cpu"), tf32=True):
+    with convolutions(torch.device("cpu"), tf32=True, search=True):
         assert (CUDNN.benchmark, CUDNN.conv.fp32_precision) == before
 
 

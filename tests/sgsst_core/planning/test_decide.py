@@ -15,7 +15,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.planning.choices import rasterizer_anew
 from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Rate
-from sgsst_core.planning.decide import MEASURING_BYTES, decide
+from sgsst_core.planning.decide import LEAST_PASSES, MEASURING_BYTES, decide
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
 from sgsst_core.planning.pruning import ImageError
@@ -195,6 +195,26 @@ def test_another_precision_where_it_is_asked_for_and_faster(
     plan = plan_of(probe(precision_ratio=ratio), precision=asked)
     assert plan.precision == precision
     assert (said(plan, "precision") if text else line(plan, "precision")) == text
+
+
+@pytest.mark.parametrize(
+    ("device", "weights", "steps", "search"),
+    [
+        ("cuda", "off", LEAST_PASSES, True),
+        ("cuda", "off", LEAST_PASSES - 1, False),
+        ("cuda", "on", LEAST_PASSES, False),  # every view is cut to a size of its own
+        ("cuda", "on", VIEWS * LEAST_PASSES, True),
+        ("cpu", "off", LEAST_PASSES, False),
+    ],
+)
+def test_algorithms_are_tried_where_sizes_come_back(device: str, weights: str, steps: int, search: bool) -> None:
+    found = probe(device=device, raster=WITHOUT_KEPT)
+    plan = plan_of(found, steps_coarse=0, steps_sos=steps, position_weights=weights)
+    assert plan.search is search
+    decision = line(plan, "convolutions")
+    assert (decision is not None) is (device == "cuda")
+    if decision:
+        assert ("not tried" in decision.decision) is not search
 
 
 def test_the_measured_error_of_a_precision_is_said() -> None:
@@ -412,6 +432,7 @@ def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
         "partition",
         "second forward",
         "rasterizer",
+        "convolutions",
         "blend weights",
         "scales",
         "phase 1",

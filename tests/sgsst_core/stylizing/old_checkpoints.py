@@ -18,7 +18,7 @@ def of_version_4(path: Path) -> None:
     history, plan = json.loads(metadata["history"]), json.loads(metadata["plan"])
     for record in history:
         del record["device_memory"]
-    del plan["prediction"]["device_bytes"]
+    del plan["prediction"]["device_bytes"], plan["search"]
     metadata |= {"version": "4", "history": json.dumps(history), "plan": json.dumps(plan)}
     save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
 
