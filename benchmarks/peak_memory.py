@@ -1,19 +1,20 @@
 """Peak memory of one exact SOS gradient of a 5187x3361 view: the largest of the paper.
 
-python -m benchmarks.peak_memory [--memory 5] [--width 5187] [--height 3361]
+python -m benchmarks.peak_memory [--memory 5] [--width 5187] [--height 3361] [--device cuda]
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
-import time
 
 from benchmarks.machine import write_result
 from benchmarks.pictures import picture
+from sgsst_core.budget import device_peak, forget_device_peak
 from sgsst_core.features.network_weights import load_network_weights
-from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.vgg import FeatureNetwork, use_whole_float32
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.timing import Timer
 
 
 def main() -> None:
@@ -22,22 +23,27 @@ def main() -> None:
     parser.add_argument("--memory", type=float, default=5.0, help="GB for activations")
     parser.add_argument("--width", type=int, default=5187)
     parser.add_argument("--height", type=int, default=3361)
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     arguments = parser.parse_args()
+    use_whole_float32()
     size = (arguments.height, arguments.width)
-    network = FeatureNetwork(load_network_weights("auto"))
+    network = FeatureNetwork(load_network_weights("auto"), device=arguments.device)
     loss = SosLoss(network, memory=int(arguments.memory * 1e9))
     targets = loss.style_targets(picture("immunohistochemistry", *size), size)
     view = loss.view_target(picture("coffee", *size))
-    started = time.perf_counter()
-    result = loss.evaluate(picture("astronaut", *size), targets, view)
-    seconds = time.perf_counter() - started
+    forget_device_peak(network.device)
+    timer = Timer(network.device)
+    with timer("gradient"):
+        result = loss.evaluate(picture("astronaut", *size), targets, view)
+    seconds = timer.read()["gradient"]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
+    on_device = device_peak(network.device)
+    gpu = f" and {on_device / 1e9:.2f} GB of the GPU's memory" if on_device is not None else ""
     tiles = len(loss.tiles(*size))
-    print(
-        f"{size[1]}x{size[0]}: {tiles} tiles at full size, {seconds:.0f} s, peak {peak:.2f} GB, loss {result.loss:.4g}"
-    )
+    print(f"{size[1]}x{size[0]}: {tiles} tiles at full size, {seconds:.3g} s, loss {result.loss:.4g}")
+    print(f"peak {peak:.2f} GB{gpu}")
     write_result(
-        "peak_memory",
+        "peak_memory" if arguments.device == "cpu" else "peak_memory_gpu",
         {
             "width": size[1],
             "height": size[0],
@@ -46,6 +52,7 @@ def main() -> None:
             "tiles": tiles,
             "seconds": seconds,
             "peak_gb": peak,
+            "device_peak_gb": on_device / 1e9 if on_device is not None else None,
         },
     )
 

@@ -30,6 +30,17 @@ def default_memory_limit(device: torch.device | None = None) -> int:
     return int(min(memory.total * TOTAL_SHARE, memory.available * FREE_SHARE))
 
 
+def forget_device_peak(device: torch.device | str) -> None:
+    """Let `device_peak` count from here."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def device_peak(device: torch.device | str) -> int | None:
+    """Most bytes of a GPU's memory that tensors have held, since `forget_device_peak`; None for a CPU."""
+    return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
+
+
 class Shelf(Generic[K, V]):
     """Keeps values by key as long as they fit a number of bytes; what does not fit is made anew at each use.
 

@@ -12,7 +12,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.options import Declared, Option
 
 PresetName = Literal["preview", "standard", "paper"]
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 #: What can be left out without changing the result, for `Settings.keep`.
@@ -72,7 +72,10 @@ class Settings(BaseModel):
         description="Weigh statistics by coverage, so that an empty surround does not count; auto does so where views "
         "have uncovered pixels.",
     )
-    precision: Precision = Field("float32", description="Number format of the feature network.")
+    precision: Precision = Field(
+        "float32",
+        description="Number format of the feature network; tf32: of its convolutions alone, on NVIDIA GPUs.",
+    )
     max_resolution: Resolution = None
     background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
         (0.0, 0.0, 0.0), description="Colour behind the Gaussians."

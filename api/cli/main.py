@@ -263,7 +263,10 @@ def plan(
     if made.prediction:
         seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9
         coarse = f" ({made.prediction.seconds_coarse:.2g} s in phase 1)" if made.steps_coarse else ""
-        out_console.print(f"Expected: {seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB")
+        on_device = made.prediction.device_bytes
+        gpu = f", of the GPU's {on_device / 1e9:.1f} GB" if on_device is not None else ""
+        expected = f"{seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
+        out_console.print(f"Expected: {expected}")
     out_console.print(f"{'plan:':<22}{out}")
 
 

@@ -247,6 +247,7 @@ class PlanView(BaseModel):
         workers=1,
         estimated_seconds=12.4,
         memory_bytes=946495488,
+        device_memory_bytes=None,
         plan={
             "version": 1,
             "decisions": [
@@ -272,6 +273,7 @@ class PlanView(BaseModel):
     workers: int | None = Field(description="As asked for; null where the service decides when the job starts.")
     estimated_seconds: float | None = Field(description="Of all steps; null where it cannot be told.")
     memory_bytes: int | None = Field(description="At the peak, as far as that can be told.")
+    device_memory_bytes: int | None = Field(None, description="The same of a GPU's memory; null where no GPU computes.")
     plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
 
 

@@ -106,12 +106,18 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
     made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True)
-    seconds = memory = None
+    seconds = memory = on_device = None
     if made.prediction:
-        memory = made.prediction.peak_bytes
+        memory, on_device = made.prediction.peak_bytes, made.prediction.device_bytes
         coarse = made.prediction.seconds_coarse or made.prediction.seconds
         seconds = made.prediction.seconds * request.settings.steps_sos + coarse * made.steps_coarse
-    return {**found, "plan": plan_json(made), "estimated_seconds": seconds, "memory_bytes": memory}
+    return {
+        **found,
+        "plan": plan_json(made),
+        "estimated_seconds": seconds,
+        "memory_bytes": memory,
+        "device_memory_bytes": on_device,
+    }
 
 
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {

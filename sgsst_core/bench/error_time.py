@@ -94,6 +94,7 @@ VARIANTS = {
         Variant("warm-no-phase-1", "warm start instead of phase 1", _sos, {"warm_start": True}),
         Variant("no-revive", "standard; colours that fall below 0 stay there", settings={"revive": False}),
         Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
+        Variant("tf32", "standard with TF32 convolutions", settings={"precision": "tf32"}),
         Variant("half-weights", "standard with blend weights in half precision", settings={"kept_weights": "half"}),
         Variant("no-kept-weights", "standard, blend weights computed anew", settings={"kept_weights": "none"}),
         Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
@@ -229,7 +230,7 @@ def _prepare(stylizer: _TimedStylizer) -> float:
 
 def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
     wanted = settings.precision
-    if wanted != str(stylizer.network.dtype).removeprefix("torch."):
+    if wanted != stylizer.network.precision:
         return next(d.reason for d in stylizer.plan.decisions if d.item == "precision")
     return None
 

@@ -8,8 +8,10 @@ from an error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +29,15 @@ CONTENT_LAYER = "relu4_2"
 HALO = {"vgg16": 64, "vgg19": 80}
 #: Partition tiles start at multiples of the deepest layer's stride, so that every pooling window lies in one tile.
 ALIGNMENT = 16
+#: Its newer names are not declared.
+_CUDNN: Any = torch.backends.cudnn
+#: Relative rounding of what is multiplied in TF32, as `torch.finfo` has those of other formats.
+_TF32_EPS = 2.0**-10
+#: Values of a tensor up to which cuDNN's fused convolution, which knows no way around, can count in 32 bits.
+_FUSED_VALUES = 2**31
+#: Side of the picture on which fused convolutions are tried, and by how much of their largest value they may differ
+#: from the parts, which in TF32 or bfloat16 round in other places.
+_TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
 
 
 def layer_stride(layer: str) -> int:
@@ -45,6 +56,7 @@ class _Convolution:
     weight: Tensor  # [out, in, 3, 3]
     bias: Tensor  # [out]
     backward_weight: Tensor  # [in, out, 3, 3], transposed and flipped
+    fused: bool = False  # convolution, bias and ReLU are one launch of cuDNN's
 
 
 class _Pool:
@@ -60,7 +72,8 @@ class Activations:
 
     Attributes:
         features: layer name to [h, w, c] in the network's dtype (a view in NHWC order).
-        outputs: for each step, the ReLU's output, or the positions of a pool's maxima, [1, c, h, w].
+        outputs: for each step, the ReLU's output, or the positions of a pool's maxima, [1, c, h, w]; nothing, [0],
+            for a pool whose positions are found again.
         size: (height, width) of the pixels that went in.
     """
 
@@ -75,8 +88,36 @@ def use_whole_float32() -> None:
     PyTorch lets cuDNN round their factors to the 10 bits of TF32 unless told otherwise: gradients would no longer be
     exact, and those of a partition no longer those of the whole view.
     """
+    # The older names are what other libraries read. They do not say no where the newer ones allow TF32 in general.
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
+    _CUDNN.conv.fp32_precision = "ieee"
+    torch.backends.cuda.matmul.fp32_precision = "ieee"
+
+
+def has_tf32(device: torch.device | str) -> bool:
+    """Whether a device multiplies in TF32: NVIDIA GPUs of compute capability 8.0 and above do."""
+    if torch.device(device).type != "cuda" or torch.version.hip is not None:
+        return False
+    return torch.cuda.get_device_capability(device) >= (8, 0)
+
+
+@contextmanager
+def convolutions(device: torch.device, *, tf32: bool = False, search: bool = False) -> Iterator[None]:
+    """A block in which convolutions of float32 on a GPU are whole float32 or TF32.
+
+    With `search`, cuDNN tries all of its algorithms at the first convolution of each shape and stays with the fastest;
+    without, with the one that it expects to be. What holds outside is as before afterwards; on a CPU nothing changes.
+    """
+    if device.type != "cuda":
+        yield
+        return
+    before = _CUDNN.benchmark, _CUDNN.conv.fp32_precision
+    try:
+        _CUDNN.benchmark, _CUDNN.conv.fp32_precision = search, "tf32" if tf32 else "ieee"
+        yield
+    finally:
+        _CUDNN.benchmark, _CUDNN.conv.fp32_precision = before
 
 
 class FeatureNetwork:
@@ -87,6 +128,14 @@ class FeatureNetwork:
         layers: the layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`); what lies behind the
             deepest of them is left out.
         dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
+        tf32: on NVIDIA GPUs, convolutions of a float32 network round their factors to the 10 bits of TF32; elsewhere it
+            changes nothing.
+
+    Attributes:
+        precision: in which convolutions are asked for: "tf32", or the name of `dtype`.
+        rounding: of features, relative.
+        search: cuDNN tries its algorithms on pictures of every new size, which takes about ten passes. Off, unless set:
+            it pays for sizes that come back often enough.
     """
 
     def __init__(
@@ -95,17 +144,28 @@ class FeatureNetwork:
         layers: Sequence[str] = (*STYLE_LAYERS, CONTENT_LAYER),
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
+        *,
+        tf32: bool = False,
     ) -> None:
+        if tf32 and dtype != torch.float32:
+            raise ValueError(f"TF32 is a way to multiply float32, not {dtype}")
         self.name = weights.name
         self.layers = tuple(layers)
         self.dtype = dtype
         self.device = torch.device(device)
+        self.tf32 = tf32
+        self.precision = "tf32" if tf32 else str(dtype).removeprefix("torch.")
+        self.search = False
+        self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
+        #: A CPU takes longer to find positions of maxima again than to keep them; a GPU has less memory than speed.
+        self._keeps_positions = self.device.type == "cpu"
         self.halo = HALO[weights.name]
         # The normalisation stays in at least float32: in bfloat16, 255 grey levels would lose their last bits twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
         self._steps = self._build(weights)
+        self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
 
     def _build(self, weights: BackboneWeights) -> list[_Step]:
@@ -131,6 +191,16 @@ class FeatureNetwork:
                     return steps
         raise ValueError(f"{weights.name} has no layers {sorted(left)}")
 
+    @torch.no_grad()
+    def _fuse(self) -> None:
+        """Let cuDNN compute bias and ReLU with the convolution wherever it can, which a try shows."""
+        if self.device.type != "cuda" or torch.version.hip is not None or not torch.backends.cudnn.is_available():
+            return
+        with convolutions(self.device, tf32=self.tf32):
+            for step in self._steps:
+                if isinstance(step, _Convolution):
+                    step.fused = _can_fuse(step)
+
     def channels(self, layer: str) -> int:
         """Number of channels of a layer."""
         return self._channels[layer]
@@ -151,24 +221,39 @@ class FeatureNetwork:
         # [h, w, 3] seen as [1, 3, h, w] is already in channels-last order: no copy.
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         kept = Activations({}, size=(height, width))
+        with convolutions(self.device, tf32=self.tf32, search=self.search):
+            self._forward_steps(x, kept, keep)
+        for layer in self.layers:
+            if layer not in kept.features:
+                stride = layer_stride(layer)
+                kept.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
+        return kept
+
+    def _forward_steps(self, x: Tensor, kept: Activations, keep: bool) -> None:
+        """All steps from the pixels [1, 3, h, w] on, as far as a layer has cells."""
         for step in self._steps:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
                     break
                 x, positions = F.max_pool2d(x, 2, return_indices=True)
                 if keep:
-                    kept.outputs.append(positions)
+                    kept.outputs.append(positions if self._keeps_positions else positions.new_empty(0))
                 continue
-            x = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
+            x = self._convolve(x, step)
             if keep:
                 kept.outputs.append(x)
             if step.layer in self.layers:
                 kept.features[step.layer] = x[0].permute(1, 2, 0)
-        for layer in self.layers:
-            if layer not in kept.features:
-                stride = layer_stride(layer)
-                kept.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
-        return kept
+
+    def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
+        """ReLU of convolution and bias, of x [1, in, h, w]."""
+        if step.fused and x.shape[2] * x.shape[3] * max(step.weight.shape[:2]) < _FUSED_VALUES:
+            return _fused_convolution(x, step)
+        return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
+
+    def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
+        """Gradient [1, in, h, w] with respect to what went into a convolution, of that of its sums [1, out, h, w]."""
+        return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()
     def backward(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor:
@@ -182,6 +267,14 @@ class FeatureNetwork:
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
         """
+        with convolutions(self.device, tf32=self.tf32, search=self.search):
+            gradient = self._backward_steps(kept, feature_gradient)
+        if gradient is None:
+            return torch.zeros((*kept.size, 3), dtype=self._input_dtype, device=self.device)
+        return gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
+
+    def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
+        """Gradient [1, 3, h, w] with respect to what went into the first step; None where no layer has one."""
         gradient: Tensor | None = None  # [1, c, h, w]
         steps = self._steps[: len(kept.outputs)]
         for step in reversed(steps):
@@ -195,16 +288,16 @@ class FeatureNetwork:
                 feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0))
             if gradient is not None:
                 gradient = torch.ops.aten.threshold_backward(gradient, output, 0)
-                gradient = F.conv2d(gradient, step.backward_weight, padding=1)
-        if gradient is None:
-            return torch.zeros((*kept.size, 3), dtype=self._input_dtype, device=self.device)
-        return gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
+                gradient = self._convolve_back(gradient, step)
+        return gradient
 
     @staticmethod
     def _pool_backward(gradient: Tensor | None, positions: Tensor, kept: Activations) -> Tensor | None:
         if gradient is None:
             return None
         source = kept.outputs[-1]  # the ReLU output that was pooled
+        if not positions.numel():
+            positions = F.max_pool2d(source, 2, return_indices=True)[1]
         spread: Tensor = torch.ops.aten.max_pool2d_with_indices_backward(
             gradient, source, [2, 2], [2, 2], [0, 0], [1, 1], False, positions
         )
@@ -213,7 +306,7 @@ class FeatureNetwork:
     def held_bytes_per_pixel(self) -> float:
         """Bytes that a forward pass keeps for each pixel until `backward` has used them.
 
-        Counted from the layers: a ReLU output of c channels at stride k holds c/k^2 values a pixel, a pool one
+        Counted from the layers: a ReLU output of c channels at stride k holds c/k^2 values a pixel, a pool on a CPU one
         int64 position for each of its outputs.
         """
         size = torch.finfo(self.dtype).bits // 8
@@ -221,7 +314,7 @@ class FeatureNetwork:
         for step in self._steps:
             if isinstance(step, _Pool):
                 stride *= 2
-                held += 8 * channels / stride**2
+                held += 8 * channels / stride**2 if self._keeps_positions else 0
             else:
                 channels = int(step.weight.shape[0])
                 held += size * channels / stride**2
@@ -230,3 +323,24 @@ class FeatureNetwork:
     def working_bytes_per_pixel(self) -> float:
         """Bytes a pixel that a forward or backward pass needs beside what is held: two tensors of relu1_1's size."""
         return 2 * self.channels("relu1_1") * torch.finfo(self.dtype).bits / 8
+
+
+def _fused_convolution(x: Tensor, step: _Convolution) -> Tensor:
+    """ReLU of convolution and bias in one launch, [1, out, h, w] of x [1, in, h, w], both channels last."""
+    stride = padding = dilation = (1, 1)
+    result: Tensor = torch.ops.aten.cudnn_convolution_relu(x, step.weight, step.bias, stride, padding, dilation, 1)
+    return result
+
+
+def _can_fuse(step: _Convolution) -> bool:
+    """Whether cuDNN has a fused convolution of these channels and this dtype, and its result is that of the parts."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn((1, int(step.weight.shape[1]), _TRIAL_SIDE, _TRIAL_SIDE), generator=generator)
+    x = x.to(step.weight).contiguous(memory_format=torch.channels_last)
+    expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
+    try:
+        found = _fused_convolution(x, step)
+    except RuntimeError:  # cuDNN finds no engine for it
+        return False
+    difference = float((found - expected).abs().max())
+    return found.stride() == expected.stride() and difference <= _TRIAL_TOLERANCE * float(expected.abs().max())

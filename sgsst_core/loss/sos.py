@@ -331,8 +331,7 @@ class SosLoss:
         """Style loss of one scale, added to its terms, and gradient maps, from the statistics of the whole scale."""
         for layer, part in statistics.items():
             if layer in style:
-                eps = torch.finfo(self.network.dtype).eps
-                layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=eps)
+                layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=self.network.rounding)
                 pass_.terms = pass_.terms + layer_terms
 
     def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:

@@ -43,15 +43,15 @@ def pruned_gaussians(looked: Survey, seen: Tensor) -> Tensor:
     return ~seen & (looked.total_blend_weights > 0)
 
 
-def precision_of(ratio: float | None) -> Precision:
-    """The network's precision, where a convolution in float32 takes `ratio` times as long as in bfloat16.
+def precision_of(asked: Precision, ratio: float | None) -> Precision:
+    """The network's precision, where a convolution in float32 takes `ratio` times as long as in the one asked for.
 
     Processors without bfloat16 instructions compute it hundreds of times slower than float32.
 
     Args:
-        ratio: None where bfloat16 was not asked for.
+        ratio: None where float32 was asked for, or what there is not here.
     """
-    return "bfloat16" if ratio is not None and ratio > 1 else "float32"
+    return asked if ratio is not None and ratio > 1 else "float32"
 
 
 #: Rasterizers of GPUs, the preferred one first.

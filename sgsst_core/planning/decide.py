@@ -15,7 +15,7 @@ from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
 from sgsst_core.planning.choices import GPU_RASTERIZERS, optimised_gaussians, precision_of, rendered_gaussians
-from sgsst_core.planning.cost import Work, content_bytes, image_bytes, pieces_of
+from sgsst_core.planning.cost import OPTIMISER_BYTES, Work, content_bytes, image_bytes, pieces_of
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
@@ -26,6 +26,8 @@ UNCOVERED_SHARE = 0.01
 #: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
 #: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
 LEAST_VISITS = 5
+#: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few per cent.
+LEAST_PASSES = 200
 #: What measuring between steps and the report take beside the iterations: libraries, LPIPS, another set of raster lists
 #: (measured on jobs of 10 to 100 small views).
 MEASURING_BYTES = 400 << 20
@@ -96,11 +98,18 @@ class _Deciding:
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
             anew=next((name for name in GPU_RASTERIZERS if name == probe.rasterizer), "cpu"),
-            precision=precision_of(probe.network.precision_ratio),
+            precision=precision_of(settings.precision, probe.network.precision_ratio),
+            search=probe.machine.device == "cuda" and self._passes_of_a_size(steps_coarse, weighted) >= LEAST_PASSES,
             kept_weights=form,
             coarse_weights=self._keeps_coarse(form, steps_coarse / views),
             measured=self.measured,
         )
+
+    def _passes_of_a_size(self, steps_coarse: int, weighted: bool) -> int:
+        """How often pictures of one size go through the network; weighted views are cut to what each of them covers."""
+        views = self.probe.distinct
+        sizes = len(views) if weighted else len({self.probe.sizes[index] for index in views})
+        return (steps_coarse + self.settings.steps_sos) * self.settings.views_per_step // sizes
 
     def _kept_form(self, visits: float) -> KeptWeights:
         """How blend weights are kept: exactly where they fit, in half precision where only that fits, where it pays."""
@@ -137,11 +146,12 @@ class _Deciding:
             *decisions.of_views(probe, plan, settings, self.work, shared),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
+            *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),
             decisions.of_blend_weights(probe, plan, settings, self.budget),
             *decisions.of_schedule(plan, settings, [self.tiling.scale_count(size) for size in self.sizes]),
         ]
         found += [ranks] if ranks else []
-        return (*found, *decisions.of_precision(probe.network.precision_ratio))
+        return (*found, *decisions.of_precision(probe, settings))
 
     # --- what is expected ------------------------------------------------------------------------------------------
 
@@ -154,22 +164,25 @@ class _Deciding:
         raster = self.probe.raster
         return raster.kept_seconds if self.base.kept_weights != "none" and raster.kept_seconds else raster.seconds
 
-    def _peak_bytes(self) -> int:
-        """Of a rank, but for activations."""
+    def _peak_bytes(self, activations: int) -> tuple[int, int | None]:
+        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes."""
         probe, raster = self.probe, self.probe.raster
         memory, ranks = probe.machine.memory, probe.machine.ranks
         kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[self.base.kept_weights] or 0
         content = 0 if "content" in self.settings.keep else self._content_bytes(self.base.covered)
-        peak = probe.process_bytes + image_bytes(probe.sizes)
-        peak += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
-        return peak + (MEASURING_BYTES if self.measured else 0)
+        process = probe.process_bytes + (MEASURING_BYTES if self.measured else 0)
+        computing = image_bytes(probe.sizes) + activations
+        computing += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
+        if probe.machine.device == "cpu":
+            return process + computing, None
+        return process, probe.device_bytes + computing + int(self.base.seen.sum()) * OPTIMISER_BYTES
 
     def _one_rank(self) -> tuple[Prediction, int, None]:
         network, raster = self.probe.network, self._raster_seconds
         coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
-        peak = self._peak_bytes() + int(self.work.peak * network.held_bytes)
+        peak, on_device = self._peak_bytes(int(self.work.peak * network.held_bytes))
         seconds = (self.work.seconds(network.rate) + raster, coarse.seconds(network.rate) + raster)
-        return Prediction(*seconds, peak), 1, None
+        return Prediction(*seconds, peak, device_bytes=on_device), 1, None
 
     def _several_ranks(self) -> tuple[Prediction, int, Decision]:
         """What is expected of the ranks that take part, how many that are, and why."""
@@ -195,12 +208,14 @@ class _Deciding:
         largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
         sharing = self.probe.machine.sharing
         memory = self.activations * sharing / min(choice.ranks, sharing)  # of fewer ranks, each has more
+        peak, on_device = self._peak_bytes(int(min(largest * (network.held_bytes + network.working_bytes), memory)))
         return Prediction(
             mean(work.seconds(each, link, groups) for work in sos),
             mean(work.seconds(each, link, groups) for work in coarse),
-            self._peak_bytes() + int(min(largest * (network.held_bytes + network.working_bytes), memory)),
+            peak,
             mean(work.communication(each, link) for work in sos),
             mean(work.seconds(1, link) for work in sos) * groups,
+            on_device,
         )
 
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:

@@ -141,6 +141,16 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     return [Decision("rasterizer", how, "; ".join(failed) or "asked for")]
 
 
+def of_search(plan: Plan, passes: int) -> list[Decision]:
+    """On a GPU, how cuDNN chooses its algorithms; passes: of pictures of one size through the network."""
+    if plan.device != "cuda":
+        return []
+    reason = f"pictures of one size go through the network about {passes:,} times"
+    if plan.search:
+        return [Decision("convolutions", "cuDNN tries its algorithms", reason, error="runs may round differently")]
+    return [Decision("convolutions", "cuDNN's algorithms are not tried first", reason)]
+
+
 def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:
     """Whether blend weights are kept, in `budget` bytes."""
     raster = probe.raster
@@ -228,12 +238,22 @@ def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
     return Decision("ranks", f"{choice.ranks} of {available} take part, {speed}", reason)
 
 
-def of_precision(ratio: float | None) -> list[Decision]:
-    """The network's precision, where bfloat16 was asked for; ratio: how many times faster it is than float32."""
-    if ratio is None:
+def of_precision(probe: Probe, settings: Settings) -> list[Decision]:
+    """The network's precision, where another one than float32 was asked for."""
+    asked, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
+    if asked == "float32":
         return []
-    if precision_of(ratio) == "bfloat16":
-        error = "about 20 % of the gradient's norm; measured during the run"
-        return [Decision("precision", "features in bfloat16", f"asked for, {ratio:.1f} times faster here", error=error)]
-    reason = f"bfloat16 was asked for, but this processor computes it {1 / ratio:.0f} times slower"
-    return [Decision("precision", "features in float32", reason)]
+    if ratio is None:
+        reason = f"{asked} was asked for, which NVIDIA GPUs of compute capability 8.0 and above have: as float32 here"
+        return [Decision("precision", "features in float32", reason)]
+    if precision_of(asked, ratio) == "float32":
+        reason = f"{asked} was asked for, but this processor computes it {1 / ratio:.0f} times slower"
+        return [Decision("precision", "features in float32", reason)]
+    known = "that of the colours is measured during the run"
+    if error is not None:
+        known = (
+            f"the first view's pixel gradient is off by {error.relative_error:.2g} of its norm (cosine "
+            f"{error.cosine:.5f}); {known}"
+        )
+    what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[asked]
+    return [Decision("precision", what, f"asked for, {ratio:.1f} times faster here", error=known)]

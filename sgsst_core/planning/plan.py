@@ -45,6 +45,7 @@ class Prediction:
         peak_bytes: of physical memory of a rank, at any time.
         communication: seconds of an SOS iteration in which a rank waits for what others send.
         seconds_one_rank: of an SOS iteration on one rank; None where there is only one.
+        device_bytes: of a GPU's memory, at any time; None where a CPU computes.
     """
 
     seconds: float
@@ -52,6 +53,7 @@ class Prediction:
     peak_bytes: int
     communication: float = 0.0
     seconds_one_rank: float | None = None
+    device_bytes: int | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class Plan:
         rasterizer: that renders; "cached" keeps blend weights in the form `kept_weights`.
         anew: rasterizer that computes blend weights, and every time those that are not kept.
         precision: of the feature network.
+        search: cuDNN tries its algorithms before it chooses (`FeatureNetwork.search`).
         kept_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         measured: the prediction counts what measuring between steps and the report take.
@@ -89,6 +92,7 @@ class Plan:
     rasterizer: str = "cpu"
     anew: RasterizerName = "cpu"
     precision: Precision = "float32"
+    search: bool = False
     kept_weights: KeptWeights = "none"
     coarse_weights: bool = False
     measured: bool = False

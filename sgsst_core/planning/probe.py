@@ -6,6 +6,7 @@ to use.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import torch
 from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork, use_whole_float32
+from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
@@ -28,7 +30,9 @@ from sgsst_core.planning.choices import (
     rendered_gaussians,
 )
 from sgsst_core.planning.cost import RasterCost, Rate
+from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.planning.plan import Device
+from sgsst_core.planning.precision import DTYPES, gradient_error, precision_ratio
 from sgsst_core.planning.pruning import ImageError, distinct_views, pruned_image_error
 from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import Survey
@@ -41,13 +45,14 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, Settings
+from sgsst_core.timing import Timer
 
 #: Largest side of the picture that the network is timed on: large enough that its rate is that of a partition tile.
-PROBE_SIDE = 384
+#: A GPU has more to do before the seconds of its launches do not count.
+PROBE_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 1024}
 #: Views whose blend weights are counted and timed; the others are taken to be like them.
 SAMPLED_VIEWS = 3
 
-_DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 #: Of kept blend weights, the exact one first.
 _FORMS: tuple[WeightPrecision, ...] = ("float32", "half")
 
@@ -78,7 +83,9 @@ class NetworkFacts:
         content_bytes: of a cell of the content layer.
         rate: seconds a pixel.
         fixed: seconds that a partition tile of hardly any pixel takes.
-        precision_ratio: seconds of a convolution in float32, over those in bfloat16; None where that was not asked for.
+        precision_ratio: seconds of a convolution in float32, over those in the precision that was asked for; None where
+            that is float32, or what there is not here.
+        gradient_error: of a view's pixel gradient, against float32; None where that is what runs.
     """
 
     halo: int
@@ -88,6 +95,7 @@ class NetworkFacts:
     rate: Rate
     fixed: float = 0.0
     precision_ratio: float | None = None
+    gradient_error: Difference | None = None
 
 
 @dataclass(frozen=True)
@@ -127,6 +135,7 @@ class Probe:
         raster: what it takes, and what kept weights would.
         link: between ranks.
         process_bytes: of physical memory, with scene and network loaded.
+        device_bytes: of a GPU's memory, likewise; 0 where a CPU computes.
     """
 
     scene: SceneFacts
@@ -140,6 +149,7 @@ class Probe:
     link: Link
     process_bytes: int
     pruned_error: ImageError | None = None
+    device_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -149,6 +159,7 @@ class Workshop:
     Attributes:
         scene: the whole scene.
         cameras: at the size at which they are stylized.
+        weights: of the network.
         network: in the precision in which it will run.
         precision_ratio: see `NetworkFacts`.
         rasterizer: of the whole scene, computes blend weights anew.
@@ -158,6 +169,7 @@ class Workshop:
     cameras: tuple[Camera, ...]
     settings: Settings
     machine: Machine
+    weights: BackboneWeights
     network: FeatureNetwork
     precision_ratio: float | None
     rasterizer: Rasterizer
@@ -179,10 +191,8 @@ def equip(
     """
     device = common_device(collectives)
     problems = gpu_problems(collectives) if device == "cuda" else {}
-    ratio = None
-    if settings.precision != "float32":
-        ratio = collectives.broadcast(lambda: convolution_ratio(device))
-    network = make_network(weights, settings, precision_of(ratio), device)
+    ratio = precision_ratio(settings.precision, device, collectives)
+    network = make_network(weights, settings, precision_of(settings.precision, ratio), device)
     limit = settings.memory_limit or default_memory_limit(network.device)
     machine = Machine(
         device,
@@ -194,7 +204,7 @@ def equip(
     )
     name = rasterizer or rasterizer_anew(device, problems)
     whole = make_rasterizer(name, scene, background=settings.background, near=settings.near)
-    return Workshop(scene, tuple(cameras), settings, machine, network, ratio, whole)
+    return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole)
 
 
 def common_device(collectives: Collectives) -> Device:
@@ -230,7 +240,7 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
     """The feature network, with layers up to the deepest one used."""
     layers = (*STYLE_LAYERS, CONTENT_LAYER) if settings.content_weight else STYLE_LAYERS
     use_whole_float32()
-    return FeatureNetwork(weights, layers, _DTYPES[precision], device)
+    return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
 def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
@@ -242,7 +252,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     scene, cameras, settings = workshop.scene, workshop.cameras, workshop.settings
     seen = rendered_gaussians(optimised_gaussians(looked, settings), settings)
     distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
-    network = _network_facts(workshop)
+    network = _network_facts(workshop, cameras[distinct[0]])
     budget = int(workshop.machine.memory * MEMORY_SHARES["rasterizer"])
     raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)
     pruned = pruned_gaussians(looked, seen)
@@ -260,13 +270,15 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
         link,
         psutil.Process().memory_info().rss,
         error,
+        torch.cuda.memory_allocated(workshop.network.device) if workshop.machine.device == "cuda" else 0,
     )
 
 
 # --- the feature network -------------------------------------------------------------------------------------------
 
 
-def _network_facts(workshop: Workshop) -> NetworkFacts:
+def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
+    """Of the network on made-up pictures, and where it is not in float32, its error on the first view."""
     network, settings = workshop.network, workshop.settings
     loss = SosLoss(
         network,
@@ -275,7 +287,7 @@ def _network_facts(workshop: Workshop) -> NetworkFacts:
         coarsest=settings.coarsest_side,
         keep_activations="activations" not in settings.keep,
     )
-    side = min(PROBE_SIDE, max(max(camera.width, camera.height) for camera in workshop.cameras))
+    side = min(_side(workshop, loss), max(max(camera.width, camera.height) for camera in workshop.cameras))
     fixed = 0.0
     rate = measure_rate(loss, side)
     if workshop.machine.ranks > 1:  # as good as no pixel: what it takes is the same for any number
@@ -288,40 +300,30 @@ def _network_facts(workshop: Workshop) -> NetworkFacts:
         rate,
         fixed,
         workshop.precision_ratio,
+        gradient_error(network, workshop.weights, workshop.scene, first, workshop.rasterizer, loss.memory, side),
     )
+
+
+def _side(workshop: Workshop, loss: SosLoss) -> int:
+    """Largest side of pictures for measuring; on a GPU, of those whose activations fit."""
+    most = PROBE_SIDE[workshop.machine.device]
+    if workshop.machine.device == "cpu":
+        return most
+    fits = math.isqrt(int(loss.memory / (loss.network.held_bytes_per_pixel() + loss.network.working_bytes_per_pixel())))
+    return max(min(most, fits), ALIGNMENT)
 
 
 def measure_rate(loss: SosLoss, side: int) -> Rate:
     """Time the feature network on a small picture of side x side pixels; the second of two runs counts."""
-    cells = torch.rand((1, 3, side // 16 + 1, side // 16 + 1), generator=torch.Generator().manual_seed(0))
-    picture = torch.nn.functional.interpolate(cells, size=(side, side), mode="bilinear")[0]
-    image = picture.permute(1, 2, 0).contiguous().to(loss.network.device)
+    image = soft_picture(side).to(loss.network.device)
     style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
     seconds = []
     for gradient in (True, True, False):
-        started = time.perf_counter()
-        loss.evaluate(image, style, view, [0], gradient=gradient)
-        _wait_for(loss.network.device)
-        seconds.append(time.perf_counter() - started)
+        timer = Timer(loss.network.device)
+        with timer("evaluation"):
+            loss.evaluate(image, style, view, [0], gradient=gradient)
+        seconds.append(timer.read()["evaluation"])
     return Rate(forward=seconds[2] / side**2, both=seconds[1] / side**2)
-
-
-def convolution_ratio(device: Device) -> float:
-    """Seconds of a convolution in float32, over those in bfloat16."""
-    return _convolution_seconds(torch.float32, device) / _convolution_seconds(torch.bfloat16, device)
-
-
-def _convolution_seconds(dtype: torch.dtype, device: Device) -> float:
-    """Of a 3x3 convolution with 128 channels on 24 x 24 cells, the second of two runs."""
-    image = torch.ones((1, 128, 24, 24), dtype=dtype, device=device)
-    kernel = torch.ones((128, 128, 3, 3), dtype=dtype, device=device)
-    seconds = 0.0
-    for _ in range(2):
-        started = time.perf_counter()
-        torch.nn.functional.conv2d(image, kernel, padding=1)
-        _wait_for(image.device)
-        seconds = time.perf_counter() - started
-    return seconds
 
 
 # --- the rasterizer ------------------------------------------------------------------------------------------------

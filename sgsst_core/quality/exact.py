@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import LayerTarget
 from sgsst_core.rasterizer import make_rasterizer
@@ -26,8 +27,8 @@ from sgsst_core.stylizing.views import Views
 def approximations(stylizer: Stylizer) -> list[str]:
     """What makes a job's gradient differ from the exact one by more than rounding; empty where nothing does."""
     found = []
-    if stylizer.network.dtype != torch.float32:
-        found.append("bfloat16 features")
+    if stylizer.network.precision != "float32":
+        found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
     if bool((stylizer.plan.survey.total_blend_weights[~stylizer.plan.seen] > 0).any()):
         found.append("pruned Gaussians")
     if stylizer.plan.kept_weights == "half" and stylizer.views.rasterizer.name == "cached":
@@ -126,14 +127,12 @@ class ExactTwin:
         approximate, seconds = stylizer.gradient(index, scales)
         exact, seconds_exact = self.gradient(index, stylizer.stylized(), scales)
         seen = stylizer.plan.seen
-        error, wanted = (approximate - exact[seen]).double().norm(), exact[seen].double().norm()
-        product = float((approximate.double() * exact[seen].double()).sum())
-        lengths = float(approximate.double().norm() * wanted)
+        difference = Difference.of(approximate, exact[seen])
         return GradientError(
             stylizer.step,
             stylizer.views.cameras[index].name,
-            float(error / wanted) if wanted > 0 else float(error > 0),
-            product / lengths if lengths > 0 else float(not error > 0),
+            difference.relative_error,
+            difference.cosine,
             seconds,
             seconds_exact,
         )

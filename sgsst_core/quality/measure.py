@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut, moments
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -68,7 +66,7 @@ class Measurements:
             stylizer = self._stylizer
             scene = stylizer.scene.without_zero_bands()
             settings = stylizer.settings
-            source = self.exact if stylizer.network.dtype != torch.float32 else stylizer
+            source = self.exact if stylizer.network.precision != "float32" else stylizer
             first = stylizer.measured[0]["held_out"] if stylizer.measured else None
             self._held_out = HeldOut(
                 stylizer.views.cameras,

@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from sgsst_core.budget import device_peak
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.terms import LossTerms
@@ -70,7 +71,11 @@ def build_report(
         **_inputs_json(stylizer, sources),
         "plan": {**stylizer.plan.as_dict(), "measured": _measured(stylizer)},
         "rasterizer": stylizer.views.rasterizer.name,
-        "memory": {"limit_bytes": stylizer.memory, "peak_bytes": peak_memory()},
+        "memory": {
+            "limit_bytes": stylizer.memory,
+            "peak_bytes": peak_memory(),
+            "device_peak_bytes": device_peak(stylizer.network.device),
+        },
         "machine": machine(stylizer.network.device),
         "history": [_record_json(record, before) for record in stylizer.history],
     }
@@ -133,7 +138,7 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
     """What happened, beside the plan's prediction.
 
     Median seconds of a step of either phase and, in the second, of waiting for other ranks; the speed-up over one rank,
-    whose seconds are the predicted ones; peak memory in bytes.
+    whose seconds are the predicted ones; peak memory of the process and of its GPU in bytes.
     """
     values = {
         stage: [
@@ -153,6 +158,7 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
         "communication": median(waited) if waited else None,
         "speed_up": one_rank / seconds["sos"] if one_rank and seconds["sos"] else None,
         "peak_bytes": peak_memory(),
+        "device_bytes": device_peak(stylizer.network.device),
     }
 
 
@@ -244,4 +250,5 @@ def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
         "scales": {str(scale): _terms_json(terms) for scale, terms in record.terms.items()},
         "parts": {name: round(seconds, 4) for name, seconds in record.parts.items()},
         "memory_bytes": record.memory,
+        "device_memory_bytes": record.device_memory,
     }

@@ -96,9 +96,11 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
         draw = partial(_draw_approximations, history=history, probes=probes)
         figures.append(_figure("approximations", "Error of the approximated gradient", caption, draw))
     if np.isfinite(history.memory).any():
-        predicted = ((report.get("plan") or {}).get("prediction") or {}).get("peak_bytes")
+        predicted = (report.get("plan") or {}).get("prediction") or {}
         draw = partial(_draw_memory, history=history, predicted=predicted)
-        figures.append(_figure("memory", "Memory", "Held by the process.", draw))
+        caption = "Held by the process"
+        caption += "; of the GPU's, the most so far." if np.isfinite(history.device_memory).any() else "."
+        figures.append(_figure("memory", "Memory", caption, draw))
     return figures
 
 
@@ -187,13 +189,20 @@ def _draw_approximations(figure: Figure, against: Against, history: History, pro
     axes.set_ylabel("relative error")
 
 
-def _draw_memory(figure: Figure, against: Against, history: History, predicted: float | None) -> None:
+def _draw_memory(figure: Figure, against: Against, history: History, predicted: dict[str, Any]) -> None:
     axes = figure.subplots()
-    # Every step stands alone: of memory, the most in a place is what matters, not a mean over a round.
-    line = thinned(history.x[against], history.memory / 1e9, 1, history.place_width(against))
-    axes.plot(line.x, line.high, color=colour_of(0), marker="o" if len(line.x) == 1 else None, label="measured")
-    if predicted is not None and math.isfinite(predicted):
-        axes.axhline(predicted / 1e9, color=INK, linestyle="--", linewidth=1, label="peak that the plan predicted")
+    on_device = bool(np.isfinite(history.device_memory).any())
+    shown = [(history.memory, predicted.get("peak_bytes"), "", colour_of(0), INK)]
+    if on_device:
+        shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", colour_of(1), colour_of(1)))
+    for memory, peak, where, colour, dashed in shown:
+        # Every step stands alone: of memory, the most in a place is what matters, not a mean over a round.
+        line = thinned(history.x[against], memory / 1e9, 1, history.place_width(against))
+        marker = "o" if len(line.x) == 1 else None
+        axes.plot(line.x, line.high, color=colour, marker=marker, label=f"measured{where}")
+        if peak is not None and math.isfinite(peak):
+            label = f"peak{where} that the plan predicted"
+            axes.axhline(peak / 1e9, color=dashed, linestyle="--", linewidth=1, label=label)
     axes.set_ylim(bottom=0)
     axes.set_ylabel("GB")
     mark_phases(axes, history, against)

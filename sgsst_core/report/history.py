@@ -51,7 +51,8 @@ class History:
         terms: what the loss of a scale is the sum of.
         relative: loss of a scale over that of the unstylized scene.
         mean_relative: the same of the mean of the scales; NaN where a step is on one scale alone.
-        memory: bytes.
+        memory: bytes that the process held.
+        device_memory: most bytes that its tensors had held on the GPU.
         round_length: steps in which every view comes once.
     """
 
@@ -62,6 +63,7 @@ class History:
     relative: dict[int, Floats]
     mean_relative: Floats
     memory: Floats
+    device_memory: Floats
     round_length: int
 
     def place_width(self, against: Against) -> float:
@@ -92,6 +94,7 @@ def history_of(report: dict[str, Any]) -> History:
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
         memory=column([record.get("memory_bytes") for record in records]),
+        device_memory=column([record.get("device_memory_bytes") for record in records]),
         round_length=max(1, report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"])),
     )
 

@@ -93,6 +93,9 @@ def prediction_table(report: dict[str, Any]) -> Table:
         _beside("a step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
         _beside("peak memory", predicted.get("peak_bytes"), measured.get("peak_bytes"), byte_count),
     ]
+    on_device = predicted.get("device_bytes"), measured.get("device_bytes")
+    if any(value is not None for value in on_device):
+        rows.append(_beside("peak memory of the GPU", *on_device, byte_count))
     one_rank, seconds = predicted.get("seconds_one_rank"), predicted.get("seconds")
     if one_rank and seconds:
         waiting = predicted["communication"], measured.get("communication")

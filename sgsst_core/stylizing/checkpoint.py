@@ -32,7 +32,9 @@ from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 
 #: Raised whenever the meaning of a stored value changes.
-FORMAT_VERSION = "4"
+FORMAT_VERSION = "5"
+#: Its predictions count the memory of a GPU as the process's, nothing else is said of it, and cuDNN tries nothing.
+_ONE_MEMORY = "4"
 #: Its plans do not say which network and rasterizer run; see `_completed`.
 _PLANS_WITHOUT_DEVICE = "3"
 #: Settings that may differ between a checkpoint and the run that goes on from it: they only end it, or (the memory
@@ -201,7 +203,7 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        if metadata["version"] not in (FORMAT_VERSION, _PLANS_WITHOUT_DEVICE):
+        if metadata["version"] not in (FORMAT_VERSION, _ONE_MEMORY, _PLANS_WITHOUT_DEVICE):
             raise CheckpointError(f"{path}: is of another version of this program. Start again without --resume.")
         if metadata.pop("digest") != _digest(tensors, metadata):
             raise ValueError("its content is not what was written")
@@ -275,7 +277,9 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def _plan_values(metadata: Mapping[str, str]) -> dict[str, Any]:
     """A plan's values, whichever version wrote them."""
     values: dict[str, Any] = json.loads(metadata["plan"])
-    return values if metadata["version"] == FORMAT_VERSION else _completed(values, json.loads(metadata["memory"]))
+    if metadata["version"] == _PLANS_WITHOUT_DEVICE:
+        return _completed(values, json.loads(metadata["memory"]))
+    return values
 
 
 def _completed(values: dict[str, Any], memory: int) -> dict[str, Any]:

@@ -24,6 +24,7 @@ class StepRecord:
         parts: seconds of this step by what they went into.
         memory: bytes of physical memory that the process held after the step.
         sent: bytes that this rank sent to others, by what for (`collectives.Traffic`); empty for one rank.
+        device_memory: most bytes of the GPU's memory that its tensors have held so far; None on a CPU.
     """
 
     step: int
@@ -35,6 +36,7 @@ class StepRecord:
     parts: dict[str, float]
     memory: int
     sent: dict[str, int] = field(default_factory=dict)
+    device_memory: int | None = None
 
 
 @dataclass

@@ -14,7 +14,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
@@ -84,7 +84,7 @@ class Stylizer:
     ) -> None:
         self.plan = plan
         self.settings = settings
-        self.timer = Timer()
+        self.timer = Timer(plan.device)
         self.seconds = 0.0
         self.seconds_by_part: dict[str, float] = {}
         self.step = 0
@@ -94,8 +94,10 @@ class Stylizer:
         self.weights = weights
         self.photos = photos
         self.style = style
+        forget_device_peak(plan.device)
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
         self._style = style.to(self.network.device)
+        self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
         #: The partition follows from it, and so does rounding: it is the same on all ranks.
@@ -250,7 +252,7 @@ class Stylizer:
             DivergedError: the gradient has left the range of float32; the colours are those before the step.
         """
         started = time.perf_counter()
-        self.timer.seconds.clear()
+        self.timer.clear()
         sent = dict(self.collectives.sent)
         phase = self.phase
         if phase.scale is None:
@@ -259,10 +261,11 @@ class Stylizer:
         gradient, results = self._mean_gradient(views, phase)
         with self.timer("optimiser"):
             largest = self._optimiser.update(gradient, self.settings.learning_rate_at(self.share_done()))
-            terms = self._read(largest, results)
-        self.step += 1
         with self.timer("communication"):
-            self._team.check_drift(self.step, self.sh_dc)
+            self._team.check_drift(self.step + 1, self.sh_dc)
+        terms = self._read(largest, results)
+        self.step += 1
+        self.timer.read()
         if phase.scale is None:
             self._balance()
         self.seconds += time.perf_counter() - started
@@ -278,6 +281,7 @@ class Stylizer:
             dict(self.timer.seconds),
             self._process.memory_info().rss,
             {kind: total - sent[kind] for kind, total in self.collectives.sent.items() if total > sent[kind]},
+            device_peak(self.network.device),
         )
         self.history.append(record)
         return record

@@ -291,6 +291,7 @@ def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, P
         assert plan["plan"]["decisions"]
         assert plan["estimated_seconds"] > 0
         assert plan["memory_bytes"] > 0
+        assert plan["device_memory_bytes"] is None
         assert len(client.get("/v1/jobs").json()["jobs"]) == before
 
 

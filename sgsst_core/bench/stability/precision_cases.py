@@ -20,6 +20,7 @@ from sgsst_core.features.statistics import (
     merge_all,
 )
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import LayerTarget, style_loss
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -88,9 +89,9 @@ def _bfloat16(brightest: float, full: bool) -> CaseResult:
         assert gradient is not None
         gradients.append(gradient)
     exact, found = gradients
-    error = float((found - exact).norm() / exact.norm()) if bool(torch.isfinite(found).all()) else math.inf
-    cosine = float(torch.nn.functional.cosine_similarity(found.flatten(), exact.flatten(), dim=0))
-    return CaseResult(error, 0.5, f"cosine {cosine:.3f}: for `preview`, and measured in every report that uses it")
+    difference = Difference.of(found, exact)
+    note = f"cosine {difference.cosine:.3f}: for `preview`, and measured in every plan and report that uses it"
+    return CaseResult(difference.relative_error, 0.5, note)
 
 
 def _half_weights(full: bool) -> CaseResult:

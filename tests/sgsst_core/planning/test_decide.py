@@ -12,9 +12,10 @@ import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.difference import Difference
 from sgsst_core.planning.choices import rasterizer_anew
 from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Rate
-from sgsst_core.planning.decide import MEASURING_BYTES, decide
+from sgsst_core.planning.decide import LEAST_PASSES, MEASURING_BYTES, decide
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
 from sgsst_core.planning.pruning import ImageError
@@ -168,21 +169,60 @@ def test_content_is_left_out_without_weight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "precision", "text"),
+    ("asked", "ratio", "precision", "text"),
     [
-        (None, "float32", None),
-        (1.7, "bfloat16", "features in bfloat16: asked for, 1.7 times faster here"),
+        ("float32", None, "float32", None),
+        ("bfloat16", 1.7, "bfloat16", "features in bfloat16: asked for, 1.7 times faster here"),
         (
+            "bfloat16",
             0.04,
             "float32",
             "features in float32: bfloat16 was asked for, but this processor computes it 25 times slower",
         ),
+        ("tf32", 3.0, "tf32", "convolutions in TF32: asked for, 3.0 times faster here"),
+        (
+            "tf32",
+            None,
+            "float32",
+            "features in float32: tf32 was asked for, which NVIDIA GPUs of compute capability 8.0 and above have: "
+            "as float32 here",
+        ),
     ],
 )
-def test_bfloat16_where_it_is_asked_for_and_faster(ratio: float | None, precision: str, text: str | None) -> None:
-    plan = plan_of(probe(precision_ratio=ratio))
+def test_another_precision_where_it_is_asked_for_and_faster(
+    asked: str, ratio: float | None, precision: str, text: str | None
+) -> None:
+    plan = plan_of(probe(precision_ratio=ratio), precision=asked)
     assert plan.precision == precision
     assert (said(plan, "precision") if text else line(plan, "precision")) == text
+
+
+@pytest.mark.parametrize(
+    ("device", "weights", "steps", "search"),
+    [
+        ("cuda", "off", LEAST_PASSES, True),
+        ("cuda", "off", LEAST_PASSES - 1, False),
+        ("cuda", "on", LEAST_PASSES, False),  # every view is cut to a size of its own
+        ("cuda", "on", VIEWS * LEAST_PASSES, True),
+        ("cpu", "off", LEAST_PASSES, False),
+    ],
+)
+def test_algorithms_are_tried_where_sizes_come_back(device: str, weights: str, steps: int, search: bool) -> None:
+    found = probe(device=device, raster=RasterCost(0.01))
+    plan = plan_of(found, steps_coarse=0, steps_sos=steps, position_weights=weights)
+    assert plan.search is search
+    decision = line(plan, "convolutions")
+    assert (decision is not None) is (device == "cuda")
+    if decision:
+        assert ("not tried" in decision.decision) is not search
+
+
+def test_the_measured_error_of_a_precision_is_said() -> None:
+    measured = probe(precision_ratio=2.0, gradient_error=Difference(0.1234, 0.98765))
+    error = line(plan_of(measured, precision="bfloat16"), "precision").error  # type: ignore[union-attr]
+    assert error.startswith("the first view's pixel gradient is off by 0.12 of its norm (cosine 0.98765)")
+    slower = probe(precision_ratio=0.5)
+    assert line(plan_of(slower, precision="bfloat16"), "precision").error == "none"  # type: ignore[union-attr]
 
 
 # --- the rasterizer ------------------------------------------------------------------------------------------------
@@ -385,6 +425,22 @@ def test_measuring_takes_memory_but_changes_no_decision() -> None:
     assert (plain.measured, measured.measured) == (False, True)
 
 
+def test_a_gpu_holds_what_is_computed_with() -> None:
+    """What both hold together is what a process without one holds, and what the GPU alone has."""
+    own = 2 * GIGABYTE
+    for ranks in (1, 2):
+        values: dict[str, Any] = {"ranks": ranks, "raster": RasterCost(0.01), "link": Link(1e12, 1e-6)}
+        on_cpu, on_gpu = (
+            plan_of(probe(device=device, device_bytes=held, **values)).prediction
+            for device, held in (("cpu", 0), ("cuda", own))
+        )
+        assert on_cpu is not None
+        assert on_gpu is not None
+        assert on_cpu.device_bytes is None
+        assert on_gpu.peak_bytes == GIGABYTE
+        assert on_gpu.device_bytes == own + on_cpu.peak_bytes - GIGABYTE + 5 * OPTIMISER_BYTES
+
+
 def test_the_same_probe_gives_the_same_plan() -> None:
     one, other = (plan_of(probe(uncovered_share=0.2, ranks=3, link=Link(1e9, 1e-4))) for _ in range(2))
     for field in dataclasses.fields(Plan):
@@ -421,7 +477,9 @@ def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
         content_bytes=0,
         device="cuda",
     )
-    plan = plan_of(found, prune_weight=1.0, content_weight=0, coarsest_side=4000, similar_views=0.1)
+    plan = plan_of(
+        found, prune_weight=1.0, content_weight=0, coarsest_side=4000, similar_views=0.1, precision="bfloat16"
+    )
     assert [decision.item for decision in plan.decisions] == [
         "unseen Gaussians",
         "pruned Gaussians",
@@ -435,6 +493,7 @@ def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
         "partition",
         "second forward",
         "rasterizer",
+        "convolutions",
         "blend weights",
         "scales",
         "phase 1",

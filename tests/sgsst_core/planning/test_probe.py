@@ -10,9 +10,11 @@ import torch
 
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import ALIGNMENT
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import Workshop, convolution_ratio, equip, measure
+from sgsst_core.planning.probe import Workshop, _side, equip, measure
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.planning.pruning import pruned_image_error
 from sgsst_core.planning.ranks_model import Link
@@ -47,12 +49,25 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     )
     assert 0 < probe.network.rate.forward < 10 * probe.network.rate.both
     assert probe.network.precision_ratio is None
+    assert probe.network.gradient_error is None
+    assert probe.device_bytes == 0
     assert probe.raster.bytes is not None
     assert probe.raster.half_bytes is not None
     assert 0 < probe.raster.half_bytes < probe.raster.bytes
     assert probe.raster.seconds > 0
     assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
     assert probe.process_bytes > 10**7
+
+
+def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
+    """On a GPU large, as far as their activations fit; the views' own size bounds both (`measure_rate` is given it)."""
+    workshop = equipped(tiny_weights, wall(), memory_limit=10**9)
+    on_gpu = replace(workshop, machine=replace(workshop.machine, device="cuda"))
+    network = workshop.network
+    a_pixel = network.held_bytes_per_pixel() + network.working_bytes_per_pixel()
+    for memory, on_cpu, with_gpu in ((1 << 40, 384, 1024), (int(500.5**2 * a_pixel), 384, 500), (1, 384, ALIGNMENT)):
+        loss = SosLoss(network, memory=memory)
+        assert (_side(workshop, loss), _side(on_gpu, loss)) == (on_cpu, with_gpu)
 
 
 def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:
@@ -126,7 +141,3 @@ def test_a_rasterizer_that_is_named_is_measured_and_used(tiny_weights: BackboneW
     settings = make_settings(kept_weights="none")
     stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
     assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"
-
-
-def test_both_precisions_are_timed() -> None:
-    assert convolution_ratio("cpu") > 0

@@ -14,6 +14,7 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.rounding import RoundedToTf32
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -56,6 +57,22 @@ def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: Backb
         assert approximations(stylizer) == ["pruned Gaussians"]
         errors.append(ExactTwin(stylizer).gradient_error().relative_error)
     assert 0 < errors[0] < errors[1]
+
+
+def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -> None:
+    """Planned by hand. On a processor a network in TF32 is one in float32; what GPUs do is imitated."""
+    scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
+    plan, workshop = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+    plan = replace(plan, precision="tf32")
+    rounded = RoundedToTf32(tiny_weights, workshop.network.layers)
+    errors = []
+    for shop in (None, replace(workshop, network=rounded)):
+        stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights, workshop=shop)
+        assert approximations(stylizer) == ["TF32 convolutions"]
+        errors.append(ExactTwin(stylizer).gradient_error())
+    assert errors[0].relative_error < 1e-5
+    assert 1e-3 < errors[1].relative_error < 0.2
+    assert errors[1].cosine > 0.98
 
 
 def test_bfloat16_has_an_error_between_rounding_and_nonsense(tiny_weights: BackboneWeights) -> None:

@@ -60,6 +60,7 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     assert len(report["backbone"]["sha256"]) == 64
     assert report["settings"] == stylizer.settings.model_dump(mode="json")
     assert report["memory"]["peak_bytes"] > 50_000_000
+    assert report["memory"]["device_peak_bytes"] is report["plan"]["measured"]["device_bytes"] is None
     parts = sum(report["seconds_by_part"].values())
     assert 0.5 * report["seconds"] < parts <= report["seconds"] + 0.01
 
@@ -79,6 +80,7 @@ def test_losses_in_the_report_are_those_of_the_steps(
         assert entry["relative"] == pytest.approx(record.loss / mean_loss(before))
         assert sum(entry["parts"].values()) == pytest.approx(sum(record.parts.values()), abs=1e-3)
         assert entry["memory_bytes"] > 50_000_000
+        assert entry["device_memory_bytes"] is None
     assert report["loss"]["relative"] == pytest.approx(mean_loss(after) / mean_loss(before))
     assert report["loss"]["relative"] < 1
     assert report["loss"]["views"] == ["view_0", "view_1", "view_0", "view_1"]

@@ -287,6 +287,22 @@ def test_prediction_stands_beside_the_measurement() -> None:
     ]
 
 
+def test_memory_of_a_gpu_stands_apart() -> None:
+    report = losses_alone()
+    cells, captions = parsed(report).cells, []
+    assert "peak memory of the GPU" not in cells
+    report["plan"]["prediction"]["device_bytes"] = 40_000_000_000
+    report["plan"]["measured"]["device_bytes"] = 20_000_000_000
+    for known in (False, True):
+        for record in report["history"]:
+            record |= {"memory_bytes": 3 * 10**9, "device_memory_bytes": 2 * 10**10 if known else None}
+        page = parsed(report)
+        captions.append("of the GPU's, the most so far" in page.text)
+        place = page.cells.index("peak memory of the GPU")
+        assert page.cells[place + 1 : place + 4] == ["40 GB", "20 GB", "0.5"]
+    assert captions == [False, True]
+
+
 def test_speed_up_of_several_ranks_stands_beside_its_prediction() -> None:
     report = sample_report()
     report["plan"]["prediction"] |= {"seconds_one_rank": 3.6, "communication": 0.1}

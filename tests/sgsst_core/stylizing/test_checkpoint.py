@@ -25,7 +25,7 @@ from sgsst_core.stylizing.checkpoint import (
     versions,
 )
 from sgsst_core.stylizing.state import StepRecord, StylizerState
-from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
+from tests.sgsst_core.stylizing.old_checkpoints import of_version_3, of_version_4
 from tests.small_scenes import cameras, style, wall
 
 
@@ -98,6 +98,20 @@ def test_everything_comes_back_exactly(kept: Checkpoint, tmp_path: Path) -> None
     torch.Generator().set_state(loaded.state.generator)
 
 
+def test_the_memory_of_a_gpu_comes_back(kept: Checkpoint, tmp_path: Path) -> None:
+    history = [replace(record, device_memory=10**11) for record in kept.state.history]
+    plan = replace(kept.plan, device="cuda", precision="tf32", prediction=Prediction(0.1, 0.2, 3, device_bytes=10**12))
+    kept = replace(kept, state=replace(kept.state, history=history), plan=plan)
+    save_checkpoint(tmp_path / "c", kept, "job")
+    assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
+
+
+def test_a_checkpoint_of_version_4_comes_back_without_memory_of_a_gpu(kept: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", kept, "job")
+    of_version_4(tmp_path / "c")
+    assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
+
+
 def test_a_checkpoint_of_version_3_comes_back_with_what_its_plan_meant(kept: Checkpoint, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", kept, "job")
     of_version_3(tmp_path / "c")
@@ -112,7 +126,7 @@ def test_a_checkpoint_of_version_3_comes_back_with_what_its_plan_meant(kept: Che
 
 def test_a_checkpoint_of_a_version_before_that_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", kept, "job")
-    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"4"', b'"version":"2"'))
+    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"5"', b'"version":"2"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
 
@@ -126,7 +140,7 @@ def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Che
     assert stored.items() <= history[1].pop("terms")["0"].items()
     assert history[1] == {
         **{"step": 2, "stage": "sos", "view": 3, "seconds": 0.3, "loss": 4.0},
-        **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9, "sent": {"image": 7}},
+        **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9, "sent": {"image": 7}, "device_memory": None},
     }
     assert {"gram": 1.0, "mean": 2.0, "std": 1 / 3, "content": 0.0}.items() <= before["0"].items()
 

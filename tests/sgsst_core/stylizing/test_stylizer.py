@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import Callbacks, Progress, run
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.timing import Timer
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import HEIGHT, WIDTH, ball, blind_camera, cameras, style, wall
 
@@ -261,3 +263,33 @@ def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene:
     assert colours.shape == before.shape
     assert not torch.equal(colours, before)
     assert not colours.requires_grad
+
+
+class ClockEvent:
+    """A mark in the stream of a device that does at once what it is given."""
+
+    def record(self) -> None:
+        self.at = time.perf_counter()
+
+    def query(self) -> bool:
+        return True
+
+    def synchronize(self) -> None:
+        pass
+
+    def elapsed_time(self, end_event: Any) -> float:
+        return 1000 * float(end_event.at - self.at)
+
+
+def test_a_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    """They are complete when the step is, as a GPU's are."""
+    clock, events = (make(tiny_weights, scene) for _ in range(2))
+    events.timer = events.loss.timer = Timer(event=ClockEvent)
+    for _ in range(6):  # the last one on all scales
+        expected, found = clock.run_step(), events.run_step()
+        assert found.parts.keys() == expected.parts.keys()
+        assert all(seconds > 0 for seconds in found.parts.values())
+        assert sum(found.parts.values()) < events.seconds
+        assert found.loss == expected.loss
+    assert events.seconds_by_part.keys() == clock.seconds_by_part.keys()
+    assert sum(found.parts.values()) > 0.5 * (events.seconds - events.history[-2].seconds)

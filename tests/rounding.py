@@ -1,0 +1,46 @@
+"""TF32 on a processor: factors are rounded to its 10 bits, products summed in float32, as NVIDIA's GPUs do it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgsst_core.features import vgg
+from sgsst_core.features.vgg import Activations, FeatureNetwork
+
+#: Bits of float32's significand that TF32 does not have.
+_LOST = 13
+
+
+def to_tf32(values: Tensor) -> Tensor:
+    """Float32 values rounded to 10 bits, to nearest and even."""
+    bits = values.view(torch.int32)
+    half_and_tie = (1 << _LOST - 1) - 1 + (bits >> _LOST & 1)
+    return (bits + half_and_tie & ~((1 << _LOST) - 1)).view(torch.float32)
+
+
+class RoundedToTf32(FeatureNetwork):
+    """A float32 network whose convolutions round their factors.
+
+    Args:
+        decisions: its ReLU masks and pool positions take the place of those that rounding arrives at.
+    """
+
+    def __init__(self, *arguments: Any, decisions: FeatureNetwork | None = None) -> None:
+        super().__init__(*arguments, tf32=True)
+        self._decisions = decisions
+
+    def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
+        kept = super().forward(rgb, keep=keep)
+        if self._decisions:
+            kept.outputs = self._decisions.forward(rgb, keep=keep).outputs
+        return kept
+
+    def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:
+        return super()._convolve(to_tf32(x), replace(step, weight=to_tf32(step.weight)))
+
+    def _convolve_back(self, gradient: Tensor, step: vgg._Convolution) -> Tensor:
+        return super()._convolve_back(to_tf32(gradient), replace(step, backward_weight=to_tf32(step.backward_weight)))

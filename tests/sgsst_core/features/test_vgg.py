@@ -1,0 +1,287 @@
+"""The feature network's passes: layout, what is kept, and what holds around them on a GPU."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sgsst_core.features import vgg
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
+
+CUDA = torch.device("cuda")  # a name: nothing here needs one
+CUDNN: Any = torch.backends.cudnn
+SIZE = (50, 37)
+
+
+def picture() -> Tensor:
+    return torch.rand((*SIZE, 3), generator=torch.Generator().manual_seed(1))
+
+
+def add(layer: str, features: Tensor, gradient: Tensor) -> None:
+    """Of the mean square of all reported features."""
+    gradient += features / features.numel()
+
+
+def pixel_gradient(network: FeatureNetwork) -> Tensor:
+    return network.backward(network.forward(picture()), add)
+
+
+class Watched(FeatureNetwork):
+    """Notes the flags and layouts that its convolutions see."""
+
+    def note(self, *tensors: Tensor) -> None:
+        self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark))
+        self.layouts += [tensor.is_contiguous(memory_format=torch.channels_last) for tensor in tensors]
+
+    def __init__(self, *arguments: object, **options: object) -> None:
+        self.flags: set[tuple[str, bool]] = set()
+        self.layouts: list[bool] = []
+        super().__init__(*arguments, **options)  # type: ignore[arg-type]
+
+    def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:
+        result = super()._convolve(x, step)
+        self.note(x, step.weight, result)
+        return result
+
+    def _convolve_back(self, gradient: Tensor, step: vgg._Convolution) -> Tensor:
+        result = super()._convolve_back(gradient, step)
+        self.note(gradient, step.backward_weight, result)
+        return result
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_every_convolution_has_channels_last(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
+    """So that none of them copies what it is given: not behind a ReLU's or a pool's backward pass either."""
+    network = Watched(tiny_weights, dtype=dtype)
+    pixel_gradient(network)
+    count = sum(isinstance(step, vgg._Convolution) for step in network._steps)
+    assert len(network.layouts) == 6 * count
+    assert all(network.layouts)
+
+
+def test_positions_that_are_found_again_are_those_that_were_kept(tiny_weights: BackboneWeights) -> None:
+    """As on a GPU; a picture of few grey levels has equal maxima."""
+    kept, again = FeatureNetwork(tiny_weights), FeatureNetwork(tiny_weights)
+    again._keeps_positions = False
+    for image in (picture(), picture().mul(2).round()):
+        gradients = []
+        for network in (kept, again):
+            activations = network.forward(image)
+            assert any(not output.numel() for output in activations.outputs) is (network is again)
+            gradients.append(network.backward(activations, add))
+        assert torch.equal(*gradients)
+    assert again.held_bytes_per_pixel() < kept.held_bytes_per_pixel()
+
+
+# --- what holds around the passes on a GPU -------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def _flags() -> Iterator[None]:
+    cudnn, matmul = CUDNN, torch.backends.cuda.matmul
+    before = cudnn.benchmark, cudnn.allow_tf32, matmul.allow_tf32
+    yield
+    cudnn.benchmark, cudnn.allow_tf32, matmul.allow_tf32 = before
+
+
+def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextManager[None]:
+    return convolutions(CUDA, **flags)
+
+
+@pytest.mark.parametrize("search", [False, True])
+@pytest.mark.parametrize("tf32", [False, True])
+def test_flags_hold_in_the_network_alone(
+    tiny_weights: BackboneWeights, tf32: bool, search: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network computes on the CPU here, and takes itself to be on a GPU for the flags."""
+    use_whole_float32()
+    network = Watched(tiny_weights, tf32=tf32)
+    network.search = search
+    monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
+    pixel_gradient(network)
+    assert network.flags == {("tf32" if tf32 else "ieee", search)}
+    assert not CUDNN.allow_tf32
+    assert not CUDNN.benchmark
+    assert not torch.backends.cuda.matmul.allow_tf32
+    assert network.precision == ("tf32" if tf32 else "float32")
+
+
+def test_statistics_are_summed_in_whole_float32(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loss is asked for in the middle of the backward pass."""
+    use_whole_float32()
+    monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
+    network = FeatureNetwork(tiny_weights, tf32=True)
+    seen = []
+    network.backward(network.forward(picture()), lambda *_: seen.append(torch.backends.cuda.matmul.fp32_precision))
+    assert set(seen) == {"ieee"}
+
+
+@pytest.mark.parametrize("before", ["ieee", "tf32", "none"])
+def test_flags_come_back_after_an_error(before: str) -> None:
+    CUDNN.conv.fp32_precision = before
+    with contextlib.suppress(KeyError), convolutions(CUDA, tf32=True, search=True):
+        assert CUDNN.benchmark
+        assert CUDNN.conv.fp32_precision == "tf32"
+        raise KeyError
+    assert CUDNN.conv.fp32_precision == before
+    assert not CUDNN.benchmark
+
+
+def test_nothing_is_set_on_a_cpu() -> None:
+    before = CUDNN.benchmark, CUDNN.conv.fp32_precision
+    with convolutions(torch.device("cpu"), tf32=True, search=True):
+        assert (CUDNN.benchmark, CUDNN.conv.fp32_precision) == before
+
+
+def test_float32_is_whole_where_tf32_is_allowed_in_general(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends, "fp32_precision", "tf32")
+    use_whole_float32()
+    assert CUDNN.conv.fp32_precision == torch.backends.cuda.matmul.fp32_precision == "ieee"
+
+
+@pytest.mark.parametrize(
+    ("device", "hip", "capability", "expected"),
+    [
+        ("cuda", None, (9, 0), True),
+        ("cuda", None, (8, 0), True),
+        ("cuda", None, (7, 5), False),
+        ("cuda", "6.4", (9, 4), False),
+        ("cpu", None, (9, 0), False),
+    ],
+)
+def test_which_devices_have_tf32(
+    device: str, hip: str | None, capability: tuple[int, int], expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.version, "hip", hip)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    assert has_tf32(device) is expected
+
+
+def test_tf32_is_of_float32(tiny_weights: BackboneWeights) -> None:
+    with pytest.raises(ValueError, match="float32"):
+        FeatureNetwork(tiny_weights, dtype=torch.bfloat16, tf32=True)
+
+
+# --- the fused convolution -----------------------------------------------------------------------------------------
+
+
+def fused(x: Tensor, weight: Tensor, bias: Tensor, *rest: Any) -> Tensor:
+    stride, padding, dilation, groups = rest
+    assert (list(stride), list(padding), list(dilation), groups) == ([1, 1], [1, 1], [1, 1], 1)
+    return F.conv2d(x, weight, bias, stride, padding, dilation, groups).relu()
+
+
+def without_bias(x: Tensor, weight: Tensor, bias: Tensor, *rest: Any) -> Tensor:
+    return fused(x, weight, torch.zeros_like(bias), *rest)
+
+
+def in_planes(*arguments: Any) -> Tensor:
+    return fused(*arguments).contiguous()
+
+
+@contextmanager
+def operator_on_cpu(does: Callable[..., Tensor]) -> Iterator[list[int]]:
+    """cuDNN's operator on the CPU, made of its parts; the list has a member for each call."""
+    calls: list[int] = []
+
+    def counted(*arguments: Any) -> Tensor:
+        calls.append(1)
+        return does(*arguments)
+
+    library = torch.library.Library("aten", "IMPL")
+    library.impl("cudnn_convolution_relu", counted, "CPU")
+    try:
+        yield calls
+    finally:
+        library._destroy()
+
+
+def fuse(network: FeatureNetwork) -> set[bool]:
+    """Fuse what a try shows to work, as at the construction of a network on a GPU."""
+    steps = [step for step in network._steps if isinstance(step, vgg._Convolution)]
+    for step in steps:
+        step.fused = vgg._can_fuse(step)
+    return {step.fused for step in steps}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_fused_network_is_the_same(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
+    network = FeatureNetwork(tiny_weights, dtype=dtype)
+    expected = pixel_gradient(network)
+    with operator_on_cpu(fused) as calls:
+        assert fuse(network) == {True}
+        calls.clear()
+        assert torch.equal(pixel_gradient(network), expected)
+        assert len(calls) == sum(isinstance(step, vgg._Convolution) for step in network._steps)
+
+
+@pytest.mark.parametrize("does", [without_bias, in_planes])
+def test_what_differs_from_its_parts_is_not_fused(tiny_weights: BackboneWeights, does: Callable[..., Tensor]) -> None:
+    with operator_on_cpu(does):
+        assert fuse(FeatureNetwork(tiny_weights)) == {False}
+
+
+def test_what_there_is_no_engine_for_is_not_fused(tiny_weights: BackboneWeights) -> None:
+    assert fuse(FeatureNetwork(tiny_weights)) == {False}
+
+
+def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = FeatureNetwork(tiny_weights)
+    with operator_on_cpu(fused) as calls:
+        fuse(network)
+        calls.clear()
+        monkeypatch.setattr(vgg, "_FUSED_VALUES", SIZE[0] * SIZE[1] * 16)
+        network.forward(picture())
+        first_block = 2
+        assert len(calls) == sum(isinstance(step, vgg._Convolution) for step in network._steps) - first_block
+
+
+class Launches(TorchDispatchMode):
+    """Counts what computes: neither views nor empty memory."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if not func.is_view and "empty" not in func.__name__:
+            self.names[func.overloadpacket.__name__] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights) -> None:
+    """One for a convolution with its ReLU, one for a pool; backward two for each."""
+    network = FeatureNetwork(tiny_weights, tf32=True)
+    network._keeps_positions = False
+    pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
+    convolved, image = len(network._steps) - pools, picture()
+    with operator_on_cpu(fused):
+        fuse(network)
+        with Launches() as forward:
+            kept = network.forward(image)
+        with Launches() as backward:
+            network.backward(kept, lambda *_: None)
+    assert forward.names == {
+        "cudnn_convolution_relu": convolved,
+        "max_pool2d_with_indices": pools,
+        "mul": 1,  # the input's normalisation
+        "add": 1,
+    }
+    assert backward.names == {
+        "threshold_backward": convolved,
+        "convolution": convolved,
+        "max_pool2d_with_indices": pools,
+        "max_pool2d_with_indices_backward": pools,
+        "zeros_like": 1,  # the deepest layer's gradient, to which the loss adds
+        "mul": 1,
+    }

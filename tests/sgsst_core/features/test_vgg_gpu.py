@@ -1,0 +1,86 @@
+"""The feature network on a GPU against float64 on the CPU. Twins without one: test_vgg, test_precision, test_timing."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from sgsst_core.features import vgg
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
+from sgsst_core.loss.difference import Difference
+from sgsst_core.timing import Timer
+from tests.sgsst_core.pictures import picture
+
+HAS_GPU = torch.cuda.is_available()
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not HAS_GPU, reason="no GPU that PyTorch can use")]
+SIZE = (160, 240)
+
+
+def add(layer: str, features: Tensor, gradient: Tensor) -> None:
+    gradient += features / features.numel()
+
+
+def difference(weights: BackboneWeights, dtype: torch.dtype = torch.float32, *, tf32: bool = False) -> Difference:
+    """Of the pixel gradient, to float64 on the CPU."""
+    use_whole_float32()
+    image = picture(*SIZE)
+    exact = FeatureNetwork(weights, dtype=torch.float64)
+    found = FeatureNetwork(weights, dtype=dtype, device="cuda", tf32=tf32)
+    gradients = [network.backward(network.forward(image), add).cpu().double() for network in (found, exact)]
+    return Difference.of(*gradients)
+
+
+def test_float32_on_a_gpu_is_whole(vgg16_weights: BackboneWeights) -> None:
+    assert difference(vgg16_weights).relative_error < 5e-3
+
+
+@pytest.mark.parametrize("tf32", [True, False])
+def test_other_precisions_differ_by_what_they_round(vgg16_weights: BackboneWeights, tf32: bool) -> None:
+    if tf32 and not has_tf32("cuda"):
+        pytest.skip("this GPU has no TF32")
+    found = difference(vgg16_weights, torch.float32 if tf32 else torch.bfloat16, tf32=tf32)
+    print(found)
+    assert 1e-3 < found.relative_error < (0.2 if tf32 else 0.8)
+
+
+def test_tf32_is_on_in_the_block_alone() -> None:
+    if not has_tf32("cuda"):
+        pytest.skip("this GPU has no TF32")
+    use_whole_float32()
+    generator = torch.Generator().manual_seed(0)
+    image, kernel = (torch.randn(*shape, generator=generator).cuda() for shape in ((1, 64, 64, 64), (64, 64, 3, 3)))
+    exact = F.conv2d(image.double(), kernel.double(), padding=1)
+    errors = []
+    for block in (True, False):
+        if block:
+            with convolutions(image.device, tf32=True):
+                found = F.conv2d(image, kernel, padding=1)
+        else:
+            found = F.conv2d(image, kernel, padding=1)
+        errors.append(Difference.of(found.double(), exact).relative_error)
+    assert 1e-5 < errors[0] < 1e-2
+    assert errors[1] < 2e-6
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_fused_convolutions_have_channels_last(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
+    network = FeatureNetwork(vgg16_weights, dtype=dtype, device="cuda")
+    kept = network.forward(picture(*SIZE))
+    print({step.layer: step.fused for step in network._steps if isinstance(step, vgg._Convolution)})
+    held = [output for output in kept.outputs if output.numel()]
+    assert all(output.is_contiguous(memory_format=torch.channels_last) for output in held)
+
+
+def test_events_time_what_the_device_does() -> None:
+    timer = Timer("cuda")
+    matrix = torch.randn(4096, 4096, device="cuda")
+    with timer("whole"):
+        for _ in range(8):
+            with timer("part"):
+                matrix = (matrix @ matrix).clamp_(-1, 1)
+    torch.cuda.synchronize()
+    assert timer.read().keys() == {"whole", "part"}
+    assert all(seconds > 0 for seconds in timer.seconds.values())

@@ -1,0 +1,31 @@
+"""How far one gradient is from another."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from sgsst_core.loss.difference import Difference
+
+
+@pytest.mark.parametrize(
+    ("found", "exact", "error", "cosine"),
+    [
+        ([3.0, 4.0], [3.0, 4.0], 0.0, 1.0),
+        ([6.0, 8.0], [3.0, 4.0], 1.0, 1.0),
+        ([-4.0, 3.0], [3.0, 4.0], math.sqrt(2), 0.0),
+        ([-3.0, -4.0], [3.0, 4.0], 2.0, -1.0),
+        ([0.0, 0.0], [3.0, 4.0], 1.0, 0.0),
+        ([1e-30, 0.0], [0.0, 0.0], 1.0, 0.0),
+        ([0.0, 0.0], [0.0, 0.0], 0.0, 1.0),
+        ([1e-30, 0.0], [2e-30, 0.0], 0.5, 1.0),  # squares vanish in float32
+        ([1e30, 0.0], [2e30, 0.0], 0.5, 1.0),  # and overflow
+        ([math.nan, 0.0], [1.0, 0.0], math.inf, 0.0),
+        ([math.inf, 0.0], [1.0, 0.0], math.inf, 0.0),
+    ],
+)
+def test_difference(found: list[float], exact: list[float], error: float, cosine: float) -> None:
+    difference = Difference.of(torch.tensor(found), torch.tensor(exact))
+    assert (difference.relative_error, difference.cosine) == (pytest.approx(error), pytest.approx(cosine, abs=1e-12))

@@ -1,0 +1,103 @@
+"""What another precision gains and costs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.difference import Difference
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning import precision
+from sgsst_core.planning.precision import convolution_ratio, gradient_error, precision_ratio, seconds_of
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.rounding import RoundedToTf32, to_tf32
+from tests.small_scenes import ball, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def error_of(network: FeatureNetwork, weights: BackboneWeights, side: int = 384) -> Difference | None:
+    scene = wall(sh_degree=1)
+    return gradient_error(network, weights, scene, cameras(1)[0], make_rasterizer("cpu", scene), 1 << 30, side)
+
+
+def test_ten_bits_have_an_error_of_a_thousandth_but_for_flips(vgg16_weights: BackboneWeights) -> None:
+    """Most of what a lower precision costs are ReLUs and maxima that decide otherwise. Their number follows the
+    rounding, and the error goes down as the root of it.
+    """
+    flipping = error_of(RoundedToTf32(vgg16_weights), vgg16_weights)
+    deciding = error_of(RoundedToTf32(vgg16_weights, decisions=FeatureNetwork(vgg16_weights)), vgg16_weights)
+    bfloat16 = error_of(FeatureNetwork(vgg16_weights, dtype=torch.bfloat16), vgg16_weights)
+    assert deciding is not None
+    assert flipping is not None
+    assert bfloat16 is not None
+    print(f"TF32: {flipping}, without flips: {deciding}; bfloat16: {bfloat16}")
+    assert 1e-4 < deciding.relative_error < 3e-3
+    assert deciding.relative_error < 0.1 * flipping.relative_error
+    assert 1e-2 < flipping.relative_error < 0.6 * bfloat16.relative_error < 0.3
+    assert 0.95 < bfloat16.cosine < flipping.cosine < deciding.cosine <= 1
+
+
+def test_float32_is_not_compared_and_tf32_is_float32_on_a_processor(tiny_weights: BackboneWeights) -> None:
+    assert error_of(FeatureNetwork(tiny_weights), tiny_weights) is None
+    assert error_of(FeatureNetwork(tiny_weights, tf32=True), tiny_weights) == Difference(0.0, pytest.approx(1.0))  # type: ignore[arg-type]
+
+
+def test_rounding_is_to_nearest_and_even() -> None:
+    step = 2.0**-10
+    values = torch.tensor([1 + 0.49 * step, 1 + 0.51 * step, 1 + 0.5 * step, 1 + 1.5 * step, -2 - 0.8 * step, 0.0])
+    assert to_tf32(values).tolist() == [1.0, 1 + step, 1.0, 1 + 2 * step, -2.0, 0.0]
+
+
+# --- what it gains -------------------------------------------------------------------------------------------------
+
+
+def test_a_processor_is_timed_for_what_it_has() -> None:
+    assert convolution_ratio("bfloat16", "cpu") > 0
+    assert precision_ratio("bfloat16", "cpu", ALONE) is not None
+    assert precision_ratio("float32", "cpu", ALONE) is precision_ratio("tf32", "cpu", ALONE) is None
+
+
+def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Others(type(ALONE)):  # type: ignore[misc]
+        def all_gather(self, value: Any) -> list[Any]:
+            return [value, has_it]
+
+    monkeypatch.setattr(precision, "has_tf32", lambda device: True)
+    monkeypatch.setattr(precision, "convolution_ratio", lambda asked, device: 3.0)
+    has_it = True
+    assert precision_ratio("tf32", "cuda", Others()) == 3.0
+    has_it = False
+    assert precision_ratio("tf32", "cuda", Others()) is None
+
+
+@pytest.mark.parametrize(("least", "runs"), [(0.0, [1, 1]), (1.0, [1, 1]), (5.0, [1, 1, 2, 4, 8])])
+def test_repetitions_take_long_enough(least: float, runs: list[int]) -> None:
+    """A second each, and the first one ten: it prepares."""
+    made: list[int] = []
+
+    def run(times: int) -> float:
+        made.append(times)
+        return float(times) if made[1:] else 10.0
+
+    assert seconds_of(run, least) == 1.0
+    assert made == runs
+
+
+def test_tf32_on_a_processor_is_the_same_job(tiny_weights: BackboneWeights) -> None:
+    asked, plain = (
+        Stylizer.planned(ball(300), cameras(2), style(), make_settings(precision=name), weights=tiny_weights)
+        for name in ("tf32", "float32")
+    )
+    assert asked.plan.precision == asked.network.precision == "float32"
+    assert [decision.decision for decision in asked.plan.decisions if decision.item == "precision"] == [
+        "features in float32"
+    ]
+    assert asked.run_step().loss == plain.run_step().loss
+    assert torch.equal(asked.sh_dc, plain.sh_dc)

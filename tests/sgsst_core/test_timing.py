@@ -1,0 +1,138 @@
+"""Exclusive seconds by name, by the clock and by events of a pretend stream."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from sgsst_core.timing import Timer
+
+
+class Stream:
+    """A device that works behind the program: what it is given takes so many seconds of its own."""
+
+    def __init__(self) -> None:
+        self.given = 0.0
+        self.done = 0.0
+        self.waits = 0
+        self.events = 0
+
+    def launch(self, seconds: float) -> None:
+        self.given += seconds
+
+    def wait(self) -> None:
+        self.waits += self.done < self.given
+        self.done = self.given
+
+    def event(self) -> PretendEvent:
+        self.events += 1
+        return PretendEvent(self)
+
+
+class PretendEvent:
+    """A mark of `Stream`, with the rules of CUDA's: what the device has not come to has no time."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
+        self.at: float | None = None
+
+    def record(self) -> None:
+        self.at = self._stream.given
+
+    def query(self) -> bool:
+        assert self.at is not None
+        return self.at <= self._stream.done
+
+    def synchronize(self) -> None:
+        assert self.at is not None
+        if self._stream.done < self.at:
+            self._stream.waits += 1
+            self._stream.done = self.at
+
+    def elapsed_time(self, end_event: Any) -> float:
+        assert self.at is not None
+        assert max(self.at, end_event.at) <= self._stream.done, "the device has not come to it yet"
+        return 1000 * (end_event.at - self.at)
+
+
+def step(timer: Timer, work: Any) -> None:
+    """Blocks within blocks, the same name inside and outside, and work between blocks, which counts for none."""
+    with timer("loss"):
+        work(1.0)
+        with timer("forward"):
+            work(2.0)
+            with timer("statistics"):
+                work(4.0)
+            work(8.0)
+        with timer("forward"):
+            work(16.0)
+        work(32.0)
+    work(64.0)
+    with timer("optimiser"):
+        work(128.0)
+
+
+SECONDS = {"loss": 33.0, "forward": 26.0, "statistics": 4.0, "optimiser": 128.0}
+
+
+def test_nested_blocks_count_for_the_inner_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [10.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    timer = Timer()
+    step(timer, lambda seconds: now.__setitem__(0, now[0] + seconds))
+    assert timer.seconds == SECONDS  # with no need to read them
+    assert timer.read() == SECONDS
+
+
+def test_a_devices_seconds_are_its_own() -> None:
+    """The program gives the work at once: by its clock hardly any time passes."""
+    stream = Stream()
+    timer = Timer(event=stream.event)
+    step(timer, stream.launch)
+    assert timer.seconds == {}
+    assert timer.read() == pytest.approx(SECONDS)
+    assert stream.waits == 1
+
+
+def test_reading_behind_a_wait_costs_none() -> None:
+    stream = Stream()
+    timer = Timer(event=stream.event)
+    for rounds in (1, 2):
+        step(timer, stream.launch)
+        stream.wait()
+        timer.read()
+        assert stream.waits == rounds
+        assert timer.seconds == pytest.approx({name: rounds * value for name, value in SECONDS.items()})
+
+
+def test_what_was_not_read_is_forgotten() -> None:
+    stream = Stream()
+    timer = Timer(event=stream.event)
+    step(timer, stream.launch)
+    timer.clear()
+    assert timer.read() == {}
+    with timer("loss"):
+        stream.launch(1.0)
+        timer.clear()
+        stream.launch(2.0)
+    assert timer.read() == pytest.approx({"loss": 2.0})
+
+
+def test_a_block_that_fails_is_timed_and_closed() -> None:
+    stream = Stream()
+    timer = Timer(event=stream.event)
+    with pytest.raises(KeyError):
+        fail(timer, stream)
+    with timer("render"):
+        stream.launch(3.0)
+    assert timer.read() == pytest.approx({"loss": 0.5, "forward": 0.25, "render": 3.0})
+
+
+def fail(timer: Timer, stream: Stream) -> None:
+    with timer("loss"):
+        stream.launch(0.5)
+        with timer("forward"):
+            stream.launch(0.25)
+            raise KeyError
