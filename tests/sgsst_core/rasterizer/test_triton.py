@@ -31,11 +31,8 @@ from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
-from tests.small_scenes import cameras, style, wall
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -184,6 +181,11 @@ def test_made_by_its_name() -> None:
 
 def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
     """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
+    # The other tests need not even pydantic: they run on a bare machine that has a GPU.
+    from sgsst_core.settings import make_settings
+    from sgsst_core.stylizing.stylizer import Stylizer
+    from tests.small_scenes import cameras, style, wall
+
     settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=24)
     losses = {}
     for name in ("cpu", "triton"):
