@@ -25,7 +25,7 @@ from triton.compiler import ASTSource
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
 from sgsst_core.rasterizer import triton_kernels as kernels
-from sgsst_core.scene import spherical_harmonics_kernels
+from sgsst_core.scene import spherical_harmonics_triton_kernels
 
 TARGETS = {
     "sm_80": GPUTarget("cuda", 80, 32),
@@ -58,7 +58,7 @@ KERNELS: dict[str, tuple[dict[str, Any], int, dict[str, str]]] = {
     "slot_gradients": (_CUTS, 8, {}),
     "add_slots": ({"BLOCK": _BLOCK}, 4, {"slots": "*fp32"}),
     "rest_colours": (
-        {"DEGREE": 3, "COEFFICIENTS": 15, "BLOCK": spherical_harmonics_kernels.BLOCK.value},
+        {"DEGREE": 3, "COEFFICIENTS": 15, "BLOCK": spherical_harmonics_triton_kernels.BLOCK.value},
         4,
         {"sh_rest": "*fp32", "centre": "*fp64"},
     ),
@@ -68,7 +68,7 @@ KERNELS: dict[str, tuple[dict[str, Any], int, dict[str, str]]] = {
 def compile_kernel(name: str, target: str) -> dict[str, Any]:
     """Registers, spilled bytes or registers, shared memory and seconds of one kernel for one target."""
     constants, warps, types = KERNELS[name]
-    module = spherical_harmonics_kernels if name == "rest_colours" else kernels
+    module = spherical_harmonics_triton_kernels if name == "rest_colours" else kernels
     kernel = getattr(module, name)
     signature = {
         argument: "constexpr" if argument in constants else {**_TYPES, **types}[argument]

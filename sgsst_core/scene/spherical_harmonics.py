@@ -114,7 +114,7 @@ def kernel_rest_colours(
     Directions are differences of float64; basis and sum are float32: up to 1e-6 of the sum of the coefficients' sizes
     away from `rest_colours`. On a GPU, or on the CPU where Triton's interpreter is on.
     """
-    from sgsst_core.scene import spherical_harmonics_kernels as kernels
+    from sgsst_core.scene import spherical_harmonics_triton_kernels as kernels
 
     count, block = len(sh_rest), kernels.BLOCK.value
     colours = torch.empty((count, 3), device=sh_rest.device)
