@@ -9,6 +9,7 @@ from benchmarks.gpu.clock import forget_peak, peak_bytes, waited_seconds
 from benchmarks.gpu.inputs import network_weights, small_weights, surface_scene, texture, views
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.report.machine import peak_memory
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 
@@ -20,12 +21,13 @@ def run(sizes: Sizes, found: Findings) -> None:
     """Every size, in every precision on a GPU."""
     precisions: tuple[Precision, ...] = get_args(Precision) if device().type == "cuda" else ("float32",)
     for width, height, gaussians in sizes.steps:
+        scene = surface_scene(gaussians, degree=3)
         for precision in precisions:
-            _measure(sizes, (width, height, gaussians), precision, found)
+            _measure(sizes, scene, (width, height), precision, found)
 
 
-def _measure(sizes: Sizes, size: tuple[int, int, int], precision: Precision, found: Findings) -> None:
-    width, height, gaussians = size
+def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Precision, found: Findings) -> None:
+    width, height = size
     place = f"{width}x{height}/{precision}"
     forget_peak(device())
     quick = sizes == QUICK
@@ -34,7 +36,7 @@ def _measure(sizes: Sizes, size: tuple[int, int, int], precision: Precision, fou
         coarsest_side=24 if quick else None, kept_weights="none" if quick else None,
     )  # fmt: skip
     stylizer = Stylizer.planned(
-        surface_scene(gaussians, degree=3),
+        scene,
         views(_WARM, width, height),
         texture(height, height, seed=3),
         settings,
@@ -48,7 +50,7 @@ def _measure(sizes: Sizes, size: tuple[int, int, int], precision: Precision, fou
     names = {name for record in records for name in record.parts}
     parts = {name: statistics.median(record.parts.get(name, 0.0) for record in records) for name in sorted(names)}
     prediction = stylizer.plan.prediction
-    found.add(f"{place}/gaussians", gaussians)
+    found.add(f"{place}/gaussians", len(scene))
     found.add(f"{place}/rasterizer", stylizer.plan.rasterizer)
     found.add(f"{place}/precision", stylizer.plan.precision)
     found.add(f"{place}/seconds", statistics.median(taken))
