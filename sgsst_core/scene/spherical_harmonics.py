@@ -3,7 +3,8 @@
     c_j = max(0, 0.5 + SH_C0 * sh_dc_j + sum over l >= 1 of sh_rest_j * Y_l(direction_j))
 
 Only `sh_dc` is ever optimised, so the sum over l >= 1 is frozen: it is computed once per view (`rest_colours`), after
-which a view's colours cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments.
+which a view's colours cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments, but
+for the compiled twins of that sum: Numba's on the CPU, Triton's on a GPU.
 """
 
 from __future__ import annotations
@@ -90,16 +91,40 @@ def rest_colours(
     degree = stored if degree is None else degree
     if not 0 <= degree <= stored:
         raise ValueError(f"degree {degree} asked of spherical harmonics of degree {stored}")
-    if degree and sh_rest.is_cuda and sh_rest.dtype == torch.float32 and _kernel_runs(sh_rest.device):
-        return kernel_rest_colours(sh_rest, means, camera, degree)
-    colours = torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     if degree == 0:
-        return colours
+        return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
+    if sh_rest.dtype == torch.float32 and sh_rest.device.type == "cpu":
+        return _compiled_rest_colours(sh_rest, means, camera, degree)
+    if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and _kernel_runs(sh_rest.device):
+        return kernel_rest_colours(sh_rest, means, camera, degree)
+    return reference_rest_colours(sh_rest, means, camera, degree)
+
+
+def reference_rest_colours(
+    sh_rest: Tensor,  # [N, K, 3]
+    means: Tensor,  # [N, 3]
+    camera: Camera,
+    degree: int,
+) -> Tensor:
+    """`rest_colours` of degree 1 to 3 in tensor functions, in float64, rounded to the dtype of `sh_rest`: [N, 3]."""
+    colours = torch.empty(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     count = (degree + 1) ** 2 - 1
     for start in range(0, sh_rest.shape[0], _CHUNK):
         part = slice(start, start + _CHUNK)
         values = basis(view_directions(means[part], camera.centre), degree)
         colours[part] = torch.einsum("nk,nkc->nc", values, sh_rest[part, :count].double()).to(sh_rest.dtype)
+    return colours
+
+
+def _compiled_rest_colours(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
+    """The same on the CPU for float32, on all cores; sums are in another order, so that the last bit may differ."""
+    from sgsst_core.compiled import kernel_threads
+    from sgsst_core.scene import spherical_harmonics_kernels as kernels
+
+    colours = torch.empty((len(sh_rest), 3))
+    values, points = (tensor.detach().cpu().contiguous().numpy() for tensor in (sh_rest, means))
+    with kernel_threads():
+        kernels.rest_colours(values, points, camera.centre.numpy(), degree, colours.numpy())
     return colours
 
 

@@ -20,6 +20,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import (
     basis,
     kernel_rest_colours,
+    reference_rest_colours,
     rest_colours,
     view_colours,
     view_colours_gradient,
@@ -151,12 +152,25 @@ def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
     scene, view = KERNEL_CASES[name]()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     count = (degree + 1) ** 2 - 1
-    exact = rest_colours(scene.sh_rest.double(), scene.means, view, degree=degree)
+    exact = reference_rest_colours(scene.sh_rest.double(), scene.means, view, degree)
     sizes = scene.sh_rest[:, :count].abs().double().sum(1)
     for sh_rest in (scene.sh_rest, scene.sh_rest[:, :count]):
         found = kernel_rest_colours(sh_rest.to(device), scene.means.to(device), view, degree)
         assert found.dtype == torch.float32
         assert bool(((found.cpu().double() - exact).abs() <= 1e-6 * sizes).all())
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("name", KERNEL_CASES)
+def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: int) -> None:
+    scene, view = KERNEL_CASES[name]()
+    count = (degree + 1) ** 2 - 1
+    exact = reference_rest_colours(scene.sh_rest.double(), scene.means, view, degree)
+    sizes = scene.sh_rest[:, :count].abs().double().sum(1)
+    for sh_rest in (scene.sh_rest, scene.sh_rest[:, :count]):
+        found = rest_colours(sh_rest, scene.means, view, degree=degree)
+        assert found.dtype == torch.float32
+        assert bool(((found.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
 
 
 @pytest.mark.gpu
