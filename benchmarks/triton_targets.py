@@ -19,14 +19,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
+from sgsst_core.features import fused_kernels as statistics_kernels
+from sgsst_core.features.fused_statistics import ENTRIES, POSITIONS, SPAN_VALUES, SPANS, TILE, matrix_precision
+from sgsst_core.loss import fused_kernels as loss_kernels
+from sgsst_core.loss import fused_terms
+from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
 from sgsst_core.rasterizer import triton_kept_kernels as kept_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
+from sgsst_core.scene import spherical_harmonics_triton_kernels as harmonics_kernels
 
 TARGETS = {
     "sm_80": GPUTarget("cuda", 80, 32),
@@ -47,6 +54,10 @@ _TYPES = {
     **dict.fromkeys(("order", "first_slots", "starts", "gaussians", "ends"), "*i64"),
     **dict.fromkeys(("masks", "slot_pieces", "block_pieces", "slot_starts", "block_starts"), "*i32"),
     **dict.fromkeys(("piece_gaussians", "piece_slots"), "*i32"),
+    **dict.fromkeys(("weights", "shift", "firsts", "seconds", "matrix", "mean", "own_mean", "offset"), "*fp32"),
+    **dict.fromkeys(("count", "centred", "target_gram", "target_mean", "target_std", "terms"), "*fp64"),
+    **dict.fromkeys(("positions", "row_step", "column_step", "weight_row_step", "weight_column_step", "spans"), "i32"),
+    **dict.fromkeys(("out_row_step", "out_column_step"), "i32"),
     **dict.fromkeys(("total", "visible", "width", "first_row", "last_row", "across"), "i32"),
 }
 _FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (kept_kernels.HALF_SCALE, "*fp16")}
@@ -74,6 +85,30 @@ def _of_kept_weights(form: str) -> dict[str, Target]:
     }
 
 
+def _of_statistics(form: str) -> dict[str, Target]:
+    """Of the widest layers, with position weights."""
+    features = {"float32": "*fp32", "bfloat16": "*bf16"}[form]
+    matrix = {"CHANNELS": _CHANNELS, "TILE": TILE, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
+    moments = {**matrix, "SPAN": SPAN_VALUES // _CHANNELS, "P": POSITIONS}
+    return {
+        f"shifted_moments_{form}": Target(
+            statistics_kernels.shifted_moments,
+            moments,
+            4,
+            {"features": features, "counts": "*fp32"},
+        ),
+        f"add_style_gradient_{form}": Target(
+            loss_kernels.add_style_gradient,
+            {**matrix, "K": fused_terms.STEP, "P": fused_terms.POSITIONS},
+            4,
+            {"features": features, "gradient": features},
+        ),
+    }
+
+
+_CHANNELS = 512
+_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_LOSS = {"GRAM": GRAM_WEIGHT, "MEAN": MEAN_WEIGHT, "STD": STD_WEIGHT, "EPS": 2.0**-23}
 _ADDED = {"BLOCK": kernels.ADDED.value, "SLOTS": kernels.SLOTS.value}
 KERNELS: dict[str, Target] = {
     "project": Target(
@@ -88,6 +123,26 @@ KERNELS: dict[str, Target] = {
     "count_pieces": Target(kept_kernels.count_pieces, _CUTS, 8),
     **_of_kept_weights("float32"),
     **_of_kept_weights("half"),
+    **_of_statistics("float32"),
+    **_of_statistics("bfloat16"),
+    "add_moments": Target(
+        statistics_kernels.add_moments,
+        {"CHANNELS": _CHANNELS, "TILE": TILE, "ENTRIES": ENTRIES, "S": SPANS},
+        4,
+        {"counts": "*fp32", "mean": "*fp64"},
+    ),
+    "compare": Target(
+        loss_kernels.compare,
+        {**_LOSS, "CHANNELS": _CHANNELS, "ROWS": ENTRIES // _CHANNELS},
+        4,
+        {"mean": "*fp64", "offset": "*fp32"},
+    ),
+    "rest_colours": Target(
+        harmonics_kernels.rest_colours,
+        {"DEGREE": 3, "COEFFICIENTS": 15, "BLOCK": harmonics_kernels.BLOCK.value},
+        4,
+        {"sh_rest": "*fp32", "centre": "*fp64"},
+    ),
 }
 
 
@@ -137,7 +192,7 @@ def main() -> int:
     table = {name: {target: compile_kernel(name, target) for target in TARGETS} for name in KERNELS}
     for name, targets in table.items():
         for target, used in targets.items():
-            print(f"{name:<24}{target:<8}" + "  ".join(f"{key} {value}" for key, value in used.items()), flush=True)
+            print(f"{name:<28}{target:<8}" + "  ".join(f"{key} {value}" for key, value in used.items()), flush=True)
     if arguments.name:
         write_result(arguments.name, {"triton": triton.__version__, "kernels": table})
     return 0

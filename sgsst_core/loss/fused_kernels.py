@@ -60,9 +60,10 @@ def compare(
 def add_style_gradient(
     features, weights, gradient, matrix, mean, offset,
     positions, width, row_step, column_step, weight_row_step, weight_column_step, out_row_step, out_column_step,
-    CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr, PRECISION: tl.constexpr,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, K: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
+    PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """gradient_p += a_p (matrix (F_p - mean) + offset), for P positions and TILE channels a program.
+    """gradient_p += a_p (matrix (F_p - mean) + offset), for P positions and TILE channels a program, K at a time.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
@@ -77,11 +78,11 @@ def add_style_gradient(
     sums = tl.zeros([P, TILE], tl.float32)
     k = tl.zeros([], tl.int32)
     while k < CHANNELS:
-        channel = k + tl.arange(0, TILE)
+        channel = k + tl.arange(0, K)
         centred = load_centred(features, mean, row_step, column_step, width, position, channel, there)
         part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :])
         sums += tl.dot(centred, part, input_precision=PRECISION)
-        k += TILE
+        k += K
     a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
     sums = (sums + tl.load(offset + own)[None, :]) * a[:, None]
     place = (position // width).to(tl.int64) * out_row_step + (position % width).to(tl.int64) * out_column_step

@@ -8,8 +8,8 @@ from torch import Tensor
 from sgsst_core.features.fused_statistics import TILE, block_of_entries, block_of_positions, matrix_precision
 from sgsst_core.features.statistics import LayerStatistics
 
-#: Positions that a program of the gradient takes.
-POSITIONS = 64
+#: Positions that a program of the gradient takes, and channels of theirs at a time: with more, registers spill.
+POSITIONS, STEP = 64, 32
 
 
 def fused_style_loss(
@@ -63,6 +63,6 @@ def fused_add_style_gradient(
     kernels.add_style_gradient[(-(-positions // block), channels // tile)](
         features, weights, gradient, matrix, mean, offset,
         positions, width, *features.stride()[:2], *weights.stride()[:2], *gradient.stride()[:2],
-        CHANNELS=channels, TILE=tile, P=block, WEIGHTED=position_weights is not None,
+        CHANNELS=channels, TILE=tile, K=min(channels, STEP), P=block, WEIGHTED=position_weights is not None,
         PRECISION=matrix_precision(features.dtype),
     )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import Settings
+
+if TYPE_CHECKING:
+    from sgsst_core.settings import Settings
 
 #: Focal length of an orbit's cameras in widths: a field of view of 49 degrees, about that of a phone's main camera.
 ORBIT_FOCAL = 1.1

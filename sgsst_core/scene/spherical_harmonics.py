@@ -3,10 +3,13 @@
     c_j = max(0, 0.5 + SH_C0 * sh_dc_j + sum over l >= 1 of sh_rest_j * Y_l(direction_j))
 
 Only `sh_dc` is ever optimised, so the sum over l >= 1 is frozen: it is computed once per view (`rest_colours`), after
-which a view's colours cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments.
+which a view's colours cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments, but
+for the compiled twins of that sum: Numba's on the CPU, Triton's on a GPU.
 """
 
 from __future__ import annotations
+
+import functools
 
 import torch
 from torch import Tensor
@@ -76,8 +79,8 @@ def rest_colours(
 ) -> Tensor:
     """The frozen part of a view's colours: the sum over l >= 1, [N, 3] in the dtype and on the device of `sh_rest`.
 
-    `degree` leaves out higher bands (that a plan found to be zero, say). Summed in float64 and rounded once. Degree 0
-    is zeros, without any work.
+    `degree` leaves out higher bands (that a plan found to be zero, say). Summed in float64 and rounded once; float32 on
+    a GPU is summed in float32 (`kernel_rest_colours`). Degree 0 is zeros, without any work.
 
     Raises:
         ValueError: K is no number of coefficients of degree 0 to 3, or `degree` is higher than the file's.
@@ -88,15 +91,77 @@ def rest_colours(
     degree = stored if degree is None else degree
     if not 0 <= degree <= stored:
         raise ValueError(f"degree {degree} asked of spherical harmonics of degree {stored}")
-    colours = torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     if degree == 0:
-        return colours
+        return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
+    if sh_rest.dtype == torch.float32 and sh_rest.device.type == "cpu":
+        return _compiled_rest_colours(sh_rest, means, camera, degree)
+    if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and _kernel_runs(sh_rest.device):
+        return kernel_rest_colours(sh_rest, means, camera, degree)
+    return reference_rest_colours(sh_rest, means, camera, degree)
+
+
+def reference_rest_colours(
+    sh_rest: Tensor,  # [N, K, 3]
+    means: Tensor,  # [N, 3]
+    camera: Camera,
+    degree: int,
+) -> Tensor:
+    """`rest_colours` of degree 1 to 3 in tensor functions, in float64, rounded to the dtype of `sh_rest`: [N, 3]."""
+    colours = torch.empty(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     count = (degree + 1) ** 2 - 1
     for start in range(0, sh_rest.shape[0], _CHUNK):
         part = slice(start, start + _CHUNK)
         values = basis(view_directions(means[part], camera.centre), degree)
         colours[part] = torch.einsum("nk,nkc->nc", values, sh_rest[part, :count].double()).to(sh_rest.dtype)
     return colours
+
+
+def _compiled_rest_colours(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
+    """The same on the CPU for float32, on all cores; sums are in another order, so that the last bit may differ."""
+    from sgsst_core.compiled import kernel_threads
+    from sgsst_core.scene import spherical_harmonics_kernels as kernels
+
+    colours = torch.empty((len(sh_rest), 3))
+    values, points = (tensor.detach().cpu().contiguous().numpy() for tensor in (sh_rest, means))
+    with kernel_threads():
+        kernels.rest_colours(values, points, camera.centre.numpy(), degree, colours.numpy())
+    return colours
+
+
+def kernel_rest_colours(
+    sh_rest: Tensor,  # [N, K, 3] float32
+    means: Tensor,  # [N, 3]
+    camera: Camera,
+    degree: int,
+) -> Tensor:
+    """`rest_colours` of degree 1 to 3 in one launch of a Triton kernel: [N, 3] float32.
+
+    Directions are differences of float64; basis and sum are float32: up to 1e-6 of the sum of the coefficients' sizes
+    away from `rest_colours`. On a GPU, or on the CPU where Triton's interpreter is on.
+    """
+    from sgsst_core.scene import spherical_harmonics_triton_kernels as kernels
+
+    count, block = len(sh_rest), kernels.BLOCK.value
+    colours = torch.empty((count, 3), device=sh_rest.device)
+    if count:
+        centre = camera.centre.to(device=sh_rest.device, dtype=torch.float64)
+        kernels.rest_colours[(-(-count // block),)](
+            sh_rest.contiguous(), means.to(sh_rest.device).contiguous(), centre, colours, count,
+            DEGREE=degree, COEFFICIENTS=sh_rest.shape[1], BLOCK=block,
+        )  # fmt: skip
+    return colours
+
+
+@functools.cache
+def _kernel_runs(device: torch.device) -> bool:
+    """Whether the kernel works on a GPU: Triton may be missing, or have no compiler for its launcher."""
+    one, centre = torch.ones((1, 3, 3), device=device), torch.eye(4, dtype=torch.float64)
+    camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, centre)
+    try:
+        found = kernel_rest_colours(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
+    except Exception:  # whatever it is, the tensor functions do the same
+        return False
+    return abs(float(found[0, 0]) - SH_C1) < 1e-6
 
 
 def view_colours(

@@ -37,11 +37,11 @@ def counts() -> Iterator[Counts]:
 
 
 def request_(folder: Path, *, scan: bool = False, **settings: Any) -> StylizeRequest:
-    """A job of two tiny views in three scales, a few steps in each phase."""
+    """A job of two tiny views in two scales, a few steps in each phase."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
-    ply, file, style = write_files(inputs, scene, cameras(2))
+    ply, file, style = write_files(inputs, scene, cameras(2, 32, 32))
     options = {"steps_coarse": 3, "steps_sos": 3, "coarsest_side": 16, "early_stop": False, **settings}
     source = SceneRequest(scene=ply, cameras=file)
     return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
@@ -78,7 +78,7 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
     result = go_on(second)
     assert (result.stopped, result.step, result.report_error) == ("finished", 6, None)
     assert result.bought is not None
-    before, after = read_scene(Path(asked.scene.scene)), read_scene(asked.out)
+    before, after = read_scene(Path(asked.source.scene)), read_scene(Path(asked.out))
     assert not torch.equal(before.sh_dc, after.sh_dc)
     assert torch.isfinite(after.sh_dc).all()
     assert torch.equal(before.means, after.means)

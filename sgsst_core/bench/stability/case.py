@@ -19,7 +19,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult, resize_area
 from sgsst_core.loss.sos_reference import sos_reference
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer import RasterizerName, make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -142,6 +142,11 @@ def repeated(
     )
 
 
+def fast_rasterizers() -> tuple[RasterizerName, ...]:
+    """What is held against `reference`: the rasterizers of processors, and that of GPUs where there is one."""
+    return ("cpu", "cached", "triton") if torch.cuda.is_available() else ("cpu", "cached")
+
+
 def compare_rasterizers(
     scene: Scene,
     view: Camera,
@@ -151,7 +156,7 @@ def compare_rasterizers(
     expected_scene: Scene | None = None,
     keep: Tensor | None = None,
 ) -> CaseResult:
-    """Largest error of `cpu` and `cached` against the float64 reference.
+    """Largest error of `fast_rasterizers` against the float64 reference.
 
     Images and coverage: as a share of the brightest colour, outside pixels where a cut-off hangs by a thread (there
     a step up to LARGEST_STEP is allowed, and counted). Colour gradients: as a share of the largest one.
@@ -174,16 +179,16 @@ def compare_rasterizers(
     gradient = torch.zeros(len(scene), 3, dtype=torch.float64)
     gradient[kept] = reference.colour_gradient(pixels, view)
     error, flipped = 0.0, 0
-    for name in ("cpu", "cached"):
+    for name in fast_rasterizers():
         fast = make_rasterizer(name, scene, near=near)
-        shown = torch.cat([fast.render(colours, view) / brightest, fast.coverage(view)[..., None]], dim=-1)
+        shown = torch.cat([fast.render(colours, view) / brightest, fast.coverage(view)[..., None]], dim=-1).cpu()
         off = (shown.double() - torch.cat([image / brightest, coverage[..., None]], dim=-1)).abs().amax(-1)
         # a step that a cut-off explains is no error, any larger one is
         explained = band & (off > IMAGE_BOUND) & (off <= LARGEST_STEP)
         flipped += int(explained.sum())
         error = _worst(error, off[~explained])
         largest = max(float(gradient.abs().max()) if len(scene) else 0.0, 1e-30)
-        error = _worst(error, (fast.colour_gradient(pixels, view).double() - gradient).abs() / largest)
+        error = _worst(error, (fast.colour_gradient(pixels, view).cpu().double() - gradient).abs() / largest)
     note = f"{flipped} pixels differ by one cut-off" if flipped else ""
     return CaseResult(error, IMAGE_BOUND, note)
 

@@ -31,11 +31,8 @@ from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
-from tests.small_scenes import cameras, style, wall
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -184,6 +181,11 @@ def test_made_by_its_name() -> None:
 
 def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
     """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
+    # The other tests need not even pydantic: they run on a bare machine that has a GPU.
+    from sgsst_core.settings import make_settings
+    from sgsst_core.stylizing.stylizer import Stylizer
+    from tests.small_scenes import cameras, style, wall
+
     settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=16)
     views = cameras(2, 32, 32)  # so small that a step in the interpreter takes seconds
     losses = {}
@@ -214,7 +216,7 @@ def test_kernels_compile_for_real_targets_within_their_registers() -> None:
     ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     lines = re.findall(r"^(\w+) +(\w+) +registers (\d+) +spilled (\d+)", ended.stdout, flags=re.M)
-    assert len(lines) == 12 * 4
+    assert len(lines) == 18 * 4
     for kernel, target, registers, spilled in lines:
         assert int(registers) <= 256, (kernel, target)
         assert int(spilled) <= (128 if target.startswith("gfx") else 0), (kernel, target)

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernel is first imported
+
 from sgsst_core.constants import SH_C0
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import (
     basis,
+    kernel_rest_colours,
+    reference_rest_colours,
     rest_colours,
     view_colours,
     view_colours_gradient,
@@ -102,6 +111,77 @@ def test_directions_of_extreme_length_are_unit_or_zero() -> None:
     directions = view_directions(means, torch.zeros(3, dtype=torch.float64))
     assert directions[0].tolist() == [0, 0, 0]
     assert torch.allclose(directions[1:].norm(dim=-1), torch.ones(3, dtype=torch.float64), atol=1e-12)
+
+
+def far_from_the_origin() -> tuple[Scene, Camera]:
+    scene, view = cloud(300, degree=3), camera(pose=turned_pose())
+    offset = torch.tensor([1e6, -2e6, 1.5e6], dtype=torch.float64)
+    pose = view.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    return replace(scene, means=(scene.means.double() + offset).float()), replace(view, world_to_camera=pose)
+
+
+def at_the_centre() -> tuple[Scene, Camera]:
+    """Also so near to it, and so far, that squares would vanish or overflow."""
+    scene = cloud(5, degree=3)
+    means = torch.tensor([[0.0, 0, 0], [1e-38, 0, 0], [1e38, 1e38, 0], [0, 1e-45, -1e-45], [0, 0, -2.0]])
+    return replace(scene, means=means), camera()
+
+
+def huge_coefficients() -> tuple[Scene, Camera]:
+    """Some of them cancel."""
+    scene = cloud(300, degree=3)
+    sizes = torch.logspace(0, 36, 300)[:, None, None]
+    return replace(scene, sh_rest=scene.sh_rest * sizes), camera(pose=turned_pose())
+
+
+KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
+    "ordinary": lambda: (cloud(300, degree=3), camera(pose=turned_pose())),
+    "camera far from the origin": far_from_the_origin,
+    "a Gaussian at the centre": at_the_centre,
+    "huge coefficients": huge_coefficients,
+    "no Gaussian": lambda: (cloud(0, degree=3), camera()),
+}
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("name", KERNEL_CASES)
+def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
+    """Of a file of that degree, and of one with higher bands that are left out."""
+    pytest.importorskip("triton")
+    scene, view = KERNEL_CASES[name]()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    count = (degree + 1) ** 2 - 1
+    exact = reference_rest_colours(scene.sh_rest.double(), scene.means, view, degree)
+    sizes = scene.sh_rest[:, :count].abs().double().sum(1)
+    for sh_rest in (scene.sh_rest, scene.sh_rest[:, :count]):
+        found = kernel_rest_colours(sh_rest.to(device), scene.means.to(device), view, degree)
+        assert found.dtype == torch.float32
+        assert bool(((found.cpu().double() - exact).abs() <= 1e-6 * sizes).all())
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("name", KERNEL_CASES)
+def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: int) -> None:
+    scene, view = KERNEL_CASES[name]()
+    count = (degree + 1) ** 2 - 1
+    exact = reference_rest_colours(scene.sh_rest.double(), scene.means, view, degree)
+    sizes = scene.sh_rest[:, :count].abs().double().sum(1)
+    for sh_rest in (scene.sh_rest, scene.sh_rest[:, :count]):
+        found = rest_colours(sh_rest, scene.means, view, degree=degree)
+        assert found.dtype == torch.float32
+        assert bool(((found.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
+def test_colours_on_a_gpu_are_those_of_the_kernel() -> None:
+    scene, view = cloud(300, degree=3), camera(pose=turned_pose())
+    sh_rest, means = scene.sh_rest.cuda(), scene.means.cuda()
+    found = rest_colours(sh_rest, means, view)
+    assert torch.equal(found, kernel_rest_colours(sh_rest, means, view, 3))
+    assert torch.allclose(found.cpu(), rest_colours(scene.sh_rest, scene.means, view), atol=1e-5)
+    assert not rest_colours(sh_rest, means, view, degree=0).any()
 
 
 def test_colours_are_clamped_and_the_gradient_follows() -> None:

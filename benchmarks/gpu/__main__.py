@@ -1,0 +1,150 @@
+"""Everything about the GPU of this machine: correctness, seconds, bytes, in one command and one file.
+
+    python -m benchmarks.gpu [--quick] [--only PART ...] [--gaussians 1000000,3000000,6000000] [--out FILE.json]
+
+Needs PyTorch, Triton, NumPy, SciPy, Numba, psutil and safetensors; what needs more (pydantic for a job's settings,
+plyfile for a real scene) is skipped with the reason where that is missing. Takes less than nine minutes. Without a GPU
+it runs in small sizes through Triton's interpreter, which shows that the benchmark works, not how fast anything is.
+Results are in benchmarks/results/gpu_<device>.json. The exit status is 1 if a part has failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.gpu.part import QUICK, Findings, Sizes
+from benchmarks.machine import RESULTS, write_result
+
+#: Seconds that each part may take; 535 in all. The first to run on the CPU compiles its kernels.
+BUDGETS = {"parity": 60, "raster": 100, "network": 40, "step": 90, "curve": 120, "ranks": 45, "tests": 80}
+#: Times as long without a GPU, where a processor may have others to serve, and seconds say nothing.
+_PATIENCE = 5
+#: Packages of this repository: one that is missing is an error, not a reason to skip.
+_OWN = ("api", "benchmarks", "service", "sgsst_core", "tests", "worker")
+
+
+def main() -> int:
+    """Run all parts, or one of them for the process that runs all."""
+    arguments = parse()
+    if not torch.cuda.is_available():
+        os.environ["TRITON_INTERPRET"] = "1"  # read when kernels are first imported, which is in the parts' processes
+    if arguments.findings:
+        return run_part(arguments.only[0], arguments)
+    name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+    parts = {}
+    for part in arguments.only or BUDGETS:
+        parts[part] = in_a_process(part, BUDGETS[part] * (_PATIENCE if arguments.quick else 1))
+        print_part(part, parts[part])
+    figures = {"device": name, "quick": arguments.quick, "torch": torch.__version__, "parts": parts}
+    where = arguments.out or RESULTS / f"gpu_{re.sub(r'[^a-z0-9]+', '_', name.lower()).strip('_')}.json"
+    print(f"\n{write_result(where.stem, figures, where.parent)}")
+    return int(any(part["status"] == "failed" for part in parts.values()))
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small sizes; always so without a GPU")
+    parser.add_argument("--only", nargs="+", choices=tuple(BUDGETS), metavar="PART", help=", ".join(BUDGETS))
+    parser.add_argument("--gaussians", help="numbers of Gaussians, with commas between them")
+    parser.add_argument("--out", type=Path, help="JSON file of the results")
+    parser.add_argument("--findings", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    arguments.quick = arguments.quick or not torch.cuda.is_available()
+    return arguments
+
+
+def sizes_of(arguments: argparse.Namespace) -> Sizes:
+    """What was asked for."""
+    sizes = QUICK if arguments.quick else Sizes()
+    if arguments.gaussians:
+        sizes = replace(sizes, gaussians=tuple(int(count) for count in arguments.gaussians.split(",")))
+    return sizes
+
+
+def in_a_process(part: str, budget: float) -> dict[str, Any]:
+    """Status, seconds and findings of a part; those until its end, where its time was up."""
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path, errors = Path(folder) / "findings.json", Path(folder) / "errors.txt"
+        command = [sys.executable, "-m", "benchmarks.gpu", *_without_parts(sys.argv[1:]), "--only", part]
+        with errors.open("w") as stderr:  # a session of its own: what the part has started ends with it
+            process = subprocess.Popen([*command, "--findings", path], stderr=stderr, start_new_session=True)
+            try:
+                status = process.wait(budget)
+                said = {} if status == 0 else {"reason": f"status {status}: {errors.read_text()[-4000:]}"}
+            except subprocess.TimeoutExpired:
+                said = {"reason": f"its {budget:.0f} seconds were up"}
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        findings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    ended = {"status": "failed", **said} if said else findings.pop("_ended")
+    return {**ended, "seconds": round(time.perf_counter() - started, 1), "found": findings}
+
+
+def _without_parts(arguments: list[str]) -> list[str]:
+    """The options that parts share."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--only", nargs="+")
+    return parser.parse_known_args(arguments)[1]
+
+
+def run_part(part: str, arguments: argparse.Namespace) -> int:
+    """One part, in this process; its findings end with how it ended."""
+    found = Findings(arguments.findings)
+    try:
+        importlib.import_module(f"benchmarks.gpu.{part}").run(sizes_of(arguments), found)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in _OWN:
+            raise
+        found.add("_ended", {"status": "skipped", "reason": f"{error.name} is not installed"})
+    except Exception:
+        found.add("_ended", {"status": "failed", "reason": traceback.format_exc()})
+    else:
+        status = {"status": "failed", "reason": "; ".join(found.broken)} if found.broken else {"status": "succeeded"}
+        found.add("_ended", status)
+    return 0
+
+
+def print_part(part: str, result: dict[str, Any]) -> None:
+    """A part as lines of a table."""
+    print(f"\n{part}: {result['status']}, {result['seconds']} s")
+    if "reason" in result:
+        print(f"  {result['reason']}")
+    for name, value in leaves(result["found"]):
+        print(f"  {name:<58}{value:.5g}" if isinstance(value, float) else f"  {name:<58}{value}", flush=True)
+
+
+def leaves(found: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
+    """Values with their path; of long lists the ends."""
+    lines: list[tuple[str, Any]] = []
+    for name, value in found.items():
+        if isinstance(value, dict):
+            lines += leaves(value, f"{above}{name}/")
+        elif isinstance(value, list) and len(value) > 4:
+            lines.append((above + name, f"{value[0]:.5g} ... {value[-1]:.5g}, {len(value)} values"))
+        else:
+            lines.append((above + name, value))
+    return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""Seconds and bytes on a device."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+
+
+def seconds(action: Callable[[], object], device: torch.device, repeats: int) -> float:
+    """Median of so many calls, after one that does not count: between events on a GPU, by the clock on a CPU."""
+    action()
+    return statistics.median(_once(action, device) for _ in range(repeats))
+
+
+def _once(action: Callable[[], object], device: torch.device) -> float:
+    if device.type != "cuda":
+        started = time.perf_counter()
+        action()
+        return time.perf_counter() - started
+    start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+    start.record()
+    action()
+    end.record()
+    end.synchronize()
+    milliseconds: float = start.elapsed_time(end)
+    return milliseconds / 1e3
+
+
+def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
+    """Wall-clock seconds of one call, until the device has done all of it."""
+    wait(device)
+    started = time.perf_counter()
+    action()
+    wait(device)
+    return time.perf_counter() - started
+
+
+def wait(device: torch.device) -> None:
+    """Until the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def forget_peak(device: torch.device) -> None:
+    """Begin to measure peaks anew, with nothing held that is not in use."""
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_bytes(device: torch.device) -> int | None:
+    """Most bytes of the device in use at a time; None on a CPU."""
+    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

@@ -1,0 +1,90 @@
+"""TFLOP/s of the feature network, forward and backward, and their share of what the device can do."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.gpu.clock import seconds
+from benchmarks.gpu.inputs import network_weights, small_weights, texture
+from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride, use_whole_float32
+
+#: Dense TFLOP/s by the data sheets, by a part of the device's name. The PCIe form of the H100 is a slower one.
+PEAKS: dict[str, dict[str, float]] = {
+    "H200": {"bfloat16": 989, "tf32": 495, "float32": 67},
+    "H100": {"bfloat16": 989, "tf32": 495, "float32": 67},
+    "A100": {"bfloat16": 312, "tf32": 156, "float32": 19.5},
+}
+
+
+def run(sizes: Sizes, found: Findings) -> None:
+    """One square picture through the network in every precision that there is."""
+    weights = small_weights() if sizes == QUICK else network_weights()
+    found.add("network", f"{weights.name}, {weights.source}")
+    found.add("side", sizes.network)
+    use_whole_float32()
+    picture = texture(sizes.network, sizes.network).to(device())
+    exact: dict[str, Tensor] = {}
+    for precision, make in precisions(weights).items():
+        network = make()
+        features = network.forward(picture, keep=False).features
+        exact = exact or features
+        found.add(f"{precision}/error_of_features", max(_error(features[name], exact[name]) for name in exact))
+        for name, action in _passes(network, picture).items():
+            taken = seconds(action, device(), sizes.repeats)
+            rate = flop(weights, sizes.network) * (2 if name == "both" else 1) / taken / 1e12
+            found.add(f"{precision}/{name}", {"seconds": taken, "tflops": rate, "share": share(rate, precision)})
+    if "tf32" not in precisions(weights):
+        found.add("tf32", {"skipped": "the feature network has no such precision"})
+
+
+def precisions(weights: BackboneWeights) -> dict[str, Callable[[], FeatureNetwork]]:
+    """The network by the name of its precision; float32 first."""
+    found: dict[str, dict[str, Any]] = {"float32": {}, "bfloat16": {"dtype": torch.bfloat16}}
+    if "tf32" in inspect.signature(FeatureNetwork).parameters:
+        found["tf32"] = {"tf32": True}
+
+    def make(options: dict[str, Any]) -> Callable[[], FeatureNetwork]:
+        return lambda: FeatureNetwork(weights, STYLE_LAYERS, device=device(), **options)
+
+    return {name: make(options) for name, options in found.items()}
+
+
+def _passes(network: FeatureNetwork, picture: Tensor) -> dict[str, Callable[[], object]]:
+    def add(layer: str, features: Tensor, gradient: Tensor) -> None:
+        gradient.add_(features)
+
+    return {
+        "forward": lambda: network.forward(picture),
+        "both": lambda: network.backward(network.forward(picture), add),
+    }
+
+
+def flop(weights: BackboneWeights, side: int) -> float:
+    """Multiplications and additions of one pass over side x side pixels; back to the pixels they are as many."""
+    deepest = layer_stride(STYLE_LAYERS[-1])
+    total = 0.0
+    for name, (weight, _) in weights.convolutions.items():
+        stride = layer_stride(f"relu{name[4:]}")
+        if stride < deepest or name == "conv5_1":
+            total += 2 * weight.numel() * (side // stride) ** 2
+    return total
+
+
+def share(tflops: float, precision: str) -> float | None:
+    """Of the device's peak; None where that is not known."""
+    if device().type != "cuda":
+        return None
+    name = torch.cuda.get_device_name(device())
+    known = next((peaks for part, peaks in PEAKS.items() if part in name and "PCIe" not in name), None)
+    return tflops / known[precision] if known else None
+
+
+def _error(found: Tensor, exact: Tensor) -> float:
+    return float((found.double() - exact.double()).norm() / exact.double().norm())

@@ -1,0 +1,65 @@
+"""Every rasterizer that works here against `reference` in float64: image, coverage, colour gradient."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from benchmarks.gpu.inputs import surface_scene, views
+from benchmarks.gpu.part import Findings, Sizes, device
+from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+
+#: Relative distance from a cut-off within which float32 may decide otherwise, and bounds of images and gradients.
+#: gsplat projects in float32 and takes exponentials with the fast intrinsic.
+RASTERIZERS: dict[RasterizerName, tuple[float, float, float]] = {
+    "triton": (2e-5, 1e-5, 5e-6),
+    "cached": (2e-5, 1e-5, 5e-6),
+    "cuda": (2e-3, 1e-4, 1e-4),
+}
+BACKGROUND = (1.0, 0.25, 0.5)
+
+
+def run(sizes: Sizes, found: Findings) -> None:
+    """Compare on one view; what cannot be used here is named with the reason, which for `triton` is a failure."""
+    gaussians, width, height = sizes.parity
+    scene, camera = surface_scene(gaussians, degree=3), views(1, width, height)[0]
+    for name, bounds in RASTERIZERS.items():
+        problem = drawing_problem(name, device())
+        if problem and name == "triton":
+            raise RuntimeError(f"rasterizer 'triton': {problem}")
+        if problem:
+            found.add(name, {"skipped": problem})
+            continue
+        compare(make_rasterizer(name, scene, background=BACKGROUND, device=device()), scene, camera, bounds, found)
+
+
+def compare(
+    fast: Rasterizer, scene: Scene, camera: Camera, bounds: tuple[float, float, float], found: Findings
+) -> None:
+    """Errors outside pixels where a cut-off hangs by a thread; how many of those make a step is told."""
+    close, image_bound, gradient_bound = bounds
+    alpha_max = getattr(fast, "alpha_max", None)
+    options = {} if alpha_max is None else {"alpha_max": alpha_max}
+    reference = ReferenceRasterizer(scene, background=BACKGROUND, **options)
+    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+    pixels = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+    band = reference.near_cutoff(camera, close)
+    pixels[band] = 0
+    image = _off(fast.render(colours, camera), reference.render(colours, camera)).amax(-1)
+    coverage = _off(fast.coverage(camera), reference.coverage(camera))
+    expected = reference.colour_gradient(pixels, camera)
+    gradient = float(_off(fast.colour_gradient(pixels, camera), expected).norm() / expected.norm())
+    brightest = max(1.0, float(colours.max()))
+    found.check(f"{fast.name}/image", float(image[~band].max()) / brightest, image_bound)
+    found.check(f"{fast.name}/coverage", float(coverage[~band].max()), image_bound)
+    found.check(f"{fast.name}/gradient", gradient, gradient_bound)
+    found.add(f"{fast.name}/pixels_with_a_step", int((image > image_bound * brightest).sum()))
+
+
+def _off(found: Tensor, expected: Tensor) -> Tensor:
+    return (found.cpu().double() - expected).abs()

@@ -1,0 +1,87 @@
+"""Two ranks on one device give what one rank gives.
+
+NCCL refuses two ranks on one GPU, so that gloo carries the tensors: this is about results, not about speed.
+"""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+from datetime import timedelta
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as multiprocessing
+from torch import Tensor
+
+from benchmarks.gpu.inputs import network_weights, small_weights, surface_scene, texture, views
+from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from worker.ranks.process_group import ProcessGroupCollectives
+
+RANKS, STEPS = 2, 3
+#: Of the first step's gradient, in the Euclidean norm. Near-ties of max pooling may fall the other way.
+GRADIENT_BOUND = 1e-4
+#: Of the colours' change, likewise: Adam moves colours with gradients of rounding's size as far as any others.
+COLOURS_BOUND = 1e-2
+
+
+def run(sizes: Sizes, found: Findings) -> None:
+    """Compare the gradient of the first step, and the colours after a few."""
+    expected_gradient, expected = follow(ALONE, sizes)
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+    with tempfile.TemporaryDirectory() as folder:
+        multiprocessing.spawn(run_rank, (address, folder, sizes), nprocs=RANKS)  # type: ignore[attr-defined]
+        results = [torch.load(Path(folder) / f"{rank}.pt") for rank in range(RANKS)]
+    start = surface_scene(sizes.gaussians[0], degree=3).sh_dc
+    gradient, colours = results[0]
+    found.add("ranks", RANKS)
+    found.check("ranks_that_differ", float(sum(not torch.equal(own[1], colours) for own in results)), 0.0)
+    found.check("gradient", _error(gradient, expected_gradient, torch.zeros(())), GRADIENT_BOUND)
+    found.check("colours", _error(colours, expected, start), COLOURS_BOUND)
+
+
+def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
+    """Gradient of a view before the first step, and colours [N, 3] after all of them."""
+    quick = sizes == QUICK
+    settings = make_settings(
+        "standard", steps_coarse=0, steps_sos=STEPS, early_stop=False, keep=("ranks", "unseen"), rebalance=False,
+        kept_weights="none", coarsest_side=24 if quick else None,
+    )  # fmt: skip
+    width, height = sizes.view
+    stylizer = Stylizer.planned(
+        surface_scene(sizes.gaussians[0], degree=3),
+        views(2, width, height),
+        texture(height, height, seed=3),
+        settings,
+        weights=small_weights() if quick else network_weights(),
+        rasterizer=None if device().type == "cuda" else "triton",
+        collectives=collectives,
+    )
+    gradient = stylizer.gradient(0, range(stylizer.scale_count(0)))[0].cpu()
+    for _ in range(STEPS):
+        stylizer.run_step()
+    return gradient, stylizer.sh_dc.detach().cpu()
+
+
+def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
+    """One rank; writes what it has found."""
+    if device().type == "cpu":
+        torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"tcp://{address}", rank=rank, world_size=RANKS)
+    collectives = ProcessGroupCollectives(dist.group.WORLD, device(), timedelta(seconds=60))
+    try:
+        torch.save(follow(collectives, sizes), Path(folder) / f"{rank}.pt")
+    finally:
+        collectives.close()
+        dist.destroy_process_group()
+
+
+def _error(found: Tensor, expected: Tensor, start: Tensor) -> float:
+    """Relative to how far it is from the start."""
+    return float((found.double() - expected.double()).norm() / (expected.double() - start.double()).norm())

@@ -1,0 +1,82 @@
+"""Seconds and bytes of the rasterizer and of spherical harmonics, by number of Gaussians."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from benchmarks.gpu.clock import forget_peak, peak_bytes, seconds, waited_seconds
+from benchmarks.gpu.inputs import surface_scene, views
+from benchmarks.gpu.part import Findings, Sizes, device
+from sgsst_core.planning.survey import survey
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import kernel_rest_colours
+
+DEGREE = 3
+
+
+def run(sizes: Sizes, found: Findings) -> None:
+    """All sizes without kept weights first: those may take the rest of the time."""
+    found.add("view", sizes.view)
+    cameras = views(2, *sizes.view)
+    for count in sizes.gaussians:
+        scene = surface_scene(count, DEGREE)
+        forget_peak(device())
+        _anew(scene, cameras, f"{count}", sizes.repeats, found)
+        _harmonics(scene, cameras[0], f"{count}/spherical_harmonics", sizes.repeats, found)
+        found.add(f"{count}/device_peak_bytes", peak_bytes(device()))
+    for count in sizes.gaussians:
+        _kept(surface_scene(count), cameras[0], f"{count}/kept_weights", sizes.repeats, found)
+
+
+def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:
+    """Survey, lists, forward and backward with weights computed anew."""
+    rasterizer = TritonRasterizer(scene, device=device(), max_list_bytes=0)  # holds the lists of the last view only
+    survey(scene, cameras, rasterizer)  # compiles
+    looked = waited_seconds(lambda: survey(scene, cameras, rasterizer), device())
+    found.add(f"{place}/survey_seconds_a_view", looked / len(cameras))
+    both = seconds(lambda: [rasterizer.lists(camera) for camera in cameras], device(), repeats)
+    lists = rasterizer.lists(cameras[0])
+    found.add(f"{place}/lists_seconds", both / len(cameras))
+    found.add(f"{place}/lists_bytes", lists.nbytes)
+    found.add(f"{place}/visible", len(lists.gaussians))
+    found.add(f"{place}/pairs", len(lists.ranks))
+    _passes(rasterizer, cameras[0], place, repeats, found)
+
+
+def _passes(rasterizer: Rasterizer, camera: Camera, place: str, repeats: int, found: Findings) -> None:
+    colours, pixels = _operands(rasterizer, camera)
+    found.add(f"{place}/forward_seconds", seconds(lambda: rasterizer.render(colours, camera), device(), repeats))
+    backward = seconds(lambda: rasterizer.colour_gradient(pixels, camera), device(), repeats)
+    found.add(f"{place}/backward_seconds", backward)
+
+
+def _operands(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    scene: Scene = rasterizer.scene  # type: ignore[attr-defined]  # all of them have one
+    colours = torch.rand((len(scene), 3), generator=generator)
+    pixels = torch.randn((camera.height, camera.width, 3), generator=generator)
+    return colours.to(rasterizer.device), pixels.to(rasterizer.device)
+
+
+def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
+    """Of the kernel, which a GPU takes; in the interpreter it is asked for by name."""
+    sh_rest, means = scene.sh_rest.to(device()), scene.means.to(device())
+    taken = seconds(lambda: kernel_rest_colours(sh_rest, means, camera, DEGREE), device(), repeats)
+    found.add(f"{place}/seconds", taken)
+    found.add(f"{place}/gigabytes_per_second", (sh_rest.nbytes + 2 * means.nbytes) / taken / 1e9)
+
+
+def _kept(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
+    """Computing and keeping a view's weights, and both passes with them."""
+    forget_peak(device())
+    rasterizer = make_rasterizer("cached", scene, device=device())
+    colours, _ = _operands(rasterizer, camera)
+    first = waited_seconds(lambda: rasterizer.render(colours, camera), device())
+    found.add(f"{place}/first_render_seconds", first)
+    found.add(f"{place}/bytes", rasterizer.kept_bytes)  # type: ignore[attr-defined]  # `cached` counts them
+    _passes(rasterizer, camera, place, repeats, found)
+    found.add(f"{place}/device_peak_bytes", peak_bytes(device()))

@@ -1,0 +1,61 @@
+"""SOS steps of small and of the largest views: seconds by part, and peak memory against the plan."""
+
+from __future__ import annotations
+
+import statistics
+from typing import get_args
+
+from benchmarks.gpu.clock import forget_peak, peak_bytes, waited_seconds
+from benchmarks.gpu.inputs import network_weights, small_weights, surface_scene, texture, views
+from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from sgsst_core.report.machine import peak_memory
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Precision, make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+
+#: Steps that prepare views, and let libraries choose their algorithms.
+_WARM = 2
+
+
+def run(sizes: Sizes, found: Findings) -> None:
+    """Every size, in every precision on a GPU."""
+    precisions: tuple[Precision, ...] = get_args(Precision) if device().type == "cuda" else ("float32",)
+    for width, height, gaussians in sizes.steps:
+        scene = surface_scene(gaussians, degree=3)
+        for precision in precisions:
+            _measure(sizes, scene, (width, height), precision, found)
+
+
+def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Precision, found: Findings) -> None:
+    width, height = size
+    place = f"{width}x{height}/{precision}"
+    forget_peak(device())
+    quick = sizes == QUICK
+    settings = make_settings(
+        "standard", steps_coarse=0, steps_sos=1000, early_stop=False, precision=precision,
+        coarsest_side=24 if quick else None, kept_weights="none" if quick else None,
+    )  # fmt: skip
+    stylizer = Stylizer.planned(
+        scene,
+        views(_WARM, width, height),
+        texture(height, height, seed=3),
+        settings,
+        weights=small_weights() if quick else network_weights(),
+        rasterizer=None if device().type == "cuda" else "triton",
+    )
+    for _ in range(_WARM):
+        stylizer.run_step()
+    taken = [waited_seconds(stylizer.run_step, device()) for _ in range(sizes.step_repeats)]
+    records = stylizer.history[_WARM:]
+    names = {name for record in records for name in record.parts}
+    parts = {name: statistics.median(record.parts.get(name, 0.0) for record in records) for name in sorted(names)}
+    prediction = stylizer.plan.prediction
+    found.add(f"{place}/gaussians", len(scene))
+    found.add(f"{place}/rasterizer", stylizer.plan.rasterizer)
+    found.add(f"{place}/precision", stylizer.plan.precision)
+    found.add(f"{place}/seconds", statistics.median(taken))
+    found.add(f"{place}/seconds_by_part", parts)
+    found.add(f"{place}/device_peak_bytes", peak_bytes(device()))
+    found.add(f"{place}/process_peak_bytes", peak_memory())
+    found.add(f"{place}/planned_seconds", prediction.seconds if prediction else None)
+    found.add(f"{place}/planned_peak_bytes", prediction.peak_bytes if prediction else None)

@@ -1,0 +1,61 @@
+"""Compiled kernel of `spherical_harmonics.rest_colours` on CPUs: one pass over the coefficients, on all cores.
+
+In float64 like the tensor functions, whose sums it makes in another order. Float32 would be hardly faster, and right to
+six digits only.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from sgsst_core.compiled import compiled
+from sgsst_core.constants import SH_C1, SH_C2, SH_C3
+
+_C20, _C21, _C22, _C23, _C24 = SH_C2
+_C30, _C31, _C32, _C33, _C34, _C35, _C36 = SH_C3
+
+
+@compiled()
+def _direction(means, i, centre):
+    """Unit vector from the camera's centre; 0 at the centre. Scaled first where squares would overflow or vanish."""
+    x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
+    largest = max(abs(x), abs(y), abs(z))
+    if not largest > 0:
+        return 0.0, 0.0, 0.0
+    if not 1e-150 < largest < 1e150:
+        x, y, z = x / largest, y / largest, z / largest
+    inverse = 1 / np.sqrt(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse
+
+
+@compiled(parallel=True)
+def rest_colours(sh_rest, means, centre, degree, out):
+    """Sum over bands 1 to `degree`, [N, 3] float32, of sh_rest [N, K, 3] float32 and means [N, 3]."""
+    for i in numba.prange(out.shape[0]):
+        x, y, z = _direction(means, i, centre)
+        b0, b1, b2 = -SH_C1 * y, SH_C1 * z, -SH_C1 * x
+        if degree == 1:
+            for c in range(3):
+                out[i, c] = b0 * sh_rest[i, 0, c] + b1 * sh_rest[i, 1, c] + b2 * sh_rest[i, 2, c]
+            continue
+        xx, yy, zz = x * x, y * y, z * z
+        b3, b4, b5 = _C20 * x * y, _C21 * y * z, _C22 * (2 * zz - xx - yy)
+        b6, b7 = _C23 * x * z, _C24 * (xx - yy)
+        b8 = b9 = b10 = b11 = b12 = b13 = b14 = 0.0
+        if degree == 3:
+            b8, b9 = _C30 * y * (3 * xx - yy), _C31 * x * y * z
+            b10, b11 = _C32 * y * (4 * zz - xx - yy), _C33 * z * (2 * zz - 3 * xx - 3 * yy)
+            b12, b13, b14 = _C34 * x * (4 * zz - xx - yy), _C35 * z * (xx - yy), _C36 * x * (xx - 3 * yy)
+        for c in range(3):
+            total = b0 * sh_rest[i, 0, c] + b1 * sh_rest[i, 1, c] + b2 * sh_rest[i, 2, c]
+            total += b3 * sh_rest[i, 3, c] + b4 * sh_rest[i, 4, c] + b5 * sh_rest[i, 5, c]
+            total += b6 * sh_rest[i, 6, c] + b7 * sh_rest[i, 7, c]
+            if degree == 3:
+                total += b8 * sh_rest[i, 8, c] + b9 * sh_rest[i, 9, c] + b10 * sh_rest[i, 10, c]
+                total += b11 * sh_rest[i, 11, c] + b12 * sh_rest[i, 12, c]
+                total += b13 * sh_rest[i, 13, c] + b14 * sh_rest[i, 14, c]
+            out[i, c] = total

@@ -1,0 +1,76 @@
+"""GPU kernel of `spherical_harmonics.rest_colours`: one launch a view, in which every coefficient is read once.
+
+The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (TRITON_INTERPRET=1 before the first
+import). Directions are differences of float64, scaled by their largest component before anything is squared; basis and
+sum are float32, as the colours that they become part of.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from sgsst_core.constants import SH_C1, SH_C2, SH_C3
+
+#: Gaussians of one program.
+BLOCK = tl.constexpr(128)
+_C1 = tl.constexpr(SH_C1)
+_C20, _C21, _C22, _C23, _C24 = (tl.constexpr(factor) for factor in SH_C2)
+_C30, _C31, _C32, _C33, _C34, _C35, _C36 = (tl.constexpr(factor) for factor in SH_C3)
+
+
+@triton.jit
+def _term(k: tl.constexpr, factor: tl.constexpr, polynomial, row, own):
+    """Coefficient k times its basis function, factor * polynomial: [BLOCK, 4], the fourth channel 0."""
+    return (polynomial * factor)[:, None] * tl.load(row + 3 * k, mask=own, other=0.0)
+
+
+@triton.jit
+def rest_colours(
+    sh_rest, means, centre, out, total, DEGREE: tl.constexpr, COEFFICIENTS: tl.constexpr, BLOCK: tl.constexpr
+):  # fmt: skip
+    """Sum over bands 1 to DEGREE of BLOCK Gaussians a program.
+
+    Args:
+        sh_rest: [N, COEFFICIENTS, 3] float32.
+        means: [N, 3] float32 or float64.
+        centre: [3] float64, of the camera.
+        out: [N, 3] float32.
+        total: N.
+    """
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = i < total
+    p = i.to(tl.int64)
+    dx = tl.load(means + 3 * p, mask=there, other=0.0).to(tl.float64) - tl.load(centre)
+    dy = tl.load(means + 3 * p + 1, mask=there, other=0.0).to(tl.float64) - tl.load(centre + 1)
+    dz = tl.load(means + 3 * p + 2, mask=there, other=0.0).to(tl.float64) - tl.load(centre + 2)
+    largest = tl.maximum(tl.maximum(tl.abs(dx), tl.abs(dy)), tl.abs(dz))
+    largest = tl.where(largest > 0, largest, 1.0)
+    x, y, z = (dx / largest).to(tl.float32), (dy / largest).to(tl.float32), (dz / largest).to(tl.float32)
+    length = tl.sqrt(x * x + y * y + z * z)  # 1 to sqrt(3), or 0 at the camera's centre
+    length = tl.where(length > 0, length, 1.0)
+    x, y, z = x / length, y / length, z / length
+    # Four channels, the last of them without memory: the three values of a coefficient lie side by side.
+    channel = tl.arange(0, 4)[None, :]
+    own = there[:, None] & (channel < 3)
+    row = sh_rest + (3 * COEFFICIENTS) * p[:, None] + channel
+    colours = _term(0, -_C1, y, row, own) + _term(1, _C1, z, row, own) + _term(2, -_C1, x, row, own)
+    if DEGREE >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        colours += _term(3, _C20, x * y, row, own)
+        colours += _term(4, _C21, y * z, row, own)
+        colours += _term(5, _C22, 2 * zz - xx - yy, row, own)
+        colours += _term(6, _C23, x * z, row, own)
+        colours += _term(7, _C24, xx - yy, row, own)
+        if DEGREE >= 3:
+            colours += _term(8, _C30, y * (3 * xx - yy), row, own)
+            colours += _term(9, _C31, x * y * z, row, own)
+            colours += _term(10, _C32, y * (4 * zz - xx - yy), row, own)
+            colours += _term(11, _C33, z * (2 * zz - 3 * xx - 3 * yy), row, own)
+            colours += _term(12, _C34, x * (4 * zz - xx - yy), row, own)
+            colours += _term(13, _C35, z * (xx - yy), row, own)
+            colours += _term(14, _C36, x * (xx - 3 * yy), row, own)
+    tl.store(out + 3 * p[:, None] + channel, colours, mask=own)

@@ -1,0 +1,65 @@
+"""`python -m benchmarks.gpu` in small sizes: every part runs, and what it writes is what readers of it expect."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("triton")
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).resolve().parents[2]
+PASSES = {"forward_seconds", "backward_seconds"}
+
+
+def benchmark(folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
+    """Exit status and what was written."""
+    out = folder / "gpu.json"
+    command = [sys.executable, "-m", "benchmarks.gpu", "--quick", "--out", str(out), *options]
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    ended = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert out.is_file(), ended.stderr
+    return ended.returncode, json.loads(out.read_text())
+
+
+def test_every_part_succeeds(tmp_path: Path) -> None:
+    status, written = benchmark(tmp_path)
+    parts = written["parts"]
+    assert {name: part.get("reason", part["status"]) for name, part in parts.items()} == dict.fromkeys(
+        ("parity", "raster", "network", "step", "curve", "ranks", "tests"), "succeeded"
+    )
+    assert status == 0
+    assert written["quick"]
+    assert {"date", "machine", "device", "torch"} <= set(written)
+    found = {name: part["found"] for name, part in parts.items()}
+    assert all(found["parity"]["triton"][name]["passed"] for name in ("image", "coverage", "gradient"))
+    for count in ("60", "120"):
+        entry = found["raster"][count]
+        assert PASSES | {"survey_seconds_a_view", "lists_seconds", "lists_bytes", "pairs"} <= set(entry)
+        assert PASSES | {"first_render_seconds", "bytes"} <= set(entry["kept_weights"])
+        assert entry["spherical_harmonics"]["seconds"] > 0
+    for precision in ("float32", "bfloat16"):
+        assert found["network"][precision]["both"]["tflops"] > 0
+    for view in ("32x32", "48x32"):
+        entry = found["step"][view]["float32"]
+        assert entry["rasterizer"] == "triton"
+        assert {"vgg_forward", "vgg_backward", "render", "raster_backward"} <= set(entry["seconds_by_part"])
+        assert entry["planned_peak_bytes"] > 0
+    assert len(found["curve"]["losses"]) == len(found["curve"]["losses_on_the_cpu"]) == 4
+    assert found["curve"]["loss"]["passed"]
+    assert found["ranks"]["colours"]["passed"]
+    assert found["tests"]["failed"] == {}
+
+
+def test_a_part_that_fails_says_why_while_others_go_on(tmp_path: Path) -> None:
+    status, written = benchmark(tmp_path, "--only", "raster", "network", "--gaussians", "0")
+    assert status == 1
+    assert written["parts"]["raster"]["status"] == "failed"
+    assert "ZeroDivisionError" in written["parts"]["raster"]["reason"]
+    assert written["parts"]["raster"]["found"]["view"] == [48, 32]
+    assert written["parts"]["network"]["status"] == "succeeded"

@@ -1,0 +1,66 @@
+"""`deploy/two_hosts.sh`: one job on two hosts, which are namespaces of this machine, from a cold cache."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.features.network_weights import BackboneWeights
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).resolve().parents[2]
+PROBE = "sgsst-probe"
+
+
+def problem() -> str | None:
+    """Why this machine cannot pretend to be two; None where it can."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        return "network namespaces are made by root, on Linux"
+    for tool in ("ip", "unshare", "nsenter"):
+        if shutil.which(tool) is None:
+            return f"{tool} is missing: apt-get install -y iproute2 util-linux"
+    commands = [
+        ["ip", "netns", "add", PROBE],
+        ["ip", "link", "add", PROBE, "type", "bridge"],
+        ["unshare", "--uts", "--pid", "--mount", "--fork", "--mount-proc", "true"],
+    ]
+    try:
+        for command in commands:
+            ended = subprocess.run(command, capture_output=True, text=True)
+            if ended.returncode:
+                return f"{' '.join(command)}: {ended.stderr.strip()}"
+    finally:
+        subprocess.run(["ip", "link", "delete", PROBE], capture_output=True)
+        subprocess.run(["ip", "netns", "delete", PROBE], capture_output=True)
+    return None
+
+
+def test_one_job_on_two_hosts_from_a_cold_cache(tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
+    if reason := problem():
+        pytest.skip(reason)
+    kernels, out = tmp_path / "kernels", tmp_path / "out" / "stylized.ply"
+    environment = {
+        **os.environ,
+        "BIN": str(Path(sys.executable).parent),
+        "NUMBA_CACHE_DIR": str(kernels),  # takes the place of the __pycache__ folders
+    }
+    ended = subprocess.run(
+        [ROOT / "deploy" / "two_hosts.sh", out], env=environment, cwd=ROOT, capture_output=True, text=True
+    )
+    assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
+    assert "Two hosts: 10.77.81.2 and 10.77.81.3" in ended.stdout
+    assert re.search(r"^ranks: host-a \(cpu, \d+ threads\), host-b \(cpu, \d+ threads\)$", ended.stdout, flags=re.M)
+    sent = re.search(r"^sent by host-b over the bridge: ([\d.]+) MB in 20 steps$", ended.stdout, flags=re.M)
+    assert sent is not None, ended.stdout
+    assert float(sent[1]) >= 20
+    assert out.is_file()
+    assert list(kernels.rglob("*.nbi")), "the kernels were not compiled here"
+    left = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
+    left += subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    assert "sgsst-" not in left

@@ -1,0 +1,87 @@
+"""Hard cases through the kernels of GPUs: on a GPU where there is one, else in Triton's interpreter.
+
+The interpreter takes milliseconds for what a GPU does in microseconds, so that what thousands of Gaussians show is
+shown by hundreds here, and by all of them where `sgsst bench stability` runs on a GPU.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.bench.stability import Case, case
+from sgsst_core.bench.stability import gaussian_cases as gaussians
+from sgsst_core.bench.stability import view_cases as views
+from sgsst_core.bench.stability.case import among_ordinary, camera, compare_rasterizers, repeated
+from sgsst_core.scene.gaussians import Scene
+from tests.stability.hard_cases import check
+
+pytest.importorskip("triton")
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's: what is not finite is the case itself
+    *([pytest.mark.gpu] if torch.cuda.is_available() else []),
+]
+#: Below, in a smaller size; files are read before any rasterizer is chosen.
+SMALLER = ("5000", "thousands", "needles", "4096 x 16", "in the file")
+
+
+def rendered_cases() -> list[Case]:
+    """Those that compare rasterizers, but for the large ones."""
+    found = [
+        case
+        for module in (gaussians, views)
+        for case in module.cases()
+        if case.measure == gaussians._IMAGE and not any(part in case.name for part in SMALLER)
+    ]
+    assert len(found) > 25
+    return found
+
+
+def needles() -> Scene:
+    """At every angle of the view, each a million times longer than wide."""
+    half = torch.arange(36) * math.pi / 36 / 2
+    quats = torch.stack([half.cos(), 0.05 * (3 * half).sin(), torch.zeros(36), half.sin()], dim=1)
+    scales = torch.tensor([1e3, 1e-3, 1e-3]).log().repeat(36, 1)
+    return replace(repeated(36, logit=-1.0), quats=quats, scales=scales)
+
+
+def around_the_camera() -> Scene:
+    """The camera is inside every one of them; centres just behind the near plane and farther away."""
+    means = torch.tensor([[0.0, 0.0, 0.21], [0.5, -0.5, 0.3], [-3.0, 2.0, 1.0], [0.0, 1.0, 2.0]])
+    sizes = torch.tensor([0.5, 3.0, 30.0, 1e4]).log()
+    return replace(repeated(4, logit=-1.0), means=means, scales=sizes[:, None].repeat(1, 3))
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "400 faint Gaussians on one pixel": partial(gaussians._stacked, 400, math.log(1.5 / 253.5)),
+    "400 opaque Gaussians on one pixel": partial(gaussians._stacked, 400, 5.0),
+    "hundreds of Gaussians smaller than a pixel": lambda: gaussians._sub_pixel().subset(torch.arange(400)),
+    "needles": needles,
+    "camera inside of Gaussians": around_the_camera,
+}
+
+
+@pytest.fixture(autouse=True)
+def triton_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(case, "fast_rasterizers", lambda: ("triton",))
+
+
+@pytest.mark.parametrize("hard_case", rendered_cases(), ids=lambda hard_case: hard_case.name)
+def test_stays_within_its_bound(hard_case: Case) -> None:
+    check(hard_case)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_stays_within_its_bound_in_a_smaller_size(name: str) -> None:
+    result = compare_rasterizers(among_ordinary(SCENES[name]()), camera())
+    assert result.passed, f"{result.error:.3g}, bound {result.bound:.3g}. {result.note}"
