@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -16,16 +17,16 @@ CHANNELS = 16
 
 
 @functools.cache
-def tiny_weights() -> BackboneWeights:
-    """VGG16's layers with `CHANNELS` channels each and random weights, the same ones in every process.
+def tiny_weights(name: Literal["vgg16", "vgg19"] = "vgg16") -> BackboneWeights:
+    """A network's layers with `CHANNELS` channels each and random weights, the same ones in every process.
 
     For tests that compare one computation with another one, which any network serves for.
     """
     return BackboneWeights(
-        name="vgg16",
+        name=name,
         source="random",
         sha256="0" * 64,
-        convolutions=_random_layers(),
+        convolutions=_random_layers(name),
         input_scale=torch.full((3,), 255.0),
         input_shift=-torch.tensor(CAFFE_MEAN),
     )
@@ -43,11 +44,11 @@ def install_tiny_weights(folder: Path) -> Path:
     return folder
 
 
-def _random_layers() -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+def _random_layers(name: str) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """Convolutions after He et al. (2015), which keep the features' size from layer to layer."""
     generator = torch.Generator().manual_seed(16)
     layers, channels = {}, 3
-    for block, count in enumerate(BLOCKS["vgg16"], start=1):
+    for block, count in enumerate(BLOCKS[name], start=1):
         for index in range(1, count + 1):
             weight = torch.randn(CHANNELS, channels, 3, 3, generator=generator) * (2 / (9 * channels)) ** 0.5
             layers[f"conv{block}_{index}"] = weight, torch.randn(CHANNELS, generator=generator)

@@ -6,12 +6,11 @@ The shift, about which moments are summed in float32, is the mean of some of the
 
 from __future__ import annotations
 
-import functools
-
 import torch
 from torch import Tensor
 
 from sgsst_core.features.statistics import LayerStatistics
+from sgsst_core.scene.spherical_harmonics import triton_runs_on
 
 #: Entries that are summed in float32 before float64 takes over, for each channel: as `statistics.CHUNK_VALUES`.
 SPAN_VALUES = 1 << 20
@@ -87,17 +86,4 @@ def can_be_fused(features: Tensor) -> bool:
 
 def has_kernels(device: torch.device, channels: int) -> bool:
     """Whether there are kernels for layers of so many channels on a device."""
-    return device.type == "cuda" and channels >= 16 and channels.bit_count() == 1 and works_on(device)
-
-
-@functools.cache
-def works_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a device: statistics of a few features are tried, once in a process.
-
-    Triton may be missing, or may find no C compiler for what it builds around its kernels.
-    """
-    try:
-        found = fused_statistics(torch.ones((4, 4, 16), device=device))
-        return float(found.count) == 16 and float(found.mean.sum()) == 16
-    except Exception:  # whatever it is, there is another way
-        return False
+    return device.type == "cuda" and channels >= 16 and channels.bit_count() == 1 and triton_runs_on(device)

@@ -95,7 +95,7 @@ def rest_colours(
         return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     if sh_rest.dtype == torch.float32 and sh_rest.device.type == "cpu":
         return _compiled_rest_colours(sh_rest, means, camera, degree)
-    if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and _kernel_runs(sh_rest.device):
+    if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and triton_runs_on(sh_rest.device):
         return kernel_rest_colours(sh_rest, means, camera, degree)
     return reference_rest_colours(sh_rest, means, camera, degree)
 
@@ -144,7 +144,7 @@ def kernel_rest_colours(
     count, block = len(sh_rest), kernels.BLOCK.value
     colours = torch.empty((count, 3), device=sh_rest.device)
     if count:
-        centre = camera.centre.to(device=sh_rest.device, dtype=torch.float64)
+        centre = camera.centre.to(device=sh_rest.device, dtype=torch.float64, non_blocking=True)
         kernels.rest_colours[(-(-count // block),)](
             sh_rest.contiguous(), means.to(sh_rest.device).contiguous(), centre, colours, count,
             DEGREE=degree, COEFFICIENTS=sh_rest.shape[1], BLOCK=block,
@@ -153,8 +153,11 @@ def kernel_rest_colours(
 
 
 @functools.cache
-def _kernel_runs(device: torch.device) -> bool:
-    """Whether the kernel works on a GPU: Triton may be missing, or have no compiler for its launcher."""
+def triton_runs_on(device: torch.device) -> bool:
+    """Whether Triton's kernels run on a GPU: the one of spherical harmonics is tried, once in a process.
+
+    Triton may be missing, or find no C compiler for what it builds around its kernels.
+    """
     one, centre = torch.ones((1, 3, 3), device=device), torch.eye(4, dtype=torch.float64)
     camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, centre)
     try:

@@ -16,9 +16,12 @@ os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are firs
 
 from sgsst_core.files.ply import read_scene
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.optimiser import is_too_large
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests import networks
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
-from tests.small_scenes import ball, cameras, wall, write_files
+from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
 from worker.request import Resume, SceneRequest, StylizeRequest
@@ -36,12 +39,12 @@ def counts() -> Iterator[Counts]:
         yield found
 
 
-def request_(folder: Path, *, scan: bool = False, **settings: Any) -> StylizeRequest:
-    """A job of two tiny views in two scales, a few steps in each phase."""
+def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 32), **settings: Any) -> StylizeRequest:
+    """A job of two tiny views in two scales or more, a few steps in each phase."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
-    ply, file, style = write_files(inputs, scene, cameras(2, 32, 32))
+    ply, file, style = write_files(inputs, scene, cameras(2, *size))
     options = {"steps_coarse": 3, "steps_sos": 3, "coarsest_side": 16, "early_stop": False, **settings}
     source = SceneRequest(scene=ply, cameras=file)
     return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
@@ -78,7 +81,66 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
     result = go_on(second)
     assert (result.stopped, result.step, result.report_error) == ("finished", 6, None)
     assert result.bought is not None
-    before, after = read_scene(Path(asked.source.scene)), read_scene(Path(asked.out))
+    before, after = (read_scene(path).scene for path in (asked.source.scene, asked.out))
     assert not torch.equal(before.sh_dc, after.sh_dc)
     assert torch.isfinite(after.sh_dc).all()
     assert torch.equal(before.means, after.means)
+
+
+@pytest.mark.parametrize("scan", [False, True])
+def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
+    """One wait more where a view comes for the first time, and its lists are built."""
+    settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
+    stylizer = prepare(request_(tmp_path, scan=scan, size=(64, 48), **settings)).stylizer
+    assert stylizer.scale_count(0) == 3
+    assert stylizer.plan.weighted == scan
+    seen: set[int] = set()
+    for _ in range(stylizer.total):
+        counts.clear()
+        record = stylizer.run_step()
+        first = record.view not in seen
+        seen.add(record.view)
+        assert 1 <= counts.waits.total() <= 1 + first, counts.waits
+        assert counts.copies.total() <= SCALARS * (1 + first), counts.copies
+    assert (record.stage, first) == ("sos", False)
+
+
+@pytest.mark.parametrize("scan", [False, True])
+def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> None:
+    """With VGG19, the larger network, on three scales. The number is the same for views of any size."""
+    settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, position_weights="on" if scan else "off")
+    scene = ball(60) if scan else wall(14, 11, sh_degree=1)
+    stylizer = Stylizer.planned(scene, cameras(1), style(), settings, weights=networks.tiny_weights("vgg19"))
+    assert stylizer.scale_count(0) == 3
+    for _ in range(2):
+        counts.clear()
+        stylizer.run_step()
+    assert counts.waits.total() == 1
+    assert 300 < counts.launches.total() < 500, counts.launches
+
+
+def test_losses_are_those_of_the_cpu(tmp_path: Path) -> None:
+    """Of the same steps: every kernel in its place, with the numbers that it was given."""
+    asked = request_(tmp_path, scan=True, size=(64, 48))
+    expected = prepare(asked).stylizer
+    with pretend_cuda():
+        found = prepare(asked).stylizer
+        for _ in range(expected.total):
+            theirs, ours = expected.run_step(), found.run_step()
+            assert ours.view == theirs.view
+            assert ours.loss == pytest.approx(theirs.loss, rel=2e-4)
+    assert found.plan.device == "cuda"
+    assert expected.plan.device == "cpu"
+
+
+def test_a_gradient_that_cannot_be_squared_changes_nothing(counts: Counts, tmp_path: Path) -> None:
+    stylizer = prepare(request_(tmp_path, learning_rate=0.5)).stylizer
+    stylizer.run_step()
+    before = stylizer.state()
+    optimiser = stylizer._optimiser
+    huge = torch.full_like(stylizer.sh_dc.detach(), 1e20)
+    assert is_too_large(float(optimiser.update(huge, 0.5)))
+    assert is_too_large(float(optimiser.update(huge * torch.nan, 0.5)))
+    after = stylizer.state()
+    assert torch.equal(after.sh_dc, before.sh_dc)
+    assert torch.equal(after.first_moment, before.first_moment)
