@@ -127,7 +127,7 @@ KERNELS: dict[str, Target] = {
     **_of_statistics("bfloat16"),
     "add_moments": Target(
         statistics_kernels.add_moments,
-        {"CHANNELS": _CHANNELS, "TILE": TILE, "ENTRIES": ENTRIES, "S": SPANS},
+        {"CHANNELS": _CHANNELS, "ENTRIES": ENTRIES, "S": SPANS},
         4,
         {"counts": "*fp32", "mean": "*fp64"},
     ),

@@ -79,7 +79,7 @@ def shifted_moments(
 @triton.jit
 def add_moments(
     counts, firsts, seconds, shift, count, mean, centred, spans,
-    CHANNELS: tl.constexpr, TILE: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
+    CHANNELS: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
     """Count, mean and centred second moment of all spans, in float64; ENTRIES of the matrix a program.
 
@@ -90,7 +90,7 @@ def add_moments(
     entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
     i, j = entry // CHANNELS, entry % CHANNELS
     # The lower pairs were not made: their mirror images were.
-    place = tl.where(i // TILE <= j // TILE, entry, j * CHANNELS + i)
+    place = tl.where(i <= j, entry, j * CHANNELS + i)
     n = tl.zeros([S], tl.float64)
     down, across, second = (
         tl.zeros([ENTRIES], tl.float64),

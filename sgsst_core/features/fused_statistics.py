@@ -73,7 +73,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     entries = block_of_entries(channels)
     kernels.add_moments[(channels**2 // entries,)](
         counts, firsts, seconds, shift, count, mean, centred, spans,
-        CHANNELS=channels, TILE=tile, ENTRIES=entries, S=SPANS,
+        CHANNELS=channels, ENTRIES=entries, S=SPANS,
     )  # fmt: skip
     return LayerStatistics(count, mean, centred)
 

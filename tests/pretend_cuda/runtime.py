@@ -77,6 +77,13 @@ class Event:
         return 1e3 * (end._moment - self._moment)
 
 
+class _Selected(nullcontext[None]):
+    """As `torch.cuda.device`: there is one device, which is selected already."""
+
+    def __init__(self, to: Any) -> None:
+        super().__init__()
+
+
 def _set_device(to: Any) -> None:
     """As `torch.cuda.set_device`: it takes a number or a device with one."""
     torch.cuda._utils._get_device_index(to)
@@ -133,7 +140,7 @@ def pretend_cuda() -> Iterator[Counts]:
         "current_stream": lambda *_: one,
         "default_stream": lambda *_: one,
         "stream": lambda *_: nullcontext(),
-        "device": lambda *_: nullcontext(),
+        "device": _Selected,
         "is_current_stream_capturing": lambda: bool(device.recorders),
         "Stream": Stream,
         "Event": Event,

@@ -1,0 +1,122 @@
+"""The pretend device behaves as CUDA does in what it is there to show."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU", allow_module_level=True)
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.runtime import pretend_cuda
+
+pytest.importorskip("triton")
+
+
+@pytest.fixture
+def counts() -> Iterator[Counts]:
+    with pretend_cuda() as found:
+        yield found
+
+
+def numbers() -> Tensor:
+    return torch.arange(6.0).reshape(2, 3).to("cuda")
+
+
+def test_tensors_are_made_moved_and_computed_there(counts: Counts) -> None:
+    there = numbers()
+    made = (torch.zeros(2, device="cuda"), torch.tensor([1.0], device="cuda"), there.new_ones(2), there + 1, there[0])
+    assert all(str(tensor.device) == "cuda:0" for tensor in made)
+    assert there.to("cuda") is there
+    assert torch.equal((2 * there).sum(dim=0).cpu(), torch.tensor([6.0, 10.0, 14.0]))
+    there[0] = 7
+    there.mul_(2)
+    assert there.tolist() == [[14.0] * 3, [6.0, 8.0, 10.0]]
+
+
+def test_what_cuda_refuses_is_refused(counts: Counts) -> None:
+    there = numbers()
+    with pytest.raises(RuntimeError, match="same device"):
+        there + torch.ones(2, 3)
+    with pytest.raises(RuntimeError, match="indices should be"):
+        torch.ones(2)[torch.tensor([0], device="cuda")]
+    for convert in (lambda x: x.numpy(), np.asarray):
+        with pytest.raises(TypeError, match="convert cuda:0"):
+            convert(there)
+    with pytest.raises(ValueError, match="index"):
+        torch.cuda.set_device(torch.device("cuda"))
+    torch.cuda.set_device(torch.device("cuda", 0))
+    assert float((there + torch.tensor(1.0)).sum()) == 21.0  # scalars of the CPU may be mixed in
+
+
+@pytest.mark.parametrize(
+    ("asked", "waits"),
+    [
+        (lambda x: float(x[0, 0]), 1),
+        (lambda x: bool((x > 1).any()), 1),
+        (lambda x: x.tolist(), 1),
+        (lambda x: x.cpu(), 1),
+        (lambda x: x[x > 1], 1),
+        (lambda x: x.nonzero(), 1),
+        (lambda x: torch.tensor([1.0], device="cuda"), 1),
+        (lambda x: torch.ones(3).to("cuda"), 1),
+        (lambda x: torch.ones(3).to("cuda", non_blocking=True), 0),
+        (lambda x: torch.ones(1 << 20).to("cuda", non_blocking=True), 1),
+        (lambda x: torch.ones(1 << 20).pin_memory().to("cuda", non_blocking=True), 0),
+        (lambda x: torch.cuda.synchronize(), 1),
+        (lambda x: torch.where(x > 1, x, 0.0).cumsum(0).sort(), 0),
+        (lambda x: x[:, 1:].T.contiguous() @ x[:, :1], 0),
+    ],
+)
+def test_waits_of_the_host_are_counted(counts: Counts, asked: Callable[[Tensor], object], waits: int) -> None:
+    there = numbers()
+    counts.clear()
+    asked(there)
+    assert counts.waits.total() == waits
+
+
+def test_launches_and_bytes_are_counted(counts: Counts) -> None:
+    there = numbers()
+    assert counts.copies.total() == 24
+    counts.clear()
+    there[0].view(3, 1).expand(3, 4)  # views
+    torch.empty(5, device="cuda")
+    assert counts.launches.total() == 0
+    there.mul_(2).add(1).sum()
+    assert counts.launches.total() == 3
+    assert counts.copies.total() == 0
+
+
+def test_events_tell_times_only_where_they_were_asked_to(counts: Counts) -> None:
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    begin.record()
+    with pytest.raises(RuntimeError, match="must be recorded"):
+        begin.elapsed_time(end)
+    end.record()
+    assert begin.elapsed_time(end) >= 0
+    with pytest.raises(ValueError, match="enable_timing"):
+        begin.elapsed_time(torch.cuda.Event())
+
+
+def test_threads_that_begin_meanwhile_see_it_too(counts: Counts) -> None:
+    found: list[str] = []
+    thread = threading.Thread(target=lambda: found.append(str(torch.zeros(2, device="cuda").device)))
+    thread.start()
+    thread.join()
+    assert found == ["cuda:0"]
+
+
+def test_afterwards_it_is_gone() -> None:
+    with pretend_cuda():
+        assert torch.cuda.is_available()
+    assert not torch.cuda.is_available()
+    with pytest.raises((RuntimeError, AssertionError)):
+        torch.zeros(2, device="cuda")

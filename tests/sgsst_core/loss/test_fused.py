@@ -1,0 +1,162 @@
+"""Statistics, style loss and its gradient by Triton kernels, against float64: on a GPU, else in the interpreter."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from torch import Tensor
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.features.fused_statistics import fused_statistics
+from sgsst_core.features.statistics import LayerStatistics, layer_statistics_reference
+from sgsst_core.loss import terms
+from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
+from sgsst_core.loss.terms import LayerTarget, StyleGradient, style_loss
+from tests.sgsst_core.pictures import relative_error
+
+pytest.importorskip("triton")
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
+WEIGHTS = (terms.GRAM_WEIGHT, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
+
+
+def features(height: int, width: int, channels: int, seed: int, mean: float = 0.0) -> Tensor:
+    """The inner part of a larger map, as a tile owns it, float32, with channels that depend on each other."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn((height + 3, width + 2, channels), generator=generator)
+    mixed = (x @ torch.randn((channels, channels), generator=generator) / channels**0.5).relu() + mean
+    return mixed.to(DEVICE)[1 : height + 1, 2:]
+
+
+def position_weights(height: int, width: int) -> Tensor:
+    """Rows of 0, as beside a silhouette, and weights in 0..1."""
+    weights = torch.rand((height + 2, width), generator=torch.Generator().manual_seed(7))
+    weights[:5] = 0
+    return weights.to(DEVICE)[2:]
+
+
+def target_of(channels: int) -> LayerTarget:
+    reference = layer_statistics_reference(features(20, 30, channels, seed=9, mean=0.3).cpu())
+    return LayerTarget(*(part.to(DEVICE) for part in (reference.gram(), reference.mean, reference.std())))
+
+
+def on_cpu(statistics: LayerStatistics) -> LayerStatistics:
+    return LayerStatistics(statistics.count.cpu(), statistics.mean.cpu(), statistics.centred.cpu())
+
+
+def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tuple[Tensor, Tensor]:
+    """Terms [4] and gradient [h, w, c] of features x; it is added, and nothing around it is touched."""
+    found, *maps = fused_style_loss(
+        fused_statistics(x, weights), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23
+    )
+    around = torch.zeros((x.shape[0] + 2, x.shape[1] + 2, x.shape[2]), dtype=x.dtype, device=x.device)
+    gradient = around[1:-1, 1:-1]
+    fused_add_style_gradient(gradient, x, maps[0], maps[1], maps[2], weights)
+    once = gradient.clone()
+    fused_add_style_gradient(gradient, x, maps[0], maps[1], maps[2], weights)
+    assert torch.equal(gradient, 2 * once)
+    gradient.zero_()
+    assert not around.any()
+    return found.cpu(), once.cpu()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(("channels", "height", "width"), [(16, 50, 40), (64, 150, 200), (128, 40, 33), (512, 9, 31)])
+def test_agrees_with_float64(channels: int, height: int, width: int, weighted: bool) -> None:
+    """64 channels at this size are summed in more than one span."""
+    x = features(height, width, channels, seed=1)
+    a = position_weights(height, width) if weighted else None
+    found, exact = on_cpu(fused_statistics(x, a)), layer_statistics_reference(x.cpu(), None if a is None else a.cpu())
+    assert float(found.count) == pytest.approx(float(exact.count), rel=1e-6)
+    assert relative_error(found.mean, exact.mean) < 1e-6
+    assert relative_error(found.centred, exact.centred) < 3e-6
+    assert torch.equal(found.centred, found.centred.T)
+    target = target_of(channels)
+    terms_, gradient = fused_gradient(x, a, target)
+    exact_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
+    expected, map_ = style_loss(exact, exact_target, feature_eps=2.0**-23)
+    assert relative_error(terms_, expected) < 1e-5
+    assert relative_error(gradient, map_.apply(x.cpu().double(), None if a is None else a.cpu())) < 1e-4
+
+
+def test_survives_a_large_mean_to_sigma_ratio() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x, style = (
+        (1e4 + spread * torch.randn((60, 50, 16), generator=generator, dtype=torch.float64)).float()
+        for spread in (1, 2)
+    )
+    exact = layer_statistics_reference(x)
+    assert relative_error(on_cpu(fused_statistics(x.to(DEVICE))).std(), exact.std()) < 1e-6
+    reference = layer_statistics_reference(style)
+    target = LayerTarget(reference.gram(), reference.mean, reference.std())
+    _, expected = style_loss(exact, target)
+    on_device = LayerTarget(*(part.to(DEVICE) for part in (target.gram, target.mean, target.std)))
+    found, *maps = fused_style_loss(
+        fused_statistics(x.to(DEVICE)), (on_device.gram, on_device.mean, on_device.std), WEIGHTS, 2.0**-23
+    )
+    gradient = torch.zeros_like(x, device=DEVICE)
+    fused_add_style_gradient(gradient, x.to(DEVICE), maps[0], maps[1], maps[2])
+    assert torch.isfinite(found).all()
+    assert relative_error(gradient.cpu(), expected.apply(x.double())) < 1e-4
+
+
+@pytest.mark.parametrize("dead_in", ["view", "style", "both"])
+def test_dead_and_constant_channels_give_finite_gradients(dead_in: str) -> None:
+    view, style = features(17, 23, 16, seed=1), features(17, 23, 16, seed=2)
+    for name, x in (("view", view), ("style", style)):
+        if dead_in in (name, "both"):
+            x[..., :3] = 0
+            x[..., 3:6] = 123.4
+    reference = layer_statistics_reference(style.cpu())
+    target = LayerTarget(*(part.to(DEVICE) for part in (reference.gram(), reference.mean, reference.std())))
+    terms_, gradient = fused_gradient(view, None, target)
+    assert torch.isfinite(gradient).all()
+    assert torch.isfinite(terms_).all()
+    assert float(terms_.sum()) > 0
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (0, 7)])
+def test_without_any_weight_all_is_nothing(shape: tuple[int, int]) -> None:
+    x = features(*shape, 16, seed=1) if shape[0] else torch.zeros((*shape, 16), device=DEVICE)
+    a = torch.zeros(shape, device=DEVICE)
+    found = on_cpu(fused_statistics(x, a))
+    assert found.empty
+    assert not found.mean.any()
+    assert not found.centred.any()
+    target = target_of(16)
+    terms_, *maps = fused_style_loss(fused_statistics(x, a), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)
+    assert not terms_.any()
+    assert not any(map_.any() for map_ in (maps[0], maps[2]))
+
+
+def test_bfloat16_features_are_summed_in_float32() -> None:
+    x = features(40, 60, 32, seed=3).bfloat16()
+    exact = layer_statistics_reference(x.cpu())
+    found = on_cpu(fused_statistics(x))
+    # In the interpreter products are whole; TF32, which a GPU takes for them, keeps three digits.
+    assert relative_error(found.centred, exact.centred) < (2e-3 if DEVICE == "cuda" else 3e-6)
+    target = target_of(32)
+    _, gradient = fused_gradient(x, None, target)
+    cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
+    assert relative_error(gradient.double(), style_loss(exact, cpu_target)[1].apply(x.cpu().double())) < 1e-2
+
+
+def test_repeats_to_the_bit() -> None:
+    x, a = features(60, 70, 64, seed=4), position_weights(60, 70)
+    first, second = fused_statistics(x, a), fused_statistics(x, a)
+    assert torch.equal(first.centred, second.centred)
+    assert torch.equal(first.mean, second.mean)
+
+
+def test_a_map_made_by_kernels_is_applied_by_the_tensor_functions_too() -> None:
+    """Where features lie otherwise in memory than the kernels read them."""
+    x, target = features(12, 14, 16, seed=5), target_of(16)
+    _, *maps = fused_style_loss(fused_statistics(x), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)
+    found = StyleGradient(maps[0].cpu(), maps[1].cpu(), maps[2].cpu()).apply(x.cpu())
+    gradient = torch.zeros_like(x)
+    fused_add_style_gradient(gradient, x, maps[0], maps[1], maps[2])
+    assert relative_error(gradient.cpu(), found.double()) < 1e-5
