@@ -8,23 +8,28 @@ import multiprocessing
 import socket
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import nullcontext
 from datetime import timedelta
 from typing import Any
 
 import torch
 
+from tests.pretend_cuda.runtime import pretend_cuda
 from worker.ranks.process_group import process_group
 
 MOST_RANKS = 4
 
 
-def on_ranks(size: int, function: Callable[..., Any], *arguments: Any, timeout: float = 60.0) -> list[Any]:
+def on_ranks(
+    size: int, function: Callable[..., Any], *arguments: Any, timeout: float = 60.0, device: str = "cpu"
+) -> list[Any]:
     """What function(collectives, *arguments) returns on each rank; its first error is raised here.
 
-    The function and its arguments must be picklable. Ranks give each other up after `timeout` seconds.
+    The function and its arguments must be picklable. Ranks give each other up after `timeout` seconds. On the device
+    "cuda" each rank has a pretend GPU.
     """
     address = f"127.0.0.1:{free_port()}"
-    futures = [_pool().submit(_run, rank, size, address, timeout, function, arguments) for rank in range(size)]
+    futures = [_pool().submit(_run, rank, size, address, timeout, device, function, arguments) for rank in range(size)]
     return [_result(future) for future in futures]
 
 
@@ -37,10 +42,19 @@ def _pool() -> ProcessPoolExecutor:
 
 
 def _run(
-    rank: int, size: int, address: str, timeout: float, function: Callable[..., Any], arguments: tuple[Any, ...]
+    rank: int,
+    size: int,
+    address: str,
+    timeout: float,
+    device: str,
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
 ) -> Any:
     torch.set_num_threads(1)
-    with process_group(rank, size, address, timeout=timedelta(seconds=timeout)) as collectives:
+    with (
+        pretend_cuda() if device == "cuda" else nullcontext(),
+        process_group(rank, size, address, device=device, timeout=timedelta(seconds=timeout)) as collectives,
+    ):
         return function(collectives, *arguments)
 
 

@@ -1,0 +1,86 @@
+"""Count what a step asks of a GPU, on a pretend one: kernels, waits of the host, bytes copied, line by line.
+
+    python -m benchmarks.device_counts [--size 980x545] [--name device_counts]
+
+VGG19's layers with random weights, three scales, a scene without a surround and a scan, whose statistics are weighted.
+Kernels are those that PyTorch's operations launch one by one; a library may take a few more for one of them. The image
+is computed in Triton's interpreter and takes minutes; the counts are the same for views of any size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import Any
+
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from benchmarks.machine import write_result
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import tiny_weights
+from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.runtime import pretend_cuda
+from tests.small_scenes import ball, cameras, style, wall
+
+
+def counted(scan: bool, precision: str, size: tuple[int, int]) -> dict[str, Any]:
+    """Counts of the first step of a view, and of a later one."""
+    settings = make_settings(
+        steps_coarse=0,
+        steps_sos=2,
+        coarsest_side=max(16, min(size) // 4),
+        position_weights="on" if scan else "off",
+        precision=precision,
+    )
+    scene = ball(60) if scan else wall(14, 11, sh_degree=1)
+    with pretend_cuda() as counts:
+        stylizer = Stylizer.planned(scene, cameras(1, *size), style(), settings, weights=tiny_weights("vgg19"))
+        steps = []
+        for _ in range(2):
+            counts.clear()
+            stylizer.run_step()
+            steps.append(counts.copy())
+    return {
+        "scales": stylizer.scale_count(0),
+        "rasterizer": stylizer.plan.rasterizer,
+        "first": totals(steps[0]),
+        "steady": totals(steps[1]),
+        "lines": {kind: dict(getattr(steps[1], kind).most_common()) for kind in ("launches", "waits", "copies")},
+    }
+
+
+def totals(counts: Counts) -> dict[str, int]:
+    """Of all lines."""
+    return {kind: getattr(counts, kind).total() for kind in ("launches", "waits", "copies")}
+
+
+def main() -> int:
+    """Count and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", default="64x48", help="of the view, WIDTHxHEIGHT")
+    parser.add_argument("--name", default=None, help="of the file in benchmarks/results; none is written without it")
+    arguments = parser.parse_args()
+    width, height = (int(side) for side in arguments.size.split("x"))
+    found = {}
+    for scan in (False, True):
+        for precision in ("float32", "bfloat16"):
+            name = f"{'scan' if scan else 'scene'}, {precision}"
+            found[name] = counted(scan, precision, (width, height))
+            print(f"{name}: {found[name]['scales']} scales", flush=True)
+            for step in ("first", "steady"):
+                print(
+                    f"  {step:<8}" + "  ".join(f"{key} {value}" for key, value in found[name][step].items()), flush=True
+                )
+    for kind, lines in found["scan, float32"]["lines"].items():
+        print(f"{kind} of a steady step, scan, float32")
+        for line, count in lines.items():
+            print(f"  {count:>6}  {line}")
+    if arguments.name:
+        write_result(arguments.name, {"size": [width, height], **found})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,72 @@
+"""Ranks with a pretend CUDA device each, over gloo: the run of one rank, and what their steps wait for."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from torch import Tensor
+
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import tiny_weights
+from tests.pretend_cuda.device import counts
+from tests.sgsst_core.pictures import relative_error
+from tests.small_scenes import ball, cameras, style
+from tests.worker.ranks.spawn import on_ranks
+
+pytest.importorskip("triton")
+STEPS = 4
+
+
+def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int], str]:
+    """Colours, losses and waits of a few steps of one view in two scales; the rasterizer."""
+    settings = make_settings(steps_coarse=0, steps_sos=STEPS, coarsest_side=16, keep=("ranks",), rebalance=False)
+    stylizer = Stylizer.planned(
+        ball(60), cameras(1, 48, 32), style(), settings, weights=tiny_weights(), collectives=collectives
+    )
+    losses, waits = [], []
+    for _ in range(STEPS):
+        counts.clear()
+        losses.append(stylizer.run_step().loss)
+        waits.append(counts.waits.total())
+    return stylizer.stylized(), losses, waits, f"{stylizer.plan.device} {stylizer.plan.anew}"
+
+
+def test_two_ranks_make_the_steps_of_one_and_wait_once_in_each() -> None:
+    """Exchanges are the communication library's: it waits for the other ranks, not the step for its device."""
+    expected, losses, _, _ = run_steps(ALONE)
+    first, second = on_ranks(2, run_steps, device="cuda")
+    assert first[2][2:] == second[2][2:] == [1] * (STEPS - 2)
+    assert torch.equal(first[0], second[0])
+    assert first[1] == second[1]
+    assert first[3] == second[3] == "cuda triton"
+    assert first[1] == pytest.approx(losses, rel=1e-4)
+    assert relative_error(first[0], expected.double()) < 1e-3
+
+
+def merge_three(collectives: Collectives) -> list[tuple[Tensor, Tensor]]:
+    """Statistics of three scales under way at once, on the stream of exchanges."""
+    own = torch.randn(9 + collectives.rank, 7, 16, generator=torch.Generator().manual_seed(collectives.rank))
+    part = layer_statistics(own.to("cuda"))
+    numbers = torch.ones(1, dtype=torch.float64, device="cuda")
+    waiting = [collectives.all_reduce_statistics([part], numbers * turn) for turn in range(3)]
+    return [(found[0].gram().cpu(), added.cpu()) for found, added in (wait() for wait in waiting)]
+
+
+def test_statistics_merge_on_a_stream_of_their_own() -> None:
+    every = torch.cat(
+        [torch.randn(9 + rank, 7, 16, generator=torch.Generator().manual_seed(rank)) for rank in range(2)]
+    )
+    expected = layer_statistics_reference(every).gram()
+    for result in on_ranks(2, merge_three, device="cuda"):
+        for turn, (gram, added) in enumerate(result):
+            assert relative_error(gram, expected) < 1e-6
+            assert float(added) == 2 * turn
