@@ -175,7 +175,7 @@ class Views:
         return self._bands[index][self.collectives.rank]
 
     def content(self, index: int) -> Tensor:
-        """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
+        """Content image [H, W, 3]: the photo, on the GPU where there is one; or the render of the unstylized scene."""
         if self._ahead is not None:
             return self._ahead(index)
         if self._photos is not None:

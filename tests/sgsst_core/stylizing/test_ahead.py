@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are firs
 
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.images import load_photo, save_png
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.ahead import PhotosAhead
 from sgsst_core.stylizing.loop import run
@@ -39,22 +41,29 @@ STUCK = 60.0
 
 
 class Photos:
-    """Reads pictures, and remembers which and in which thread.
+    """Reads photos from files, and remembers which and in which thread.
 
     Args:
-        broken: index of the photo that cannot be read.
+        folder: into which they are written.
+        broken: index of the photo whose file ends too soon.
+        side: of the photos as they are read.
 
     Attributes:
         asked: indices in the order in which they were read.
         here: those of them that were read in the thread that made this object.
     """
 
-    def __init__(self, broken: int | None = None) -> None:
+    def __init__(self, folder: Path, broken: int | None = None, side: int = SIDE) -> None:
         self.asked: list[int] = []
         self.here: list[int] = []
-        self._broken = broken
         self._thread = threading.current_thread()
         self._changed = threading.Condition()
+        self._cameras = cameras(VIEWS, side, side)
+        self._paths = [folder / f"{index}.png" for index in range(VIEWS)]
+        for index, path in enumerate(self._paths):
+            save_png(path, picture(2 * side, 2 * side, seed=index, dtype=torch.float32))
+            if index == broken:
+                path.write_bytes(path.read_bytes()[:-100])
 
     def __call__(self, index: int) -> Tensor:
         with self._changed:
@@ -62,9 +71,11 @@ class Photos:
             if threading.current_thread() is self._thread:
                 self.here.append(index)
             self._changed.notify_all()
-        if index == self._broken:
-            raise ImageError(f"photo {index}: is truncated")
-        return picture(SIDE, SIDE, seed=index, dtype=torch.float32)
+        return self.read(index)
+
+    def read(self, index: int) -> Tensor:
+        """Without remembering it."""
+        return load_photo(self._paths[index], self._cameras[index])
 
     def wait_for(self, count: int) -> None:
         """Until so many were read."""
@@ -102,10 +113,10 @@ def on_host(tensor: Tensor) -> Tensor:
 
 
 def test_a_step_reads_the_next_photo_and_waits_once(
-    tiny_weights: BackboneWeights, counts: Counts, monkeypatch: pytest.MonkeyPatch
+    tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two rounds of the views: in the first one, what is kept of each view is made."""
-    photos = Photos()
+    photos = Photos(tmp_path)
     stylizer = make(tiny_weights, photos)
     gradient = stylizer.views.gradient
 
@@ -128,12 +139,17 @@ def test_a_step_reads_the_next_photo_and_waits_once(
     assert not threads()
 
 
-@pytest.mark.parametrize("views_per_step", [1, 2])
+@pytest.mark.parametrize(("steps", "views_per_step"), [(3, 1), (2, 2)])
 def test_losses_are_those_of_photos_read_when_they_are_needed(
-    tiny_weights: BackboneWeights, counts: Counts, views_per_step: int, monkeypatch: pytest.MonkeyPatch
+    tiny_weights: BackboneWeights,
+    counts: Counts,
+    tmp_path: Path,
+    steps: int,
+    views_per_step: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    options: dict[str, Any] = {"steps_sos": 3, "views_per_step": views_per_step}
-    photos, plain = Photos(), Photos()
+    options: dict[str, Any] = {"steps_sos": steps, "views_per_step": views_per_step}
+    photos, plain = Photos(tmp_path), Photos(tmp_path)
     stylizer, expected = make(tiny_weights, photos, **options), make(tiny_weights, plain, **options)
     monkeypatch.setattr(expected.views, "look_ahead", lambda *_: None)
     assert run(stylizer) == run(expected) == "finished"
@@ -144,45 +160,47 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
     assert not threads()
 
 
-def test_photos_whose_features_are_kept_are_read_once(tiny_weights: BackboneWeights, counts: Counts) -> None:
-    photos = Photos()
+def test_photos_whose_features_are_kept_are_read_once(
+    tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
+) -> None:
+    photos = Photos(tmp_path)
     run(make(tiny_weights, photos, keep=()))
     assert sorted(photos.asked) == list(range(VIEWS))
 
 
 def test_a_photo_that_cannot_be_read_ends_the_job_in_the_step_that_needs_it(
-    tiny_weights: BackboneWeights, counts: Counts
+    tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
 ) -> None:
-    stylizer = make(tiny_weights, Photos(broken=drawn()[1]))
-    with pytest.raises(ImageError, match=f"photo {drawn()[1]}: is truncated"):
+    stylizer = make(tiny_weights, Photos(tmp_path, broken=drawn()[1]))
+    with pytest.raises(ImageError, match=rf"{drawn()[1]}\.png: is truncated"):
         run(stylizer)
     assert stylizer.step == 1
     assert not threads()
 
 
-def test_on_a_cpu_there_is_no_thread(tiny_weights: BackboneWeights) -> None:
-    photos = Photos()
+def test_on_a_cpu_there_is_no_thread(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+    photos = Photos(tmp_path)
     run(make(tiny_weights, photos))
     assert photos.here == photos.asked == drawn()
 
 
-def test_photos_come_out_as_they_were_read(counts: Counts) -> None:
-    photos = Photos()
+def test_photos_come_out_as_they_were_read(counts: Counts, tmp_path: Path) -> None:
+    photos = Photos(tmp_path, side=160)  # CUDA takes 64 KB along without a wait, pinned or not
     ahead = PhotosAhead(photos, DEVICE)
     ahead.begin(1)
     ahead.begin(1)  # already under way
-    assert torch.equal(on_host(ahead(2)), picture(SIDE, SIDE, seed=2, dtype=torch.float32))  # out of turn
-    assert torch.equal(on_host(ahead(1)), picture(SIDE, SIDE, seed=1, dtype=torch.float32))
+    assert torch.equal(on_host(ahead(2)), photos.read(2))  # out of turn
+    assert torch.equal(on_host(ahead(1)), photos.read(1))
     assert sorted(photos.asked) == [1, 2]
     assert photos.here == [2]
     assert not counts.waits
-    assert counts.copies.total() == 2 * PHOTO_BYTES
+    assert counts.copies.total() == 2 * 160 * 160 * 3 * 4
     ahead.end()
     assert not threads()
 
 
-def test_a_photo_that_nobody_asks_for_is_given_up_with_its_error(counts: Counts) -> None:
-    photos = Photos(broken=0)
+def test_a_photo_that_nobody_asks_for_is_given_up_with_its_error(counts: Counts, tmp_path: Path) -> None:
+    photos = Photos(tmp_path, broken=0)
     ahead = PhotosAhead(photos, DEVICE)
     ahead.begin(0)
     photos.wait_for(1)
