@@ -66,6 +66,10 @@ class Shelf(Generic[K, V]):
             self.used += size
         return value
 
+    def __contains__(self, key: K) -> bool:
+        """Whether the value of a key is kept."""
+        return key in self._kept
+
     def holds(self, key: K, size: int) -> bool:
         """Whether the value of a key is kept, or would be: there is room for so many bytes."""
         return key in self._kept or self.used + size <= self._capacity

@@ -18,9 +18,9 @@ from sgsst_core.loss.convergence import has_converged, has_reached
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.views import PhotoLoader
 
 Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interrupted"]
 
@@ -64,7 +64,14 @@ class Callbacks:
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     """Iterate to the end of the schedule, or until one of the settings' limits or `callbacks.stop` ends it before."""
-    callbacks = callbacks or Callbacks()
+    try:
+        return _iterate(stylizer, callbacks or Callbacks())
+    finally:
+        stylizer.views.end_look_ahead()
+
+
+def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
+    """As `run`, which clears up after it."""
     started, before = time.perf_counter(), stylizer.step
     last_checkpoint = last_preview = started
     _measure(stylizer, callbacks)

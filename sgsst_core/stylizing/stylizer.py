@@ -28,6 +28,7 @@ from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
     StyleTargets,
@@ -41,7 +42,7 @@ from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
-from sgsst_core.stylizing.views import PhotoLoader, Views
+from sgsst_core.stylizing.views import Views
 from sgsst_core.stylizing.warm_start import warm_start
 from sgsst_core.timing import Timer
 
@@ -291,10 +292,12 @@ class Stylizer:
         gradient: Tensor | None = None
         results = []
         self._cost = 0
-        for index in views[self._team.own_group :: self._team.groups]:
+        own_views = views[self._team.own_group :: self._team.groups]
+        for place, index in enumerate(own_views):
             scales = phase.scales(self.scale_count(index))
             with self.timer("prepare"):
                 target = self.views.target(index, scales)
+                self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])
             assert target.share is not None
             self._cost += target.share.cost(self.group.rank, self.network.halo)
@@ -354,6 +357,23 @@ class Stylizer:
             covered = self.views.covered
             self._queue = [covered[i] for i in torch.randperm(len(covered), generator=self._generator).tolist()]
         return self._queue.pop()
+
+    def _look_ahead(self, left: Sequence[int], phase: Phase) -> None:
+        """Name the view that this group takes next, so that what it needs can be read while the device works.
+
+        The queue is looked at, not filled: the order of views is drawn when it is needed, as checkpoints expect.
+
+        Args:
+            left: this group's views that are left in the present step.
+            phase: of the present step.
+        """
+        if left:
+            index = left[0]
+        elif self.step + 1 < self.total and len(self._queue) > self._team.own_group:
+            index, phase = self._queue[-1 - self._team.own_group], phase_at(self.schedule, self.step + 1)
+        else:
+            return
+        self.views.look_ahead(index, phase.scales(self.scale_count(index)))
 
     def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
         """Mean SOS loss over views, split by scale; changes nothing, its time does not count.

@@ -18,8 +18,7 @@ from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
-
-PhotoLoader = Callable[[int], Tensor]
+from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
 
 
 class Views:
@@ -33,7 +32,8 @@ class Views:
         cameras: one for each view.
         rasterizer: renders them.
         loss: prepares the targets.
-        photos: content image [H, W, 3] of a view by its index; None for the unstylized render.
+        photos: content image [H, W, 3] of a view by its index; None for the unstylized render. On a GPU they are read
+            in a thread too, see `look_ahead`.
         covered: indices of the views that see anything.
         weighted: weigh statistics by rendered coverage.
         memory: bytes that content features, coverage and colours of views may take.
@@ -65,6 +65,8 @@ class Views:
         self.loss = loss
         self.collectives = collectives
         self._photos = photos
+        device = loss.network.device
+        self._ahead = PhotosAhead(photos, device) if photos is not None and device.type == "cuda" else None
         self._bands = [
             divide_rows(
                 camera.height, collectives.size, (regions[index].top, regions[index].bottom) if regions else None
@@ -173,10 +175,28 @@ class Views:
         return self._bands[index][self.collectives.rank]
 
     def content(self, index: int) -> Tensor:
-        """Content image [H, W, 3]: the photo, or the render of the unstylized scene."""
+        """Content image [H, W, 3]: the photo, on the GPU where there is one; or the render of the unstylized scene."""
+        if self._ahead is not None:
+            return self._ahead(index)
         if self._photos is not None:
             return self._photos(index)
         return self.render(index, self.colours(index, self._sh_dc))
+
+    def look_ahead(self, index: int, scales: Sequence[int]) -> None:
+        """On a GPU, begin to read the photo of the view whose target is asked for next, if that will need it."""
+        if self._ahead is not None and self._needs_content(index, scales):
+            self._ahead.begin(index)
+
+    def end_look_ahead(self) -> None:
+        """Read nothing in advance any more, until `look_ahead`."""
+        if self._ahead is not None:
+            self._ahead.end()
+
+    def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
+        """Whether content features at some scales of a view have yet to be computed."""
+        share = self._shares.get((index, tuple(scales)))  # what is kept was shared out before
+        kept = share is not None and all((index, scale, share.pieces[scale]) in self._content for scale in scales)
+        return bool(self.loss.content_weight) and not kept
 
     def target(self, index: int, scales: Sequence[int]) -> ViewTarget:
         """What the view is compared with at some scales; kept where memory allows.

@@ -1,0 +1,100 @@
+"""The forecast's arithmetic, where the answer is known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from benchmarks import forecast
+from benchmarks.forecast import JOBS, LAUNCHES, SHARES, Job, Part, Passes, make_loss, statistics, step_seconds
+from benchmarks.work import Counted, Work, meta
+
+#: A scene and views that fit the memory whole.
+SMALL = Job((96, 128), 1000, 4.0, 3)
+#: Multiplications and additions of VGG19 to relu5_1 for a pixel: 9 products for each pair of channels, by block.
+FLOP = 2 * 9 * (
+    (3 * 64 + 64 * 64)
+    + (64 * 128 + 128 * 128) / 4
+    + (128 * 256 + 3 * 256 * 256) / 16
+    + (256 * 512 + 3 * 512 * 512) / 64
+    + 512 * 512 / 256
+)  # fmt: skip
+
+
+def test_vgg19_takes_0_72_million_operations_a_pixel_either_way() -> None:
+    forward, backward = Passes(make_loss("float32"), SMALL.size, [0]).network()
+    assert FLOP == 722_304
+    for works in (forward, backward):
+        assert sum(work.operations for work in works) / (96 * 128) == FLOP
+
+
+def test_what_does_not_fit_goes_forward_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    loss = make_loss("float32")
+    passes = Passes(loss, SMALL.size, [0])
+    passes.kept = [False]
+    forward, backward = passes.network()
+    assert sum(work.operations for work in backward) == 2 * sum(work.operations for work in forward)
+
+
+def test_launches_are_counted_with_their_bytes() -> None:
+    a, weight = meta(1, 4, 6, 8), meta(16, 4, 3, 3)
+    with Counted() as counted:
+        a.view(4, 48)[1:].T.add_(meta(48, 3))
+        F.conv2d(a, weight, padding=1).relu_()
+        torch.empty(7, device="meta")
+        meta(5, dtype=torch.bfloat16) + 1
+    added, convolved, last = counted.works
+    assert added == Work(0, 3 * 48 * 3 * 4)
+    assert convolved == Work(2 * 9 * 4 * 16 * 48, 4 * (4 * 48 + 16 * 4 * 9 + 16 * 48))
+    assert last == Work(0, 2 * 5 * 2)
+
+
+def test_the_slower_of_unit_and_memory_counts() -> None:
+    rates = {"convolution": 100.0, "matrix": 10.0, "bytes": 50.0}
+    assert Work(200, 50).seconds(rates) == 2
+    assert Work(200, 500).seconds(rates) == 10
+    assert Work(200, 500, "matrix").seconds(rates) == 20
+
+
+def test_statistics_are_made_of_the_upper_pairs() -> None:
+    assert statistics(64, 1000, 4).operations == 2 * 64**2 * 1000
+    assert statistics(512, 1000, 4).operations == 2 * 512**2 * 1000 * 36 / 64
+    large = statistics(512, 10**6, 2)
+    assert large.bytes > 8 * 512 * 10**6 * 2  # eight times over: it outgrows the cache
+
+
+def test_features_decide_how_products_are_rounded() -> None:
+    rates = {name: SHARES["likely"].rates(name)["matrix"] for name in forecast.PRECISIONS}
+    assert rates["tf32"] == rates["float32"] == forecast.PEAKS["float32"] * SHARES["likely"].matrix["ieee"]
+    assert rates["bfloat16"] == forecast.PEAKS["tf32"] * SHARES["likely"].matrix["tf32"]
+
+
+def test_device_and_host_work_at_the_same_time() -> None:
+    shares = SHARES["likely"]
+    parts = {
+        "a": Part([Work(0, 4.8e12 * shares.bandwidth)] * 3),
+        "b": Part([Work(0, 4.8e12 * shares.bandwidth)], 0.5, 100),
+    }
+    found = step_seconds(parts, shares, "float32", LAUNCHES)
+    assert (found["a"], found["b"], found["total"]) == pytest.approx((3.0, 0.5, 3.5))
+    assert found["host"] == pytest.approx(shares.launch * (LAUNCHES + 50))
+    assert step_seconds(parts, shares, "float32", 10**9)["total"] == pytest.approx(1e9 * shares.launch, rel=1e-6)
+
+
+def test_what_is_kept_is_not_made_anew() -> None:
+    everything = forecast.kept_shares(SMALL, make_loss("float32"), coarse=False)
+    assert everything == {"content": 1.0, "lists": 1.0, "colours": 1.0}
+    garden = forecast.kept_shares(JOBS["5187x3361"], make_loss("float32"), coarse=False)
+    assert all(0 < share < 1 for share in garden.values())
+    parts = forecast.step_parts(SMALL, "bfloat16")
+    assert [parts[name].visits for name in parts if name.endswith("anew")] == [0.0] * 3
+
+
+def test_the_range_holds_the_likely_figure() -> None:
+    found = forecast.forecast(SMALL, "tf32", LAUNCHES)
+    for kind in ("sos", "coarse"):
+        low, mid, high = (found[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))
+        assert 0 < low < mid < high
+    assert found["coarse"]["likely"]["total"] <= found["sos"]["likely"]["total"]
+    assert "| **a step** |" in forecast.table({"tf32": found})

@@ -1,0 +1,220 @@
+"""Photos that are read in advance: on a pretend GPU, on which they must not be waited for."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU: the pretend one would stand in its way", allow_module_level=True)
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.errors import ImageError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.images import load_photo, save_png
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.ahead import PhotosAhead
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.device import DEVICE, PretendTensor
+from tests.pretend_cuda.runtime import pretend_cuda
+from tests.sgsst_core.pictures import picture
+from tests.small_scenes import cameras, style, wall
+
+pytest.importorskip("triton")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+VIEWS, STEPS, SIDE, SEED = 3, 6, 32, 4
+PHOTO_BYTES = SIDE * SIDE * 3 * 4
+#: Bytes of a handful of numbers.
+SCALARS = 256
+#: Seconds after which a thread is taken to be stuck.
+STUCK = 60.0
+
+
+class Photos:
+    """Reads photos from files, and remembers which and in which thread.
+
+    Args:
+        folder: into which they are written.
+        broken: index of the photo whose file ends too soon.
+        side: of the photos as they are read.
+
+    Attributes:
+        asked: indices in the order in which they were read.
+        here: those of them that were read in the thread that made this object.
+    """
+
+    def __init__(self, folder: Path, broken: int | None = None, side: int = SIDE) -> None:
+        self.asked: list[int] = []
+        self.here: list[int] = []
+        self._thread = threading.current_thread()
+        self._changed = threading.Condition()
+        self._cameras = cameras(VIEWS, side, side)
+        self._paths = [folder / f"{index}.png" for index in range(VIEWS)]
+        for index, path in enumerate(self._paths):
+            save_png(path, picture(2 * side, 2 * side, seed=index, dtype=torch.float32))
+            if index == broken:
+                path.write_bytes(path.read_bytes()[:-100])
+
+    def __call__(self, index: int) -> Tensor:
+        with self._changed:
+            self.asked.append(index)
+            if threading.current_thread() is self._thread:
+                self.here.append(index)
+            self._changed.notify_all()
+        return self.read(index)
+
+    def read(self, index: int) -> Tensor:
+        """Without remembering it."""
+        return load_photo(self._paths[index], self._cameras[index])
+
+    def wait_for(self, count: int) -> None:
+        """Until so many were read."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.asked) >= count, STUCK), f"{self.asked} were read"
+
+
+@pytest.fixture
+def counts() -> Iterator[Counts]:
+    with pretend_cuda() as found:
+        yield found
+
+
+def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:
+    """Two scales, both in each step; content features are not kept, unless `keep` says otherwise."""
+    options = {"steps_coarse": 0, "steps_sos": STEPS, "coarsest_side": 16, "position_weights": "off", "seed": SEED}
+    settings = make_settings("paper", **{**options, "keep": ("content",), **values})
+    views = cameras(VIEWS, SIDE, SIDE)
+    return Stylizer.planned(wall(6, 5), views, style(), settings, weights=weights, photos=photos)
+
+
+def drawn() -> list[int]:
+    """The order of views in two rounds."""
+    generator = torch.Generator().manual_seed(SEED)
+    return [int(i) for _ in range(2) for i in torch.randperm(VIEWS, generator=generator).flip(0)]
+
+
+def threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("photo")]
+
+
+def on_host(tensor: Tensor) -> Tensor:
+    assert isinstance(tensor, PretendTensor)
+    return tensor.host
+
+
+def test_a_step_reads_the_next_photo_and_waits_once(
+    tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two rounds of the views: in the first one, what is kept of each view is made."""
+    photos = Photos(tmp_path)
+    stylizer = make(tiny_weights, photos)
+    gradient = stylizer.views.gradient
+
+    def end_of_step(*arguments: Any) -> Tensor:
+        photos.wait_for(stylizer.step + (1 if (stylizer.step + 1) % VIEWS == 0 else 2))
+        return gradient(*arguments)
+
+    monkeypatch.setattr(stylizer.views, "gradient", end_of_step)
+    for step in range(STEPS):
+        counts.clear()
+        stylizer.run_step()
+        if step >= VIEWS:
+            assert sum(counts.waits.values()) == 1, counts.waits
+            large = {line: size for line, size in counts.copies.items() if size > SCALARS}
+            assert list(large.values()) == [PHOTO_BYTES], large  # the photo, and nothing else
+        assert len(stylizer.state().queue) == -(step + 1) % VIEWS  # it was looked at, not filled
+    stylizer.views.end_look_ahead()
+    assert photos.asked == drawn() == [record.view for record in stylizer.history]
+    assert photos.here == drawn()[::VIEWS]  # the first of a round, which is not known before; the thread read the rest
+    assert not threads()
+
+
+@pytest.mark.parametrize(("steps", "views_per_step"), [(3, 1), (2, 2)])
+def test_losses_are_those_of_photos_read_when_they_are_needed(
+    tiny_weights: BackboneWeights,
+    counts: Counts,
+    tmp_path: Path,
+    steps: int,
+    views_per_step: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options: dict[str, Any] = {"steps_sos": steps, "views_per_step": views_per_step}
+    photos, plain = Photos(tmp_path), Photos(tmp_path)
+    stylizer, expected = make(tiny_weights, photos, **options), make(tiny_weights, plain, **options)
+    monkeypatch.setattr(expected.views, "look_ahead", lambda *_: None)
+    assert run(stylizer) == run(expected) == "finished"
+    assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
+    assert torch.equal(stylizer.stylized(), expected.stylized())
+    assert plain.here == plain.asked == photos.asked
+    assert photos.here == photos.asked[:1]  # all others were named in the queue, or in the step
+    assert not threads()
+
+
+def test_photos_whose_features_are_kept_are_read_once(
+    tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
+) -> None:
+    photos = Photos(tmp_path)
+    run(make(tiny_weights, photos, keep=()))
+    assert sorted(photos.asked) == list(range(VIEWS))
+
+
+def test_a_photo_that_cannot_be_read_ends_the_job_in_the_step_that_needs_it(
+    tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
+) -> None:
+    stylizer = make(tiny_weights, Photos(tmp_path, broken=drawn()[1]))
+    with pytest.raises(ImageError, match=rf"{drawn()[1]}\.png: is truncated"):
+        run(stylizer)
+    assert stylizer.step == 1
+    assert not threads()
+
+
+def test_on_a_cpu_there_is_no_thread(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+    photos = Photos(tmp_path)
+    run(make(tiny_weights, photos))
+    assert photos.here == photos.asked == drawn()
+
+
+def test_photos_come_out_as_they_were_read(counts: Counts, tmp_path: Path) -> None:
+    photos = Photos(tmp_path, side=160)  # CUDA takes 64 KB along without a wait, pinned or not
+    ahead = PhotosAhead(photos, DEVICE)
+    ahead.begin(1)
+    ahead.begin(1)  # already under way
+    assert torch.equal(on_host(ahead(2)), photos.read(2))  # out of turn
+    assert torch.equal(on_host(ahead(1)), photos.read(1))
+    assert sorted(photos.asked) == [1, 2]
+    assert photos.here == [2]
+    assert not counts.waits
+    assert counts.copies.total() == 2 * 160 * 160 * 3 * 4
+    ahead.end()
+    assert not threads()
+
+
+def test_a_photo_that_nobody_asks_for_is_given_up_with_its_error(counts: Counts, tmp_path: Path) -> None:
+    photos = Photos(tmp_path, broken=0)
+    ahead = PhotosAhead(photos, DEVICE)
+    ahead.begin(0)
+    photos.wait_for(1)
+    ahead.begin(1)
+    assert on_host(ahead(1)).shape == (SIDE, SIDE, 3)
+    with pytest.raises(ImageError):
+        ahead(0)
+    ahead.begin(0)
+    with pytest.raises(ImageError):
+        ahead(0)
+    assert photos.asked == [0, 1, 0, 0]
+    ahead.begin(2)
+    ahead.end()
+    assert not threads()
+    ahead.begin(2)  # another thread
+    assert on_host(ahead(2)).shape == (SIDE, SIDE, 3)
+    ahead.end()
