@@ -1,6 +1,6 @@
 """Forecast of a step on one H200, from counted operations, bytes and launches, to hold a measurement against.
 
-python -m benchmarks.forecast [--launches 430]
+python -m benchmarks.forecast [--launches 478]
 
 Nothing here is measured on a GPU: peaks are the data sheet's, and how much of them is reached are the `SHARES` below.
 The feature network, the image pyramid, colours and the content loss are counted by running the project's own code on
@@ -28,11 +28,10 @@ from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentDifference
 from sgsst_core.parallel.division import Size
+from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.cost import content_bytes
-from sgsst_core.rasterizer.triton import DEFAULT_LIST_BYTES
-from sgsst_core.scene.camera import look_at
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
+from sgsst_core.scene.spherical_harmonics import view_colours, view_colours_gradient
 from sgsst_core.settings import make_settings
 
 #: H200 SXM, data sheet, dense: operations a second by what is multiplied, bytes a second, bytes of memory and of L2.
@@ -41,8 +40,8 @@ BANDWIDTH, MEMORY, L2 = 4.8e12, 141e9, 50e6
 #: Instructions of single threads a second: a float32 operation of the data sheet is half a fused multiply-add.
 LANES = PEAKS["float32"] / 2
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Launches of a step in which all that is kept of a view is there, counted on the pretend device of the tests.
-LAUNCHES = 430
+#: Launches of a step in which all that is kept of a view is there: a scan's in bfloat16, as `device_counts` has them.
+LAUNCHES = 478
 #: Of a view's lists of raster tiles: two sorts in passes, a sum in passes, kernels and copies.
 LIST_LAUNCHES = 40
 #: Instructions a pixel of a pair of Gaussian and raster tile, as the source of `blend_weights` and of its callers has
@@ -285,12 +284,8 @@ def lists(job: Job) -> list[Work]:
 
 
 def rest(job: Job) -> list[Work]:
-    """Colours' frozen part, from spherical harmonics of degree 3."""
-    place, target, up = (torch.tensor([0.0, y, z]) for y, z in ((0, 0), (0, 1), (-1, 0)))
-    camera = look_at("view", place, target, up, width=job.size[1], height=job.size[0], focal=job.size[1])
-    with Counted() as counted:
-        rest_colours(meta(job.gaussians, 15, 3), meta(job.gaussians, 3), camera)
-    return counted.works
+    """Colours' frozen part, from spherical harmonics of degree 3: every coefficient read once, in one launch."""
+    return [Work(0, (15 * 12 + 12 + 12) * job.gaussians)]
 
 
 def colours(job: Job) -> list[Work]:
@@ -345,7 +340,10 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     size = (job.size[0] >> count - 1, job.size[1] >> count - 1) if coarse else job.size
     of_a_view = {
         "content": (views / 2, content_bytes([size], loss.tiling, cell)),
-        "lists": (DEFAULT_LIST_BYTES, LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs),
+        "lists": (
+            rasterizer_options("triton", make_settings(), int(memory_limit()))["max_list_bytes"],
+            LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs,
+        ),
         "colours": (views / 4, 12.0 * job.gaussians),
     }
     return {name: min(1.0, room // each / job.views) for name, (room, each) in of_a_view.items()}

@@ -6,10 +6,12 @@ What is measured next depends on them, so the probe and `decide` share them.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.errors import SettingsError
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
@@ -56,6 +58,21 @@ def precision_of(asked: Precision, ratio: float | None) -> Precision:
 
 #: Rasterizers of GPUs, the preferred one first.
 GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
+
+
+def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
+    """What the rasterizer of a job that computes weights anew is made with, beside its scene.
+
+    Lists of a GPU are small beside its memory, and each view without one costs a sort and a wait: they have half as
+    much as kept weights, of what is left to buffers.
+
+    Args:
+        memory: bytes that the rank may plan with.
+    """
+    options: dict[str, Any] = {"background": settings.background, "near": settings.near}
+    if name == "triton":
+        options["max_list_bytes"] = int(memory * MEMORY_SHARES["rasterizer"]) // 2
+    return options
 
 
 def rasterizer_anew(device: Device, problems: Mapping[str, str]) -> RasterizerName:

@@ -27,6 +27,7 @@ from sgsst_core.planning.choices import (
     precision_of,
     pruned_gaussians,
     rasterizer_anew,
+    rasterizer_options,
     rendered_gaussians,
 )
 from sgsst_core.planning.cost import RasterCost, Rate
@@ -203,7 +204,7 @@ def equip(
         problems=problems,
     )
     name = rasterizer or rasterizer_anew(device, problems)
-    whole = make_rasterizer(name, scene, background=settings.background, near=settings.near)
+    whole = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
     return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole)
 
 

@@ -19,6 +19,7 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import Workshop, make_network, sharing_memory
@@ -170,13 +171,15 @@ class Stylizer:
     def _rasterizers(self, seen: Scene, workshop: Workshop | None) -> tuple[Rasterizer, CoarseRasterizer | None]:
         """The rasterizer that the plan names, and the one that keeps weights of the coarsest scale for phase 1."""
         plan, settings = self.plan, self.settings
-        options: dict[str, Any] = {"background": settings.background, "near": settings.near}
         # What was prepared for the whole scene names its Gaussians by their place in it.
         whole = workshop.rasterizer if workshop and plan.seen.all() else None
         if whole is not None and whole.name == plan.rasterizer:
             return whole, None
         if plan.rasterizer != "cached":
-            return make_rasterizer(plan.rasterizer, seen, **options), None
+            return make_rasterizer(
+                plan.rasterizer, seen, **rasterizer_options(plan.rasterizer, settings, self.memory)
+            ), None
+        options = rasterizer_options(plan.anew, settings, self.memory)
         anew = whole if whole and whole.name == plan.anew else make_rasterizer(plan.anew, seen, **options)
         budget = int(self.memory * MEMORY_SHARES["rasterizer"])
         share = budget // 4 if plan.coarse_weights else 0
