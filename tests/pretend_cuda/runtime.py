@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import torch
 from torch.utils._pytree import tree_leaves
 
@@ -55,6 +56,8 @@ class Event:
 
     def record(self, stream: Stream | None = None) -> None:
         """Now."""
+        if self._timed:
+            device.refuse_in_capture("an event with timing")
         self._moment = time.perf_counter()
 
     def wait(self, stream: Stream | None = None) -> None:
@@ -77,6 +80,72 @@ class Event:
         return 1e3 * (end._moment - self._moment)
 
 
+class CUDAGraph:
+    """Operations that were captured, to be done again with the very same tensors.
+
+    Capturing computes nothing on a GPU. Here it does, and what it has computed is made unusable at its end: numbers are
+    NaN until a replay has made them.
+    """
+
+    def __init__(self, keep_graph: bool = False) -> None:
+        self._steps: list[tuple[Any, Any, Any, list[torch.Tensor | None]]] = []
+        self._written: list[torch.Tensor] = []
+        self._done = False
+
+    def record(self, func: Any, args: Any, kwargs: Any, result: Any) -> None:
+        """Hold an operation, but for those that only make a view or reserve memory, which stays where it is."""
+        schema = getattr(func, "_schema", None)
+        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        places = {tensor.untyped_storage().data_ptr() for tensor in given}
+        made = [leaf for leaf in tree_leaves(result) if isinstance(leaf, torch.Tensor)]
+        into = [None if tensor.untyped_storage().data_ptr() in places else tensor for tensor in made]
+        fresh = [tensor for tensor in into if tensor is not None]
+        self._written += fresh
+        if schema is not None:
+            if schema.is_mutable:
+                self._written += given[:1]
+            elif not fresh or "empty" in schema.name:
+                return
+        self._steps.append((func, args, kwargs, into))
+
+    def end(self) -> None:
+        """Nothing more is captured."""
+        self._done = True
+        with _plainly():
+            for tensor in self._written:
+                if tensor.is_floating_point():
+                    tensor.fill_(torch.nan)
+        self._written.clear()
+
+    def replay(self) -> None:
+        """All operations, in one launch."""
+        if not self._done:
+            raise RuntimeError("Called CUDAGraph::replay without a preceding successful capture.")
+        device.refuse_in_capture("another graph")
+        device.launch()
+        with _plainly(), torch.no_grad():
+            for func, args, kwargs, into in self._steps:
+                found = [leaf for leaf in tree_leaves(func(*args, **kwargs)) if isinstance(leaf, torch.Tensor)]
+                for place, value in zip(into, found, strict=False):
+                    if place is not None:
+                        place.copy_(value)
+
+
+@contextmanager
+def _graph(
+    cuda_graph: CUDAGraph, pool: Any = None, stream: Stream | None = None, capture_error_mode: str = "global"
+) -> Iterator[None]:
+    """As `torch.cuda.graph`: what this thread asks of the device in the block is captured."""
+    device.refuse_in_capture("another capture")
+    device.wait()
+    device.capture.recorders.append(cuda_graph.record)
+    try:
+        yield
+    finally:
+        device.capture.recorders.clear()
+    cuda_graph.end()
+
+
 def _set_device(to: Any) -> None:
     """As `torch.cuda.set_device`: it takes a number or a device with one."""
     torch.cuda._utils._get_device_index(to)
@@ -90,9 +159,10 @@ def _count_launch(original: Any) -> Any:
                 raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
             device.launch()
         values, named = [device.inner(arg) for arg in args], {name: device.inner(arg) for name, arg in kwargs.items()}
-        with _plainly():
+        # While a graph is captured, what its inputs hold means nothing.
+        with _plainly(), np.errstate(all="ignore" if device.capture.recorders else None):
             result = original(executor, *values, **named)
-        for record in device.recorders:
+        for record in device.capture.recorders:
             record(lambda *a, **k: original(executor, *a, **k), values, named, None)
         return result
 
@@ -134,9 +204,12 @@ def pretend_cuda() -> Iterator[Counts]:
         "default_stream": lambda *_: one,
         "stream": lambda *_: nullcontext(),
         "device": lambda *_: nullcontext(),
-        "is_current_stream_capturing": lambda: bool(device.recorders),
+        "is_current_stream_capturing": lambda: bool(device.capture.recorders),
         "Stream": Stream,
         "Event": Event,
+        "CUDAGraph": CUDAGraph,
+        "graph": _graph,
+        "graph_pool_handle": lambda: (0, 1),
     }
     device.counts.clear()
     with (
