@@ -14,7 +14,6 @@ if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
-from sgsst_core.features import fused_statistics
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, has_graphs
@@ -22,6 +21,7 @@ from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.stylizing.evaluation import StyleTargets
 from sgsst_core.timing import Timer
+from tests.networks import leave_out_kernels
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.sgsst_core.pictures import picture
@@ -42,7 +42,7 @@ def counts() -> Iterator[Counts]:
 @pytest.fixture
 def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels of PyTorch alone, which need no interpreter."""
-    monkeypatch.setattr(fused_statistics, "works_on", lambda device: False)
+    leave_out_kernels(monkeypatch)
 
 
 def image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
@@ -76,7 +76,7 @@ def test_a_graph_gives_the_same_bits_for_every_view(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, weighted: bool
 ) -> None:
     if not weighted:  # once is enough for the kernels in Triton, which take their time in the interpreter
-        monkeypatch.setattr(fused_statistics, "works_on", lambda device: False)
+        leave_out_kernels(monkeypatch)
     loss = make_loss(tiny_weights)
     style, views = style_of(loss), [view_of(loss, seed, weighted=weighted) for seed in (2, 3)]
     graphs, results = LossGraphs(loss), []

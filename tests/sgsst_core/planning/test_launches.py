@@ -12,7 +12,6 @@ if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
-from sgsst_core.features import fused_statistics
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
@@ -21,6 +20,7 @@ from sgsst_core.planning.launches import launch_cost
 from sgsst_core.planning.probe import LEAST_GRAPH_VISITS
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import leave_out_kernels
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import cameras, style, wall
@@ -35,7 +35,7 @@ SIZE = 32, 48
 def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
     """Kernels of PyTorch alone, which need no interpreter."""
     with pretend_cuda() as found:
-        monkeypatch.setattr(fused_statistics, "works_on", lambda device: False)
+        leave_out_kernels(monkeypatch)
         yield found
 
 

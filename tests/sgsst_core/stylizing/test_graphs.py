@@ -14,7 +14,6 @@ if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
-from sgsst_core.features import fused_statistics
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.planning.plan import Plan
@@ -23,6 +22,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import leave_out_kernels
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
@@ -69,7 +69,7 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
 ) -> None:
     """Both phases, views in turn: of two that share a graph, the first one prepares it and the second is captured."""
     if not scan:  # once is enough for the network's kernels in Triton, which take their time in the interpreter
-        monkeypatch.setattr(fused_statistics, "works_on", lambda device: False)
+        leave_out_kernels(monkeypatch)
     plain, graphs = (make(tiny_weights, graphs=graphs, scan=scan) for graphs in (False, True))
     for _ in range(plain.total):
         expected, stage = plain.run_step(), graphs.phase.stage
@@ -93,7 +93,7 @@ def test_several_views_a_step_and_a_resumed_run(
 
     With kernels of PyTorch alone, and a rasterizer of the CPU: images and gradients come from there and go there.
     """
-    monkeypatch.setattr(fused_statistics, "works_on", lambda device: False)
+    leave_out_kernels(monkeypatch)
     options: dict[str, Any] = {"rasterizer": "cpu", "views_per_step": 2, "scan": True, "steps_sos": 5}
     plain, graphs, resumed = (make(tiny_weights, graphs=graphs, **options) for graphs in (False, True, True))
     losses = [stylizer.run_step().loss for stylizer in (plain, graphs) for _ in range(5)]
