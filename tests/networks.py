@@ -6,13 +6,10 @@ import functools
 import shutil
 from pathlib import Path
 
-import pytest
 import torch
 
-from sgsst_core.features import fused_statistics
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_network_weights
-from sgsst_core.loss import terms
 
 #: Channels of every layer.
 CHANNELS = 16
@@ -44,12 +41,6 @@ def install_tiny_weights(folder: Path) -> Path:
     fetch_network_weights("vgg16", source=file, folder=folder)
     shutil.copy(cache_folder() / "lpips_alex.safetensors", folder)
     return folder
-
-
-def leave_out_kernels(patch: pytest.MonkeyPatch) -> None:
-    """Let statistics and style loss be computed by PyTorch alone: Triton's interpreter takes its time."""
-    for module in (fused_statistics, terms):
-        patch.setattr(module, "has_kernels", lambda device, channels: False)
 
 
 def _random_layers() -> dict[str, tuple[torch.Tensor, torch.Tensor]]:

@@ -21,8 +21,8 @@ from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.stylizing.evaluation import StyleTargets
 from sgsst_core.timing import Timer
-from tests.networks import leave_out_kernels
 from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.sgsst_core.pictures import picture
 

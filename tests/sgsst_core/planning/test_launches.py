@@ -20,8 +20,8 @@ from sgsst_core.planning.launches import launch_cost
 from sgsst_core.planning.probe import LEAST_GRAPH_VISITS
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.networks import leave_out_kernels
 from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import cameras, style, wall
 

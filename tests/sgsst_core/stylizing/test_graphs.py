@@ -22,8 +22,8 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.networks import leave_out_kernels
 from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
 
