@@ -16,7 +16,7 @@ from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene
 from sgsst_core.scene.camera import spread
 
-NETWORK = ("vgg_forward", "vgg_backward")
+NETWORK = ("vgg_forward", "vgg_backward", "network")
 
 
 def main() -> None:
@@ -43,7 +43,7 @@ def main() -> None:
                 seconds[name] = seconds.get(name, 0.0) + value
         total = sum(seconds.values())
         steps = arguments.rounds * len(cameras)
-        outside = 1 - sum(seconds[name] for name in NETWORK) / total
+        outside = 1 - sum(seconds.get(name, 0.0) for name in NETWORK) / total
         results[rasterizer] = {
             "seconds_per_step": {name: value / steps for name, value in seconds.items()},
             "share_outside_network": outside,

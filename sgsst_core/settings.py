@@ -16,7 +16,7 @@ Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 #: What can be left out without changing the result, for `Settings.keep`.
-Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks"]
+Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
 #: How the default of a setting that presets decide begins, in words.
 BY_PRESET = "by preset"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sgsst_core.features.partition import Rectangle, computed_twice, scaled_region
+from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Piece, Size
 
@@ -45,6 +46,38 @@ class RasterCost:
         if self.kept_seconds is None or self.keeping_seconds is None or self.kept_seconds >= self.seconds:
             return None
         return self.keeping_seconds / (self.seconds - self.kept_seconds)
+
+
+#: Share of the seconds of a view's loss that a graph must save to be worth its memory.
+LEAST_SAVING = 0.03
+
+
+@dataclass(frozen=True)
+class LaunchCost:
+    """Of the loss of a view and its gradient.
+
+    Attributes:
+        seconds: with its kernels launched one by one.
+        replayed: as a graph.
+        capture: of capturing the graph, once.
+        problem: why there is no graph, and nothing was measured; None where there is one.
+    """
+
+    seconds: float = 0.0
+    replayed: float = 0.0
+    capture: float = 0.0
+    problem: str | None = None
+
+    @property
+    def saved(self) -> float:
+        """Seconds that a graph saves at each visit; 0 where they are too few."""
+        saved = self.seconds - self.replayed
+        return saved if self.problem is None and saved > LEAST_SAVING * self.seconds else 0.0
+
+    @property
+    def least_visits(self) -> float | None:
+        """Visits of views that share a graph from which on it saves time; None where it never does."""
+        return FIRST_VISITS + self.capture / self.saved if self.saved else None
 
 
 def pieces_of(size: Size, tiling: Tiling, region: Rectangle | None, *, coarsest: bool = False) -> tuple[Piece, ...]:

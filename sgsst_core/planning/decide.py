@@ -100,6 +100,7 @@ class _Deciding:
             anew=next((name for name in GPU_RASTERIZERS if name == probe.rasterizer), "cpu"),
             precision=precision_of(settings.precision, probe.network.precision_ratio),
             search=probe.machine.device == "cuda" and self._passes_of_a_size(steps_coarse, weighted) >= LEAST_PASSES,
+            graphs=self._graphs_pay(steps_coarse, weighted),
             kept_weights=form,
             coarse_weights=self._keeps_coarse(form, steps_coarse / views),
             measured=self.measured,
@@ -110,6 +111,16 @@ class _Deciding:
         views = self.probe.distinct
         sizes = len(views) if weighted else len({self.probe.sizes[index] for index in views})
         return (steps_coarse + self.settings.steps_sos) * self.settings.views_per_step // sizes
+
+    def _graphs_pay(self, steps_coarse: int, weighted: bool) -> bool:
+        """Whether graphs of the loss save more time than it takes to capture them, one for each size and phase."""
+        launches, settings = self.probe.launches, self.settings
+        if self.probe.machine.device != "cuda" or launches is None or "launches" in settings.keep:
+            return False
+        if launches.least_visits is None or decisions.ranks_of_a_view(self.probe, settings) > 1:
+            return False
+        phases = bool(steps_coarse) + bool(settings.steps_sos)
+        return self._passes_of_a_size(steps_coarse, weighted) >= phases * launches.least_visits
 
     def _kept_form(self, visits: float) -> KeptWeights:
         """How blend weights are kept: exactly where they fit, in half precision where only that fits, where it pays."""
@@ -147,6 +158,7 @@ class _Deciding:
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
             *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),
+            *decisions.of_launches(probe, plan, settings, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),
             decisions.of_blend_weights(probe, plan, settings, self.budget),
             *decisions.of_schedule(plan, settings, [self.tiling.scale_count(size) for size in self.sizes]),
         ]
@@ -171,7 +183,8 @@ class _Deciding:
         kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[self.base.kept_weights] or 0
         content = 0 if "content" in self.settings.keep else self._content_bytes(self.base.covered)
         process = probe.process_bytes + (MEASURING_BYTES if self.measured else 0)
-        computing = image_bytes(probe.sizes) + activations
+        # What a graph computes with is its own: the same work without it has a place beside it.
+        computing = image_bytes(probe.sizes) + activations * (2 if self.base.graphs else 1)
         computing += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
         if probe.machine.device == "cpu":
             return process + computing, None

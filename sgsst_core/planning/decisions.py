@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
-from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Work
+from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
@@ -149,6 +150,44 @@ def of_search(plan: Plan, passes: int) -> list[Decision]:
     if plan.search:
         return [Decision("convolutions", "cuDNN tries its algorithms", reason, error="runs may round differently")]
     return [Decision("convolutions", "cuDNN's algorithms are not tried first", reason)]
+
+
+def ranks_of_a_view(probe: Probe, settings: Settings) -> int:
+    """Ranks that evaluate a view together, if all take part."""
+    return probe.machine.ranks // math.gcd(settings.views_per_step, probe.machine.ranks)
+
+
+def of_launches(probe: Probe, plan: Plan, settings: Settings, visits: int) -> list[Decision]:
+    """On a GPU, how the kernels of a view's loss are launched; visits: of views that share a graph."""
+    if plan.device != "cuda":
+        return []
+    launches, come = probe.launches, f"views of one size come about {visits:,} times"
+    if plan.graphs:
+        assert launches is not None
+        reason = f"{_against_graphs(launches)}; {come}"
+        return [Decision("launches", "a view's loss is captured, and launched as one", reason, seconds=launches.saved)]
+    if "launches" in settings.keep:
+        reason = "asked for"
+    elif ranks_of_a_view(probe, settings) > 1:
+        reason = "a graph cannot hold what workers tell each other"
+    elif launches is None:
+        reason = come
+    elif launches.problem is not None:
+        reason = f"there are no graphs: {launches.problem}"
+    elif launches.least_visits is None:
+        reason = f"a graph saves hardly anything: {_against_graphs(launches)}"
+    else:
+        pays = f"a graph of each phase pays from {launches.least_visits:.1f} visits on"
+        reason = f"{come}, and {pays}: {_against_graphs(launches)}"
+    return [Decision("launches", "kernel by kernel", reason)]
+
+
+def _against_graphs(launches: LaunchCost) -> str:
+    """Graphs against single launches, as was measured."""
+    return (
+        f"{1e3 * launches.replayed:.3g} ms a view were measured as a graph, {1e3 * launches.seconds:.3g} ms kernel by "
+        f"kernel, {1e3 * launches.capture:.3g} ms to capture it"
+    )
 
 
 def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:

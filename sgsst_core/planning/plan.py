@@ -73,6 +73,7 @@ class Plan:
         anew: rasterizer that computes blend weights, and every time those that are not kept.
         precision: of the feature network.
         search: cuDNN tries its algorithms before it chooses (`FeatureNetwork.search`).
+        graphs: a view's loss is captured as a graph where it can be (`LossGraphs`).
         kept_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         measured: the prediction counts what measuring between steps and the report take.
@@ -93,6 +94,7 @@ class Plan:
     anew: RasterizerName = "cpu"
     precision: Precision = "float32"
     search: bool = False
+    graphs: bool = False
     kept_weights: KeptWeights = "none"
     coarse_weights: bool = False
     measured: bool = False

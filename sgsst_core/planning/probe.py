@@ -30,7 +30,8 @@ from sgsst_core.planning.choices import (
     rasterizer_options,
     rendered_gaussians,
 )
-from sgsst_core.planning.cost import RasterCost, Rate
+from sgsst_core.planning.cost import LaunchCost, RasterCost, Rate
+from sgsst_core.planning.launches import launch_cost
 from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.precision import DTYPES, gradient_error, precision_ratio
@@ -51,6 +52,8 @@ from sgsst_core.timing import Timer
 #: Largest side of the picture that the network is timed on: large enough that its rate is that of a partition tile.
 #: A GPU has more to do before the seconds of its launches do not count.
 PROBE_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 1024}
+#: Visits of views of one size below which no graph of their loss pays, whatever it saves.
+LEAST_GRAPH_VISITS = 20
 #: Views whose blend weights are counted and timed; the others are taken to be like them.
 SAMPLED_VIEWS = 3
 
@@ -137,6 +140,7 @@ class Probe:
         link: between ranks.
         process_bytes: of physical memory, with scene and network loaded.
         device_bytes: of a GPU's memory, likewise; 0 where a CPU computes.
+        launches: of a view's loss on a GPU; None on a CPU, and where nothing follows from it.
     """
 
     scene: SceneFacts
@@ -151,6 +155,7 @@ class Probe:
     process_bytes: int
     pruned_error: ImageError | None = None
     device_bytes: int = 0
+    launches: LaunchCost | None = None
 
 
 @dataclass(frozen=True)
@@ -254,6 +259,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     seen = rendered_gaussians(optimised_gaussians(looked, settings), settings)
     distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
     network = _network_facts(workshop, cameras[distinct[0]])
+    launches = _launch_cost(workshop, [cameras[index] for index in distinct])
     budget = int(workshop.machine.memory * MEMORY_SHARES["rasterizer"])
     raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)
     pruned = pruned_gaussians(looked, seen)
@@ -272,6 +278,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
         psutil.Process().memory_info().rss,
         error,
         torch.cuda.memory_allocated(workshop.network.device) if workshop.machine.device == "cuda" else 0,
+        launches,
     )
 
 
@@ -280,14 +287,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
 
 def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
     """Of the network on made-up pictures, and where it is not in float32, its error on the first view."""
-    network, settings = workshop.network, workshop.settings
-    loss = SosLoss(
-        network,
-        content_weight=settings.content_weight,
-        memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
-        coarsest=settings.coarsest_side,
-        keep_activations="activations" not in settings.keep,
-    )
+    network, settings, loss = workshop.network, workshop.settings, _loss(workshop)
     side = min(_side(workshop, loss), max(max(camera.width, camera.height) for camera in workshop.cameras))
     fixed = 0.0
     rate = measure_rate(loss, side)
@@ -303,6 +303,27 @@ def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
         workshop.precision_ratio,
         gradient_error(network, workshop.weights, workshop.scene, first, workshop.rasterizer, loss.memory, side),
     )
+
+
+def _loss(workshop: Workshop) -> SosLoss:
+    """As one rank's."""
+    settings = workshop.settings
+    return SosLoss(
+        workshop.network,
+        content_weight=settings.content_weight,
+        memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
+        coarsest=settings.coarsest_side,
+        keep_activations="activations" not in settings.keep,
+    )
+
+
+def _launch_cost(workshop: Workshop, views: Sequence[Camera]) -> LaunchCost | None:
+    """Of the first view, on a GPU, where views of one size come often enough for graphs to be thought of."""
+    settings, sizes = workshop.settings, {(camera.height, camera.width) for camera in views}
+    visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
+    if workshop.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
+        return None
+    return launch_cost(_loss(workshop), (views[0].height, views[0].width))
 
 
 def _side(workshop: Workshop, loss: SosLoss) -> int:

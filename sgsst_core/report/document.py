@@ -76,6 +76,7 @@ def build_report(
             "peak_bytes": peak_memory(),
             "device_peak_bytes": device_peak(stylizer.network.device),
         },
+        "graphs": _graphs_json(stylizer),
         "machine": machine(stylizer.network.device),
         "history": [_record_json(record, before) for record in stylizer.history],
     }
@@ -132,6 +133,12 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
 def plan_json(plan: Plan) -> dict[str, Any]:
     """A plan as values that JSON can hold."""
     return {"version": PLAN_VERSION, **plan.as_dict()}
+
+
+def _graphs_json(stylizer: Stylizer) -> dict[str, Any] | None:
+    """What became of the graphs of the loss; None where the plan has none."""
+    graphs = stylizer.graphs
+    return None if graphs is None else {"captured": graphs.captured, "problem": graphs.problem}
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:

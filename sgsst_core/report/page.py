@@ -41,6 +41,7 @@ _PARTS = {
     "vgg_forward": "feature network, forward",
     "vgg_backward": "feature network, backward",
     "statistics": "statistics of the features",
+    "network": "feature network and loss, as a graph",
     "render": "rendering",
     "raster_backward": "rendering, backward",
     "optimiser": "optimiser",

@@ -17,6 +17,7 @@ from torch import Tensor
 from sgsst_core.budget import MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
@@ -106,6 +107,8 @@ class Stylizer:
         self.memory_limit = settings.memory_limit or plan.memory_limit
         self.memory = self.memory_limit // sharing_memory(self.collectives, plan.device)
         self.loss = self._loss()
+        #: In place of `loss` in steps, where the plan says so.
+        self.graphs = LossGraphs(self.loss) if plan.graphs and self.group.size == 1 else None
         self.scene = scene
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
@@ -325,7 +328,9 @@ class Stylizer:
         Raises:
             DivergedError: that magnitude was too large for a step to be made.
         """
-        numbers = torch.cat([largest.double()[None], *(result.values.flatten() for result in results)]).tolist()
+        # The rasterizer, and with it the colours, may be on the CPU while the network is on a GPU.
+        first = largest.double()[None].to(self.network.device)
+        numbers = torch.cat([first, *(result.values.flatten() for result in results)]).tolist()
         if is_too_large(numbers[0]):
             raise self._diverged(numbers[0])
         evaluations, place = [], 1
@@ -406,7 +411,8 @@ class Stylizer:
             colours = self.views.colours(index, self.sh_dc.detach())
             image = self.views.render(index, colours, rasterizer)
         with self.timer("loss"):
-            result = self.loss.evaluate(image, style, target, scales, image_scale=rasterizer.scale)
+            evaluate = self.graphs.evaluate if self.graphs is not None else self.loss.evaluate
+            result = evaluate(image, style, target, scales, image_scale=rasterizer.scale)
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
             return self.views.gradient(index, result.image_gradient.to(image.device), colours, rasterizer), result

@@ -25,8 +25,20 @@ from tests.pretend_cuda.counts import Counts, calling_line
 DEVICE = torch.device("cuda", 0)
 #: Of this process.
 counts = Counts()
-#: Told of every operation while a graph is captured: it, its arguments and its result, all with the CPU's tensors.
-recorders: list[Callable[[Any, Any, Any, Any], None]] = []
+
+
+class _Capture(threading.local):
+    """What is being captured by a thread: the others go on as ever.
+
+    Attributes:
+        recorders: told of every operation: it, its arguments and its result, all with the CPU's tensors.
+    """
+
+    def __init__(self) -> None:
+        self.recorders: list[Callable[[Any, Any, Any, Any], None]] = []
+
+
+capture = _Capture()
 
 #: Operations without a kernel: they make a view, or reserve memory, or only ask.
 _NO_KERNEL = {
@@ -92,14 +104,24 @@ def inner(value: Any) -> Any:
 
 def wait(line: str | None = None) -> None:
     """Count a wait of the host for the device."""
-    if recorders:
-        raise RuntimeError("operation not permitted when stream is capturing: the host waits for the device")
+    refuse_in_capture("the host waits for the device")
     counts.waits[line or calling_line()] += 1
 
 
+def refuse_in_capture(what: str) -> None:
+    """Fail as CUDA does where something is done that a graph cannot hold.
+
+    Raises:
+        RuntimeError: a graph is being captured.
+    """
+    if capture.recorders:
+        raise RuntimeError(f"operation not permitted when stream is capturing: {what}")
+
+
 def launch(kernels: int = 1) -> None:
-    """Count kernels."""
-    counts.launches[calling_line()] += kernels
+    """Count kernels; those that a graph captures are not launched."""
+    if not capture.recorders:
+        counts.launches[calling_line()] += kernels
 
 
 def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
@@ -121,8 +143,8 @@ def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if name == "_to_copy" and named.get("non_blocking"):
         named = {**named, "non_blocking": False}
     result = func(*plain, **named)
-    if recorders and (on_device or to_device):
-        for record in recorders:
+    if on_device or to_device:
+        for record in capture.recorders:
             record(func, plain, named, result)
     return _wrapped(func, result, leaves) if to_device else result
 
@@ -180,6 +202,7 @@ def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: b
 
 def _count_copy(source: Tensor, *, waits: bool) -> None:
     """A copy between host and device; scalars of the CPU travel with a launch."""
+    refuse_in_capture("a copy between host and device")
     counts.copies[calling_line()] += source.numel() * source.element_size()
     if waits and not (source.dim() == 0 and not isinstance(source, PretendTensor)):
         wait()

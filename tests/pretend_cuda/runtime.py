@@ -1,4 +1,4 @@
-"""`torch.cuda` and Triton's launches for the pretend device: events, streams, memory, graphs."""
+"""`torch.cuda` and Triton's launches for the pretend device: events, streams, memory."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from contextlib import contextmanager, nullcontext
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import torch
 from torch.utils._pytree import tree_leaves
 
 from tests.pretend_cuda import device
 from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.graphs import CUDAGraph, graph, plainly
 
 #: Bytes of the pretend device's memory.
 MEMORY = 140 << 30
@@ -55,6 +57,8 @@ class Event:
 
     def record(self, stream: Stream | None = None) -> None:
         """Now."""
+        if self._timed:
+            device.refuse_in_capture("an event with timing")
         self._moment = time.perf_counter()
 
     def wait(self, stream: Stream | None = None) -> None:
@@ -97,20 +101,14 @@ def _count_launch(original: Any) -> Any:
                 raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
             device.launch()
         values, named = [device.inner(arg) for arg in args], {name: device.inner(arg) for name, arg in kwargs.items()}
-        with _plainly():
+        # While a graph is captured, what its inputs hold means nothing.
+        with plainly(), np.errstate(all="ignore" if device.capture.recorders else None):
             result = original(executor, *values, **named)
-        for record in device.recorders:
+        for record in device.capture.recorders:
             record(lambda *a, **k: original(executor, *a, **k), values, named, None)
         return result
 
     return call
-
-
-@contextmanager
-def _plainly() -> Iterator[None]:
-    """Without the device's modes: what the interpreter computes with is its own."""
-    with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
-        yield
 
 
 @contextmanager
@@ -141,9 +139,12 @@ def pretend_cuda() -> Iterator[Counts]:
         "default_stream": lambda *_: one,
         "stream": lambda *_: nullcontext(),
         "device": _Selected,
-        "is_current_stream_capturing": lambda: bool(device.recorders),
+        "is_current_stream_capturing": lambda: bool(device.capture.recorders),
         "Stream": Stream,
         "Event": Event,
+        "CUDAGraph": CUDAGraph,
+        "graph": graph,
+        "graph_pool_handle": lambda: (0, 1),
     }
     device.counts.clear()
     with (

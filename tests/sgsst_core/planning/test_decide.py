@@ -14,7 +14,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.planning.choices import rasterizer_anew
-from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, Rate
+from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Rate
 from sgsst_core.planning.decide import LEAST_PASSES, MEASURING_BYTES, decide
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
@@ -215,6 +215,64 @@ def test_algorithms_are_tried_where_sizes_come_back(device: str, weights: str, s
     assert (decision is not None) is (device == "cuda")
     if decision:
         assert ("not tried" in decision.decision) is not search
+
+
+#: A graph saves 4 ms of 10, and takes 40 to capture: it pays from the twelfth visit on.
+CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
+
+
+@pytest.mark.parametrize(
+    ("changes", "values", "reason"),
+    [
+        ({}, {"steps_sos": 12}, None),
+        ({}, {"steps_sos": 11}, "come about 11 times, and a graph of each phase pays from 12.0 visits on: 6 ms a view"),
+        ({}, {"steps_sos": 12, "steps_coarse": 12}, None),  # each phase has a graph of its own
+        ({}, {"steps_sos": 12, "steps_coarse": 11}, "come about 23 times, and a graph of each phase pays from 12.0"),
+        ({}, {"steps_sos": 12, "position_weights": "on"}, "come about 3 times"),  # views are cut to sizes of their own
+        ({}, {"steps_sos": 12 * VIEWS, "position_weights": "on"}, None),
+        ({}, {"steps_sos": 400, "keep": ("launches",)}, "asked for"),
+        ({"ranks": 2}, {"steps_sos": 400}, "a graph cannot hold what workers tell each other"),
+        ({"ranks": 2}, {"steps_sos": 6, "views_per_step": 2}, None),  # every worker has a view to itself
+        ({"launches": None}, {"steps_sos": 400}, "views of one size come about 400 times"),
+        ({"launches": LaunchCost(problem="no")}, {"steps_sos": 400}, "there are no graphs: no"),
+        ({"launches": LaunchCost(1.0, 0.98, 0.0)}, {"steps_sos": 400}, "a graph saves hardly anything: 980 ms a view"),
+    ],
+)
+def test_the_loss_is_captured_where_that_saves_time(
+    changes: dict[str, Any], values: dict[str, Any], reason: str | None
+) -> None:
+    found = probe(**{"device": "cuda", "raster": RasterCost(0.01), "launches": CAPTURED, **changes})
+    plan = plan_of(found, **{"steps_coarse": 0, "position_weights": "off", **values})
+    decision = line(plan, "launches")
+    assert decision is not None
+    assert plan.graphs is (reason is None)
+    if reason is None:
+        assert decision.decision == "a view's loss is captured, and launched as one"
+        assert decision.reason.startswith("6 ms a view were measured as a graph, 10 ms kernel by kernel, 40 ms to")
+        assert decision.seconds == pytest.approx(0.004)
+    else:
+        assert decision.decision == "kernel by kernel"
+        assert reason in decision.reason
+        assert decision.seconds is None
+
+
+def test_on_a_cpu_nothing_is_captured_and_nothing_is_said_of_it() -> None:
+    plan = plan_of(probe(launches=CAPTURED), steps_sos=400)
+    assert not plan.graphs
+    assert line(plan, "launches") is None
+
+
+def test_a_graph_has_memory_of_its_own() -> None:
+    """Its activations beside those of the same work without it."""
+    found = probe(device="cuda", raster=RasterCost(0.01), launches=CAPTURED)
+    plans = [plan_of(found, steps_coarse=0, steps_sos=400, keep=keep) for keep in ((), ("launches",))]
+    assert [plan.graphs for plan in plans] == [True, False]
+    peaks = [plan.prediction.device_bytes for plan in plans if plan.prediction]
+    assert peaks[0] is not None
+    assert peaks[1] is not None
+    assert peaks[0] - peaks[1] == int(
+        HEIGHT * WIDTH * 3500.0
+    )  # one scale whose pixels hold 3000 bytes, and work on 500
 
 
 def test_the_measured_error_of_a_precision_is_said() -> None:
@@ -494,6 +552,7 @@ def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
         "second forward",
         "rasterizer",
         "convolutions",
+        "launches",
         "blend weights",
         "scales",
         "phase 1",

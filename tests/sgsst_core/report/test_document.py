@@ -49,6 +49,7 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     stylizer, before, after = finished
     report = build_report(stylizer, sources, "finished", before, after)
     assert report["version"] == REPORT_VERSION
+    assert report["graphs"] is None  # a CPU has none
     assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
     assert report["scene"] == {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2}
     assert report["style"] == {"path": "style.png", "width": 80, "height": 96}

@@ -1,0 +1,45 @@
+"""What it takes to launch the kernels of a view's loss: one by one, or as a captured graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sgsst_core.loss.graphs import LossGraphs, has_graphs
+from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.parallel.division import Size
+from sgsst_core.planning.cost import LaunchCost
+from sgsst_core.planning.pictures import soft_picture
+from sgsst_core.timing import Timer
+
+#: Of which the fastest counts: whatever else the machine does makes launches slower only.
+RUNS = 3
+
+
+def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
+    """Time the loss of a made-up view of a size (height, width), with its gradient, in both ways."""
+    if not has_graphs(loss.network.device):
+        return LaunchCost(problem="only NVIDIA GPUs are known to replay them")
+    picture = soft_picture(max(size))[: size[0], : size[1]].contiguous().to(loss.network.device)
+    style, view = loss.style_targets(picture.flip(0), size), loss.view_target(picture)
+    scales = list(range(loss.scale_count(*size)))
+    graphs = LossGraphs(loss)
+
+    def evaluate() -> SosResult:
+        return graphs.evaluate(picture, style, view, scales)
+
+    evaluate()  # as ever, for the first time: it prepares what kernels need
+    seconds = min(_seconds(loss, lambda: loss.evaluate(picture, style, view, scales)) for _ in range(RUNS))
+    first = _seconds(loss, evaluate)
+    if graphs.problem is not None:
+        return LaunchCost(problem=graphs.problem)
+    if not graphs.captured:
+        return LaunchCost(problem="a view's activations do not fit the memory twice")
+    replayed = min(_seconds(loss, evaluate) for _ in range(RUNS))
+    return LaunchCost(seconds, replayed, max(first - replayed, 0.0))
+
+
+def _seconds(loss: SosLoss, evaluate: Callable[[], SosResult]) -> float:
+    timer = Timer(loss.network.device)
+    with timer("evaluation"):
+        evaluate()
+    return timer.read()["evaluation"]

@@ -1,0 +1,85 @@
+"""CUDA graphs of the pretend device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch.utils._pytree import tree_leaves
+
+from tests.pretend_cuda import device
+
+
+@contextmanager
+def plainly() -> Iterator[None]:
+    """Without the device's modes: what the interpreter computes with is its own."""
+    with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
+        yield
+
+
+class CUDAGraph:
+    """Operations that were captured, to be done again with the very same tensors.
+
+    Capturing computes nothing on a GPU. Here it does, and what it has computed is made unusable at its end: numbers are
+    NaN until a replay has made them.
+    """
+
+    def __init__(self, keep_graph: bool = False) -> None:
+        self._steps: list[tuple[Any, Any, Any, list[torch.Tensor | None]]] = []
+        self._written: list[torch.Tensor] = []
+        self._done = False
+
+    def record(self, func: Any, args: Any, kwargs: Any, result: Any) -> None:
+        """Hold an operation, but for those that only make a view or reserve memory, which stays where it is."""
+        schema = getattr(func, "_schema", None)
+        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        places = {tensor.untyped_storage().data_ptr() for tensor in given}
+        made = [leaf for leaf in tree_leaves(result) if isinstance(leaf, torch.Tensor)]
+        into = [None if tensor.untyped_storage().data_ptr() in places else tensor for tensor in made]
+        fresh = [tensor for tensor in into if tensor is not None]
+        self._written += fresh
+        if schema is not None:
+            if schema.is_mutable:
+                self._written += given[:1]
+            elif not fresh or "empty" in schema.name:
+                return
+        self._steps.append((func, args, kwargs, into))
+
+    def end(self) -> None:
+        """Nothing more is captured."""
+        self._done = True
+        with plainly():
+            for tensor in self._written:
+                if tensor.is_floating_point():
+                    tensor.fill_(torch.nan)
+        self._written.clear()
+
+    def replay(self) -> None:
+        """All operations, in one launch."""
+        if not self._done:
+            raise RuntimeError("Called CUDAGraph::replay without a preceding successful capture.")
+        device.refuse_in_capture("another graph")
+        device.launch()
+        with plainly(), torch.no_grad():
+            for func, args, kwargs, into in self._steps:
+                found = [leaf for leaf in tree_leaves(func(*args, **kwargs)) if isinstance(leaf, torch.Tensor)]
+                for place, value in zip(into, found, strict=False):
+                    if place is not None:
+                        place.copy_(value)
+
+
+@contextmanager
+def graph(
+    cuda_graph: CUDAGraph, pool: Any = None, stream: Any = None, capture_error_mode: str = "global"
+) -> Iterator[None]:
+    """As `torch.cuda.graph`: what this thread asks of the device in the block is captured."""
+    device.refuse_in_capture("another capture")
+    device.wait()
+    device.capture.recorders.append(cuda_graph.record)
+    try:
+        yield
+    finally:
+        device.capture.recorders.clear()
+    cuda_graph.end()

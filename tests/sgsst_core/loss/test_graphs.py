@@ -1,0 +1,204 @@
+"""The loss from captured graphs against the loss kernel by kernel, on a pretend device: the same bits."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, has_graphs
+from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
+from sgsst_core.loss.tiling import Tiling
+from sgsst_core.stylizing.evaluation import StyleTargets
+from sgsst_core.timing import Timer
+from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
+from tests.pretend_cuda.runtime import pretend_cuda
+from tests.sgsst_core.pictures import picture
+
+pytest.importorskip("triton")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+HEIGHT, WIDTH = 32, 48
+SCALES = [0, 1]
+
+
+@pytest.fixture
+def counts() -> Iterator[Counts]:
+    with pretend_cuda() as found:
+        yield found
+
+
+@pytest.fixture
+def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels of PyTorch alone, which need no interpreter."""
+    leave_out_kernels(monkeypatch)
+
+
+def image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
+    return picture(height, width, seed=seed, dtype=torch.float32).to("cuda")
+
+
+def make_loss(weights: BackboneWeights, **options: Any) -> SosLoss:
+    return SosLoss(FeatureNetwork(weights, device="cuda"), coarsest=16, timer=Timer("cuda"), **options)
+
+
+def style_of(loss: SosLoss) -> StyleTargets:
+    return loss.style_targets(picture(40, 50, seed=1, dtype=torch.float32), (HEIGHT, WIDTH))
+
+
+def view_of(loss: SosLoss, seed: int, *, weighted: bool = False) -> ViewTarget:
+    coverage = image(seed + 1000)[:, :, 0].contiguous() if weighted else None
+    return loss.view_target(image(seed + 100), coverage)
+
+
+def assert_same(found: SosResult, expected: SosResult) -> None:
+    assert found.scales == expected.scales
+    assert found.image_gradient is not None
+    assert expected.image_gradient is not None
+    assert expected.image_gradient.cpu().abs().amax() > 0
+    assert found.image_gradient.cpu().equal(expected.image_gradient.cpu())
+    assert found.values.cpu().equal(expected.values.cpu())
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_graph_gives_the_same_bits_for_every_view(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, weighted: bool
+) -> None:
+    if not weighted:  # once is enough for the kernels in Triton, which take their time in the interpreter
+        leave_out_kernels(monkeypatch)
+    loss = make_loss(tiny_weights)
+    style, views = style_of(loss), [view_of(loss, seed, weighted=weighted) for seed in (2, 3)]
+    graphs, results = LossGraphs(loss), []
+    for step in range(4):
+        pixels, view = image(step), views[step % 2]
+        expected = loss.evaluate(pixels, style, view, SCALES)
+        counts.clear()
+        found = graphs.evaluate(pixels, style, view, SCALES)
+        assert graphs.captured == (step + 1 >= FIRST_VISITS)
+        if step >= FIRST_VISITS:
+            assert not counts.waits
+            assert not counts.copies
+            assert counts.launches.total() < 15  # one graph; image, content and coverage go in, values come out
+        assert_same(found, expected)
+        results.append((found.values, expected.values))
+    for values, expected_values in results:  # later evaluations have not changed them
+        assert values.cpu().equal(expected_values.cpu())
+    assert graphs.problem is None
+    assert loss.timer.read()["network"] > 0
+
+
+@pytest.mark.usefixtures("without_triton")
+def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneWeights) -> None:
+    """Scales, scale of the image, and style targets; graphs whose turns come in between do not disturb each other."""
+    loss = make_loss(tiny_weights)
+    whole, other = style_of(loss), loss.style_targets(picture(60, 60, seed=7, dtype=torch.float32), (HEIGHT, WIDTH))
+    content = image(8)
+    graphs = LossGraphs(loss)
+
+    def view(scales: list[int]) -> ViewTarget:
+        share = loss.share({scale: (HEIGHT >> scale, WIDTH >> scale) for scale in scales})
+        own = {scale: loss.content_features(content, scale, tiles) for scale, tiles in share.tiles.items()}
+        return ViewTarget(content=own, share=share)
+
+    for step in range(3):
+        for pixels, style, scales, image_scale in (
+            (image(step), whole, SCALES, 0),
+            (image(step), whole, [1], 0),
+            (image(step, HEIGHT // 2, WIDTH // 2), whole, [1], 1),
+            (image(step), other, [1], 0),
+        ):
+            expected = loss.evaluate(pixels, style, view(scales), scales, image_scale=image_scale)
+            found = graphs.evaluate(pixels, style, view(scales), scales, image_scale=image_scale)
+            assert_same(found, expected)
+    assert graphs.captured == 4
+
+
+@pytest.mark.usefixtures("without_triton")
+def test_there_are_no_more_graphs_than_asked_for(tiny_weights: BackboneWeights) -> None:
+    loss = make_loss(tiny_weights, content_weight=0.0)
+    view, styles = loss.view_target(image(2)), [style_of(loss), style_of(loss)]
+    graphs = LossGraphs(loss, most=1)
+    for step in range(3):
+        for style in styles:
+            assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
+    assert graphs.captured == 1
+
+
+@pytest.mark.usefixtures("without_triton")
+def test_what_cannot_be_captured_is_evaluated_as_ever(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loss = make_loss(tiny_weights, content_weight=0.0)
+    style, view = style_of(loss), loss.view_target(image(2))
+    graphs = LossGraphs(loss)
+    convolve = FeatureNetwork._convolve
+
+    def waits(network: FeatureNetwork, x: Tensor, step: Any) -> Tensor:
+        assert float(x.amax()) < 1e9  # a look at the device, which no graph can hold
+        return convolve(network, x, step)
+
+    monkeypatch.setattr(FeatureNetwork, "_convolve", waits)
+    timer = loss.timer
+    for step in range(4):
+        assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
+        assert graphs.captured == 0
+        assert loss.timer is timer
+        assert (graphs.problem is not None) is (step + 1 >= FIRST_VISITS)
+    assert graphs.problem == (
+        "RuntimeError: operation not permitted when stream is capturing: the host waits for the device"
+    )
+    assert not torch.cuda.is_current_stream_capturing()
+
+
+@pytest.mark.usefixtures("without_triton")
+@pytest.mark.parametrize(
+    ("options", "fits"), [({"tile_size": 32}, 9.0), ({"keep_activations": False}, 9.0), ({}, 1.9), ({}, 2.1)]
+)
+def test_only_scales_of_one_tile_that_fit_twice_are_captured(
+    tiny_weights: BackboneWeights, options: dict[str, Any], fits: float
+) -> None:
+    network = FeatureNetwork(tiny_weights, device="cuda")
+    once = HEIGHT * WIDTH * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel())
+    loss = make_loss(tiny_weights, content_weight=0.0, memory=int(fits * once), **options)
+    style, view = style_of(loss), loss.view_target(image(2))
+    graphs = LossGraphs(loss)
+    for step in range(FIRST_VISITS):
+        assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
+    assert (graphs.captured, graphs.problem) == (int(fits == 2.1), None)
+
+
+@pytest.mark.usefixtures("without_triton")
+def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
+    """Its features would be computed in every replay, of the view that was captured."""
+    loss = make_loss(tiny_weights)
+    style, view = style_of(loss), loss.view_target(image(2), keep_content=False)
+    graphs = LossGraphs(loss)
+    for step in range(FIRST_VISITS):
+        assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
+    assert (graphs.captured, graphs.problem) == (0, None)
+
+
+def test_where_graphs_are_thought_of(tiny_weights: BackboneWeights) -> None:
+    assert not has_graphs("cpu")
+    tiling = Tiling(halo=64, held=1000.0, working=0.25, coarsest=16)
+    assert can_be_captured(tiling, [400, 100])
+    assert not can_be_captured(tiling, [401, 100])
+    network = FeatureNetwork(tiny_weights, STYLE_LAYERS, device="cpu")
+
+    class Two:
+        rank, size, local_size = 0, 2, 2
+
+    loss = SosLoss(network, collectives=Two())  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="ranks tell each other"):
+        LossGraphs(loss)

@@ -1,0 +1,84 @@
+"""What is measured of launches, on a pretend device."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.planning import launches
+from sgsst_core.planning.launches import launch_cost
+from sgsst_core.planning.probe import LEAST_GRAPH_VISITS
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
+from tests.pretend_cuda.runtime import pretend_cuda
+from tests.small_scenes import cameras, style, wall
+
+pytest.importorskip("triton")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SIZE = 32, 48
+
+
+@pytest.fixture
+def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
+    """Kernels of PyTorch alone, which need no interpreter."""
+    with pretend_cuda() as found:
+        leave_out_kernels(monkeypatch)
+        yield found
+
+
+def test_both_ways_are_timed(counts: Counts, tiny_weights: BackboneWeights) -> None:
+    loss = SosLoss(FeatureNetwork(tiny_weights, device="cuda"), coarsest=16)
+    counts.clear()
+    found = launch_cost(loss, SIZE)
+    assert found.problem is None
+    assert found.seconds > 0
+    assert found.replayed > 0
+    assert found.capture >= 0
+    replays = [count for line, count in counts.launches.items() if "loss/graphs.py" in line]
+    assert launches.RUNS + 1 in replays  # with the one that follows the capture
+
+
+def test_what_cannot_be_timed_has_a_reason(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = FeatureNetwork(tiny_weights, device="cuda")
+    little = int(1.5 * SIZE[0] * SIZE[1] * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel()))
+    assert launch_cost(SosLoss(network, memory=little), SIZE).problem == (
+        "a view's activations do not fit the memory twice"
+    )
+    on_cpu = SosLoss(FeatureNetwork(tiny_weights, device="cpu"))
+    assert launch_cost(on_cpu, SIZE).problem == "only NVIDIA GPUs are known to replay them"
+
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("not here")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.cuda, "graph", broken)
+        assert launch_cost(SosLoss(network), SIZE).problem == "RuntimeError: not here"
+
+
+def test_a_job_measures_where_views_come_often_and_follows_its_plan(
+    counts: Counts, tiny_weights: BackboneWeights
+) -> None:
+    for steps, keep in ((LEAST_GRAPH_VISITS, ()), (LEAST_GRAPH_VISITS, ("launches",)), (LEAST_GRAPH_VISITS - 1, ())):
+        settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, keep=keep)
+        stylizer = Stylizer.planned(
+            wall(10, 8), cameras(2, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
+        )
+        decision = next(line for line in stylizer.plan.decisions if line.item == "launches")
+        measured = "ms a view" in decision.reason
+        assert measured is (steps == LEAST_GRAPH_VISITS and not keep)
+        assert (stylizer.graphs is not None) is stylizer.plan.graphs

@@ -1,0 +1,112 @@
+"""Whole steps with graphs of the loss, on a pretend device: the same bits, and few launches."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.graphs import FIRST_VISITS
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.survey import survey
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.document import Sources, build_report
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
+from tests.pretend_cuda.runtime import pretend_cuda
+from tests.small_scenes import ball, cameras, style, wall
+
+pytest.importorskip("triton")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+#: Launches of a step around its graph, at most: views and style are there, the rasterizer has its lists.
+MOST_LAUNCHES = 60
+
+
+@pytest.fixture
+def counts() -> Iterator[Counts]:
+    with pretend_cuda() as found:
+        yield found
+
+
+def make(
+    weights: BackboneWeights, *, graphs: bool, scan: bool = False, rasterizer: str = "triton", **values: Any
+) -> Stylizer:
+    """Of two views in two scales, three steps in each phase unless told otherwise."""
+    scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
+    settings = make_settings(**{"coarsest_side": 16, "steps_coarse": 3, "steps_sos": 3, **values})
+    looked = survey(scene, views, make_rasterizer("cpu", scene))
+    some = looked.total_blend_weights > 0
+    plan = Plan(
+        survey=looked,
+        optimised=some,
+        seen=some,
+        covered=tuple(looked.covered),
+        weighted=scan,
+        steps_coarse=settings.steps_coarse,
+        memory_limit=10**9,
+        device="cuda",
+        rasterizer=rasterizer,
+        graphs=graphs,
+    )
+    return Stylizer(plan, scene, views, style(), settings, weights=weights)
+
+
+@pytest.mark.parametrize("scan", [False, True])
+def test_steps_with_graphs_are_the_same_to_the_bit(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, scan: bool
+) -> None:
+    """Both phases, views in turn: of two that share a graph, the first one prepares it and the second is captured."""
+    if not scan:  # once is enough for the network's kernels in Triton, which take their time in the interpreter
+        leave_out_kernels(monkeypatch)
+    plain, graphs = (make(tiny_weights, graphs=graphs, scan=scan) for graphs in (False, True))
+    for _ in range(plain.total):
+        expected, stage = plain.run_step(), graphs.phase.stage
+        counts.clear()
+        found = graphs.run_step()
+        assert (found.view, found.loss, found.terms) == (expected.view, expected.loss, expected.terms)
+        if sum(record.stage == stage for record in graphs.history) > FIRST_VISITS:
+            assert counts.launches.total() < MOST_LAUNCHES
+            assert counts.waits.total() == 1
+            assert {"network", "render", "raster_backward"} <= found.parts.keys()
+            assert "vgg_forward" not in found.parts
+    assert graphs.stylized().equal(plain.stylized())
+    assert graphs.graphs is not None
+    assert (graphs.graphs.captured, graphs.graphs.problem) == (2, None)
+
+
+def test_several_views_a_step_and_a_resumed_run(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second view of a step does not change what was found of the first; a resumed run captures anew.
+
+    With kernels of PyTorch alone, and a rasterizer of the CPU: images and gradients come from there and go there.
+    """
+    leave_out_kernels(monkeypatch)
+    options: dict[str, Any] = {"rasterizer": "cpu", "views_per_step": 2, "scan": True, "steps_sos": 5}
+    plain, graphs, resumed = (make(tiny_weights, graphs=graphs, **options) for graphs in (False, True, True))
+    losses = [stylizer.run_step().loss for stylizer in (plain, graphs) for _ in range(5)]
+    assert losses[:5] == losses[5:]
+    resumed.load_state(graphs.state())
+    expected, *others = ([s.run_step().terms for _ in range(3)] for s in (plain, graphs, resumed))
+    assert others == [expected, expected]
+    for stylizer in (graphs, resumed):
+        assert stylizer.stylized().equal(plain.stylized())
+        assert stylizer.graphs is not None
+        assert stylizer.graphs.captured == (2 if stylizer is graphs else 1)
+        assert stylizer.graphs.problem is None
+    sources = Sources(Path("scene.ply"), 0, Path("style.png"), None, None, tiny_weights)
+    report = build_report(graphs, sources, "finished", graphs.start(), graphs.evaluate([0]))
+    assert report["graphs"] == {"captured": 2, "problem": None}
+    assert report["seconds_by_part"]["network"] > 0
