@@ -7,9 +7,9 @@ each runs it; the first one decides when it ends.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 from torch import Tensor
 
@@ -37,19 +37,32 @@ class Progress:
     seconds_left: float
 
 
+class Measuring(Protocol):
+    """Measures a job at moments between its steps."""
+
+    def __call__(self, stylizer: Stylizer) -> None:
+        """Measure now; puts an entry into `Stylizer.measured`."""
+
+    def due(self, step: int) -> bool:
+        """Whether the job is to be measured after so many steps."""
+
+    def seconds_left(self, step: int) -> float:
+        """That measuring is expected to take after so many steps."""
+
+
 @dataclass
 class Callbacks:
     """What the loop calls between iterations; each is optional.
 
-    `measure` and `moments` are the same on every rank; the others are the first rank's alone.
+    `measure` is the same on every rank; the others are the first rank's alone.
 
     Attributes:
         progress: after every iteration.
         stop: asked before every iteration; True ends the loop as "interrupted".
         checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
         preview: called with the stylizer about every `preview_seconds`.
-        measure: called with the stylizer after each of the `moments`, and before the first step for 0; its time does
-            not count as the job's.
+        measure: called with the stylizer after each step for which it is due, and before the first one for 0; its time
+            does not count as the job's.
     """
 
     progress: Callable[[Progress], None] | None = None
@@ -58,8 +71,7 @@ class Callbacks:
     checkpoint_seconds: float = 300.0
     preview: Callable[[Stylizer], None] | None = None
     preview_seconds: float = 60.0
-    measure: Callable[[Stylizer], None] | None = None
-    moments: Container[int] = ()
+    measure: Measuring | None = None
 
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
@@ -109,7 +121,7 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
     measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # before a resume
-    if callbacks.measure and stylizer.step in callbacks.moments and not measured:
+    if callbacks.measure and not measured and callbacks.measure.due(stylizer.step):
         callbacks.measure(stylizer)
 
 
