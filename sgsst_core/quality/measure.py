@@ -65,7 +65,7 @@ class Measurements:
     def seconds_left(self, step: int) -> float:
         """What the moments after so many steps will take, and the loss at the end."""
         expected, measured = self._stylizer.plan.prediction, self._stylizer.measured
-        left = sum(moment > step for moment in self.moments)
+        left = sum(moment >= step and not (measured and moment == measured[-1]["step"]) for moment in self.moments)
         price: float
         before = 2 * expected.evaluation if expected else 0.0
         known: list[float] = [entry["seconds"] for entry in measured[1:] if "seconds" in entry]

@@ -15,10 +15,12 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import has_converged, has_reached
+from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import PhotoLoader
 
@@ -27,7 +29,15 @@ Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interr
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress bar shows."""
+    """What a progress bar shows.
+
+    Attributes:
+        stage: "coarse" or "sos", of the step that was made; "measuring" where the job is measured after it.
+        step: made so far, of `total`.
+        loss: of the step.
+        seconds: of all steps so far.
+        seconds_left: until the job ends, with all that is measured.
+    """
 
     stage: str
     step: int
@@ -77,23 +87,24 @@ class Callbacks:
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     """Iterate to the end of the schedule, or until one of the settings' limits or `callbacks.stop` ends it before."""
     callbacks = callbacks or Callbacks()
-    started, before = time.perf_counter(), stylizer.step
-    last_checkpoint = last_preview = started
+    last_checkpoint = last_preview = time.perf_counter()
+    pace = _pace(stylizer)
     _measure(stylizer, callbacks)
     while stylizer.step < stylizer.total:
         reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
             return _end_early(stylizer, callbacks, reason)
-        stylizer.run_step()
+        _step(stylizer, pace)
         now = time.perf_counter()
         if callbacks.progress:
-            callbacks.progress(_progress(stylizer, (now - started) / (stylizer.step - before)))
+            callbacks.progress(_progress(stylizer, callbacks, pace))
         if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
             _checkpoint(stylizer, callbacks.checkpoint)
             last_checkpoint = time.perf_counter()
         if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
             callbacks.preview(stylizer)
             last_preview = time.perf_counter()
+        pace.add_beside(time.perf_counter() - now)
         _measure(stylizer, callbacks)
     return "finished"
 
@@ -125,12 +136,42 @@ def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
         callbacks.measure(stylizer)
 
 
-def _progress(stylizer: Stylizer, seconds_per_step: float) -> Progress:
-    record = stylizer.history[-1]
-    left = seconds_per_step * (stylizer.total - stylizer.step)
-    if stylizer.settings.max_seconds:
-        left = min(left, max(stylizer.settings.max_seconds - stylizer.seconds, 0.0))
-    return Progress(record.stage, record.step, stylizer.total, record.loss, stylizer.seconds, left)
+def _pace(stylizer: Stylizer) -> SecondsLeft:
+    """What tells the seconds left, with the steps of sessions before this one."""
+    expected = stylizer.plan.prediction or Prediction(0.0, 0.0, 0)
+    seconds = {
+        "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
+        "sos": (expected.seconds, expected.first_visit),
+    }
+    phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.schedule]
+    views_per_step = stylizer.settings.views_per_step
+    pace = SecondsLeft(phases, stylizer.views.covered, views_per_step, stylizer.prepared)
+    if views_per_step == 1:  # records name one view of each step
+        before = 0.0
+        for record in stylizer.history:
+            pace.add_step(record.stage, [record.view], record.seconds - before, record.parts.get("prepare", 0.0))
+            before = record.seconds
+        pace.resume()
+    return pace
+
+
+def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
+    """Make a step and count what it took."""
+    before = stylizer.seconds
+    record = stylizer.run_step()
+    pace.add_step(record.stage, stylizer.latest, stylizer.seconds - before, record.parts.get("prepare", 0.0))
+
+
+def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:
+    record, most, measure = stylizer.history[-1], stylizer.settings.max_seconds, callbacks.measure
+    left = pace.left(
+        stylizer.step,
+        stylizer.coming,
+        measuring=measure.seconds_left(stylizer.step) if measure else 0.0,
+        limit=most - stylizer.seconds if most else None,
+    )
+    stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
+    return Progress(stage, record.step, stylizer.total, record.loss, stylizer.seconds, left)
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

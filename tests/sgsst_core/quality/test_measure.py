@@ -86,7 +86,8 @@ def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> N
     for prediction, steps in ((LONG, [0, 1, 2, 4, 8, 16]), (EXPENSIVE, [0, 16])):
         stopped = make(tiny_weights, prediction)
         measure = Measurements(stopped)
-        run(stopped, Callbacks(measure=measure, stop=lambda stopped=stopped: stopped.step == 3))
+        asked = iter([False, False, False, True])
+        run(stopped, Callbacks(measure=measure, stop=asked.__next__))
         before = list(stopped.measured)
         resumed = make(tiny_weights, LONG, level=2)
         going_on = Measurements(resumed)
@@ -101,9 +102,11 @@ def test_seconds_left_of_measuring(tiny_weights: BackboneWeights) -> None:
     """First the plan's, then what a moment takes after the first one, then their median; the loss at the end."""
     stylizer = make(tiny_weights, Prediction(1.0, 1.0, 0, evaluation=3.0, measuring=18.0, job=100.0))
     measure = Measurements(stylizer)
-    assert measure.seconds_left(0) == 5 * 2.0 + 3.0  # 12 s of 6 moments; that of step 0 is being measured
+    assert measure.seconds_left(0) == 6 * 2.0 + 3.0  # 12 s of 6 moments
     stylizer.measured = [{"step": 0, "level": 0, "again": 1.5, "seconds": 9.0}]
     assert measure.seconds_left(0) == 5 * 1.5 + 3.0
     stylizer.measured += [{"step": step, "seconds": seconds} for step, seconds in ((1, 5.0), (2, 0.5), (4, 1.0))]
     assert measure.seconds_left(4) == 2 * 1.0 + 3.0
+    assert measure.seconds_left(8) == 2 * 1.0 + 3.0  # that of step 8 comes next
+    stylizer.measured += [{"step": step, "seconds": 1.0} for step in (8, STEPS)]
     assert measure.seconds_left(STEPS) == 3.0
