@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
@@ -18,6 +18,19 @@ from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
+
+
+#: Seconds that compiling kernels may take on a machine where nothing has been compiled yet.
+_COMPILING = 60.0
+
+
+@dataclass(frozen=True)
+class _Affordable:
+    """What prices allow: place in `LEVELS`, seconds of a moment after the first; whether prices may have been wrong."""
+
+    place: int
+    again: float
+    once_more: bool
 
 
 class Measurements:
@@ -132,31 +145,47 @@ class Measurements:
     def _first(self, colours: Tensor, seconds: float) -> dict[str, Any]:
         """How much is measured, from what one view of it takes; seconds: of the gradient's error."""
         stylizer, place = self._stylizer, self._stylizer.plan.measuring
-        level, again = LEVELS[place], 0.0
-        if stylizer.step < stylizer.total and level is not LEVELS[-1]:
-            lpips = load_lpips_or_none(stylizer.network.device)  # is not what a view takes
-            started = time.perf_counter()
-            held_out = self._make(1, lpips)
-            ready = time.perf_counter()
+        again = 0.0
+        if stylizer.step < stylizer.total and LEVELS[place] is not LEVELS[-1]:
+            held_out, prices = self._trial(colours, seconds)
             if held_out.views:
-                held_out.measure(colours.to(held_out.rasterizer.device))
-                prices = Prices(ready - started, time.perf_counter() - ready, seconds)
-                place, again = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
-                level = LEVELS[place]
-            if level.views == 1:
+                found = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
+                if found.once_more:
+                    if self.approximated:
+                        started = time.perf_counter()
+                        self.exact.gradient_error()
+                        seconds = time.perf_counter() - started
+                    prices = self._trial(colours, seconds)[1]
+                    found = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
+                place, again = found.place, found.again
+            if LEVELS[place].views == 1:
                 self._held_out = held_out
         if self._held_out is None:
-            self._held_out = self._make(level.views)
+            self._held_out = self._make(LEVELS[place].views)
         return {"level": place, "again": again}
 
-    def _affordable(self, place: int, prices: Prices) -> tuple[int, float]:
-        """The level that these prices allow, from the plan's on, and what a moment takes after the first one."""
+    def _trial(self, colours: Tensor, seconds: float) -> tuple[HeldOut, Prices]:
+        """One view of colours [N, 3], measured, and its price; seconds: of the gradient's error."""
+        lpips = load_lpips_or_none(self._stylizer.network.device)  # is not what a view takes
+        started = time.perf_counter()
+        held_out = self._make(1, lpips)
+        ready = time.perf_counter()
+        if held_out.views:
+            held_out.measure(colours.to(held_out.rasterizer.device))
+        return held_out, Prices(ready - started, time.perf_counter() - ready, seconds)
+
+    def _affordable(self, place: int, prices: Prices) -> _Affordable:
+        """The level that these prices allow, from the plan's on.
+
+        Kernels are compiled at first use: where a price may be that of compiling, it is found once more.
+        """
         stylizer = self._stylizer
-        expected = stylizer.plan.prediction
+        expected, found = stylizer.plan.prediction, place
         if expected is not None:
             allowed = held_out_seconds(stylizer.settings.measure, expected)
-            place = choose_level(prices, allowed, stylizer.total, place)
-        return place, prices.again(LEVELS[place])
+            found = choose_level(prices, allowed, stylizer.total, place)
+        quick = prices.setup + prices.view + prices.moment < _COMPILING
+        return _Affordable(found, prices.again(LEVELS[found]), found != place and quick)
 
     def _of_held_out_views(self) -> HeldOut:
         if self._held_out is None:
