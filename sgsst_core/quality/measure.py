@@ -19,7 +19,6 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
 
-
 #: Seconds that compiling kernels may take on a machine where nothing has been compiled yet.
 _COMPILING = 60.0
 
