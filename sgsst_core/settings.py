@@ -136,6 +136,11 @@ class Settings(BaseModel):
     keep: Annotated[tuple[Item, ...], Option(instead="keep_everything")] = Field(
         (), description="Items that are not left out although the scene does not need them; the result is the same."
     )
+    measure: Annotated[Share, Option(unit="share of the steps' seconds", metavar="S")] = Field(
+        0.1,
+        description="Measure views between the cameras for S of the steps' predicted time, or 30 s if that is more; 0 "
+        "measures none.",
+    )
 
     def learning_rate_at(self, share: float) -> float:
         """Adam's learning rate when `share` (0..1) of all steps is done."""

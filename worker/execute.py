@@ -80,7 +80,7 @@ def execute(
         _make_room(job.outputs)
     stylizer.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.plan)))
     checkpoint = _CheckpointWriter(job, before, run_id or secrets.token_hex(8), saved, warn)
-    callbacks = Callbacks(measure=measure, moments=measure.moments, checkpoint_seconds=checkpoint_seconds)
+    callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds)
     if first:
         callbacks.progress, callbacks.stop = progress, stop
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
@@ -134,8 +134,7 @@ def _finish(job: Job, stopped: Stopped, before: Evaluation, measure: Measurement
     stylizer.collectives.broadcast(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
-    if stylizer.measured[-1]["step"] != stylizer.step:
-        measure(stylizer)
+    measure.at_the_end()
     after = measure.evaluate()
     error = _write_reports(job, stopped, before, after) if first else None
     found = bought(stylizer, before)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 #: Where no bar can be drawn (a log file), a line is printed instead, this often.
 LOG_SECONDS = 60.0
+_STAGES = {"coarse": "coarsest scale", "sos": "all scales", "measuring": "measuring"}
 
 
 def live_bar(console: Console, *columns: ProgressColumn) -> Progress:
@@ -44,7 +45,7 @@ class JobBar:
 
     def show(self, progress: StepProgress) -> None:
         """Show a step."""
-        stage = "coarsest scale" if progress.stage == "coarse" else "all scales"
+        stage = _STAGES[progress.stage]
         loss, left = f"loss {progress.loss:.3g}", f"{clock(progress.seconds_left)} left"
         self._show(stage, progress.step, progress.total, f"{loss} {left}")
         self._print_now_and_then(f"{stage}: step {progress.step} of {progress.total}", loss, left)

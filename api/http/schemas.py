@@ -68,13 +68,13 @@ class ProgressView(BaseModel):
     )
 
     stage: str = Field(
-        description="`reading`, `planning` (looking at the views), `starting`, `coarse` (coarsest scale) or `sos` (all "
-        "scales)."
+        description="`reading`, `planning` (looking at the views), `starting`, `coarse` (coarsest scale), `sos` (all "
+        "scales) or `measuring` (views between the cameras)."
     )
     step: int = Field(description="Steps done; views looked at while `planning`.")
     total: int = Field(description="Steps, or views, at most; 0 while they are not known.")
     fraction: float = Field(description="Of the steps, or of the views, 0 to 1.")
-    eta_s: float | None = Field(description="Seconds left, as far as that can be told.")
+    eta_s: float | None = Field(description="Seconds left with all that is measured, as far as that can be told.")
     loss: float | None
     seconds: float | None = Field(description="Of all steps so far.")
     attempt: int

@@ -32,6 +32,7 @@ class RasterCost:
         bytes: of the kept weights of all views, float32; None where they would not be kept anyway.
         half_bytes: the same, half precision.
         keeping_seconds: of making a view's kept weights; None where that was not measured, on the CPU.
+        first_seconds: that the first render of a view takes beside later ones.
     """
 
     seconds: float
@@ -39,6 +40,7 @@ class RasterCost:
     bytes: int | None = None
     half_bytes: int | None = None
     keeping_seconds: float | None = None
+    first_seconds: float = 0.0
 
     @property
     def least_visits(self) -> float | None:

@@ -16,6 +16,7 @@ from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
 from sgsst_core.planning.choices import GPU_RASTERIZERS, optimised_gaussians, precision_of, rendered_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, Work, content_bytes, image_bytes, pieces_of
+from sgsst_core.planning.job import of_measuring, whole_job
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
@@ -74,7 +75,11 @@ class _Deciding:
     def plan(self) -> Plan:
         """Decisions and prediction."""
         expected, ranks, line = self._one_rank() if self.probe.machine.ranks == 1 else self._several_ranks()
-        return replace(self.base, ranks=ranks, decisions=self._decisions(line), prediction=expected)
+        coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
+        expected, measuring = whole_job(expected, self.base, self.probe, self.settings, work=self.work, coarse=coarse)
+        plan = replace(self.base, ranks=ranks, measuring=measuring, prediction=expected)
+        measured = [of_measuring(plan, expected, self.settings)] if self.measured else []
+        return replace(plan, decisions=(*self._decisions(line), *measured))
 
     def _without_decisions(self) -> Plan:
         probe, settings = self.probe, self.settings
@@ -194,7 +199,8 @@ class _Deciding:
         network, raster = self.probe.network, self._raster_seconds
         coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
         peak, on_device = self._peak_bytes(int(self.work.peak * network.held_bytes))
-        seconds = (self.work.seconds(network.rate) + raster, coarse.seconds(network.rate) + raster)
+        turns = self.settings.views_per_step
+        seconds = (turns * (self.work.seconds(network.rate) + raster), turns * (coarse.seconds(network.rate) + raster))
         return Prediction(*seconds, peak, device_bytes=on_device), 1, None
 
     def _several_ranks(self) -> tuple[Prediction, int, Decision]:

@@ -46,6 +46,11 @@ class Prediction:
         communication: seconds of an SOS iteration in which a rank waits for what others send.
         seconds_one_rank: of an SOS iteration on one rank; None where there is only one.
         device_bytes: of a GPU's memory, at any time; None where a CPU computes.
+        first_visit: seconds that a view's first visit in phase 2 takes beside those of an iteration.
+        first_visit_coarse: the same in phase 1.
+        evaluation: seconds of the loss on the evaluation views, once they have been visited.
+        measuring: seconds of all that is measured beside the steps.
+        job: seconds of all steps, with first visits, and of measuring.
     """
 
     seconds: float
@@ -54,6 +59,11 @@ class Prediction:
     communication: float = 0.0
     seconds_one_rank: float | None = None
     device_bytes: int | None = None
+    first_visit: float = 0.0
+    first_visit_coarse: float = 0.0
+    evaluation: float = 0.0
+    measuring: float = 0.0
+    job: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,7 @@ class Plan:
         kept_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         measured: the prediction counts what measuring between steps and the report take.
+        measuring: what is measured between steps, at most: place in `measuring.LEVELS`.
         ranks: how many take part.
         decisions: for people.
         prediction: for comparison with what happens.
@@ -98,6 +109,7 @@ class Plan:
     kept_weights: KeptWeights = "none"
     coarse_weights: bool = False
     measured: bool = False
+    measuring: int = 0
     ranks: int = 1
     decisions: tuple[Decision, ...] = ()
     prediction: Prediction | None = None

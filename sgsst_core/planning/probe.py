@@ -356,10 +356,13 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     scene, rasterizer = workshop.scene, workshop.rasterizer
     count = min(SAMPLED_VIEWS, len(cameras))
     sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
-    seconds = [_raster_seconds(rasterizer, len(scene), camera) for camera in sample]
+    timed = [_raster_seconds(rasterizer, len(scene), camera) for camera in sample]
+    seconds = [later for _, later in timed]
     mean = sum(seconds) / count
+    # The least: one of them may have compiled something, or waited for memory.
+    more = max(min(first - later for first, later in timed), 0.0)
     if rasterizer.name == "cuda":
-        return RasterCost(mean)
+        return RasterCost(mean, first_seconds=more)
     anew = rasterizer
     if not isinstance(anew, CpuRasterizer | TritonRasterizer):
         anew = CpuRasterizer(scene, near=workshop.settings.near)
@@ -369,14 +372,14 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     middle = count // 2
     fitting = [form for form, size in zip(_FORMS, sizes[middle], strict=True) if size <= budget]
     if not fitting:
-        return RasterCost(mean, None, total, half)
+        return RasterCost(mean, None, total, half, first_seconds=more)
     keeping = None
     if isinstance(anew, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
         keeping = _keeping_seconds(cached, sample[middle], fitting[0])
     cached = CachedRasterizer(scene, precision=fitting[0], anew=anew)
-    kept = _raster_seconds(cached, len(scene), sample[middle])
+    kept = _raster_seconds(cached, len(scene), sample[middle])[1]
     # Of the mean view, as the seconds it is compared with.
-    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping)
+    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, more)
 
 
 def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPrecision) -> float:
@@ -390,16 +393,16 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
     return seconds
 
 
-def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera) -> float:
-    """Of the second of two renders with gradient: the first one prepares the view."""
+def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera) -> tuple[float, float]:
+    """Of two renders with gradient: the first one prepares the view."""
     colours = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
-    seconds = 0.0
-    for _ in range(2):
+    seconds = [0.0, 0.0]
+    for visit in range(2):
         started = time.perf_counter()
         rasterizer.colour_gradient(rasterizer.render(colours, camera), camera)
         _wait_for(rasterizer.device)
-        seconds = time.perf_counter() - started
-    return seconds
+        seconds[visit] = time.perf_counter() - started
+    return seconds[0], seconds[1]
 
 
 def _wait_for(device: torch.device) -> None:

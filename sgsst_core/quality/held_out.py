@@ -54,11 +54,6 @@ _OUTLOOK_SIDE = 160
 _COSINE_ROUNDING = 1e-6
 
 
-def moments(total_steps: int) -> list[int]:
-    """Steps after which a run of `total_steps` is measured: none, 1/32, 1/16, 1/8, 1/4, half of it, and all."""
-    return sorted({0, *(total_steps >> halvings for halvings in range(6))})
-
-
 def neighbours(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     """The pairs that held-out cameras lie between: each two neighbours; neighbours in space follow each other.
 
@@ -147,6 +142,7 @@ class HeldOut:
         weighted: weigh statistics by rendered coverage, as the job does.
         lpips: None leaves LPIPS out.
         first: `HeldOutMoment.gram` of the run's first measurement, where a session before this one has made it.
+        most: views whose Gram distance is measured, and pairs of each range that are compared, at most.
         memory: bytes that coverage, colours, warps and pictures may take; what does not fit is computed again.
 
     Attributes:
@@ -168,6 +164,7 @@ class HeldOut:
         weighted: bool,
         lpips: Lpips | None = None,
         first: dict[int, float] | None = None,
+        most: int = MOST_VIEWS,
         memory: int = 1 << 29,
     ) -> None:
         self.scene = scene
@@ -192,14 +189,16 @@ class HeldOut:
         self._picture_memory = memory // 4
         parents = neighbours([cameras[index] for index in covered])
         self.cameras = [between(*pair) for pair in parents]
-        self.views, self.pairs = self._choose(parents)
+        self.views, self.pairs = self._choose(parents, most)
 
-    def _choose(self, parents: list[tuple[Camera, Camera]]) -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
+    def _choose(
+        self, parents: list[tuple[Camera, Camera]], most: int
+    ) -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
         """Views and pairs to measure, evenly spread over the held-out views; those inside of something are dropped."""
         count = len(self.cameras)
-        pairs = {gap: view_pairs(count, gap, MOST_VIEWS) for gap in (SHORT_RANGE, LONG_RANGE)}
+        pairs = {gap: view_pairs(count, gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
         # the first views of the short pairs: they have to be rendered anyway, and are as even
-        views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(count))
+        views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(min(count, most)))
         used = {*views, *(index for chosen in pairs.values() for pair in chosen for index in pair)}
         clear = {index for index in used if self._is_clear(self.cameras[index], parents[index])}
         return [index for index in views if index in clear], {

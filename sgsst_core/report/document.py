@@ -145,7 +145,7 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
     """What happened, beside the plan's prediction.
 
     Median seconds of a step of either phase and, in the second, of waiting for other ranks; the speed-up over one rank,
-    whose seconds are the predicted ones; peak memory of the process and of its GPU in bytes.
+    whose seconds are the predicted ones; peak memory of the process and of its GPU in bytes; seconds of measuring.
     """
     values = {
         stage: [
@@ -166,6 +166,7 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
         "speed_up": one_rank / seconds["sos"] if one_rank and seconds["sos"] else None,
         "peak_bytes": peak_memory(),
         "device_bytes": device_peak(stylizer.network.device),
+        "measuring": stylizer.seconds_by_part.get("measuring"),
     }
 
 

@@ -47,7 +47,11 @@ _PARTS = {
     "optimiser": "optimiser",
     "prepare": "preparing views and style",
     "loss": "loss and pyramid",
+    "checkpoint": "checkpoints",
+    "measuring": "measuring, beside the steps",
 }
+#: Parts of the time that are not the steps'.
+_BESIDE = ("checkpoint", "measuring")
 _ENVIRONMENT = Environment(
     loader=PackageLoader("sgsst_core.report"),
     autoescape=True,  # names of scenes, views and files are whatever users wrote
@@ -177,9 +181,10 @@ def _approximations(report: dict[str, Any]) -> dict[str, Any] | None:
 
 def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
     """Parts of the time with their share, the longest first."""
-    parts = {_PARTS.get(name, name): seconds for name, seconds in (report.get("seconds_by_part") or {}).items()}
+    found = report.get("seconds_by_part") or {}
+    parts = {_PARTS.get(name, name): seconds for name, seconds in found.items()}
     measured = sum(parts.values())
-    total = max(report["seconds"], measured)
+    total = max(report["seconds"] + sum(found.get(name, 0.0) for name in _BESIDE), measured)
     if not total:
         return []
     ordered = sorted(parts.items(), key=lambda part: -part[1])

@@ -93,6 +93,8 @@ def prediction_table(report: dict[str, Any]) -> Table:
         _beside("a step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
         _beside("peak memory", predicted.get("peak_bytes"), measured.get("peak_bytes"), byte_count),
     ]
+    if predicted.get("measuring") and measured.get("measuring") is not None:
+        rows.append(_beside("measuring, in all", predicted["measuring"], measured["measuring"], duration))
     on_device = predicted.get("device_bytes"), measured.get("device_bytes")
     if any(value is not None for value in on_device):
         rows.append(_beside("peak memory of the GPU", *on_device, byte_count))

@@ -37,9 +37,9 @@ FORMAT_VERSION = "5"
 _ONE_MEMORY = "4"
 #: Its plans do not say which network and rasterizer run; see `_completed`.
 _PLANS_WITHOUT_DEVICE = "3"
-#: Settings that may differ between a checkpoint and the run that goes on from it: they only end it, or (the memory
-#: limit, which decides the partition) change no more than its rounding.
-_FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit"}
+#: Settings that may differ between a checkpoint and the run that goes on from it: they only end it or say what is
+#: measured, or (the memory limit, which decides the partition) change no more than its rounding.
+_FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit", "measure"}
 
 
 @dataclass(frozen=True)

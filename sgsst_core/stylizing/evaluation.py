@@ -8,18 +8,16 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss.terms import LayerTarget, LossTerms
+from sgsst_core.planning.job import EVALUATION_VIEWS
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.views import Views
-
-#: Views on which a job is evaluated before and after, and which the contact sheet shows.
-EVALUATION_VIEWS = 4
 
 Evaluation = dict[int, LossTerms]
 StyleTargets = dict[int, dict[str, LayerTarget]]
 
 
 def evaluation_views(covered: Sequence[int]) -> list[int]:
-    """At most four of some views, evenly spread."""
+    """At most four of some views, evenly spread; the contact sheet shows them too."""
     count = min(EVALUATION_VIEWS, len(covered))
     return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
 

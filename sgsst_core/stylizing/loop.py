@@ -7,19 +7,21 @@ each runs it; the first one decides when it ends.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import has_converged, has_reached
+from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
 Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interrupted"]
@@ -27,7 +29,15 @@ Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interr
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress bar shows."""
+    """What a progress bar shows.
+
+    Attributes:
+        stage: "coarse" or "sos", of the step that was made; "measuring" where the job is measured after it.
+        step: made so far, of `total`.
+        loss: of the step.
+        seconds: of all steps so far.
+        seconds_left: until the job ends, with all that is measured.
+    """
 
     stage: str
     step: int
@@ -37,19 +47,32 @@ class Progress:
     seconds_left: float
 
 
+class Measuring(Protocol):
+    """Measures a job at moments between its steps."""
+
+    def __call__(self, stylizer: Stylizer) -> None:
+        """Measure now; puts an entry into `Stylizer.measured`."""
+
+    def due(self, step: int) -> bool:
+        """Whether the job is to be measured after so many steps."""
+
+    def seconds_left(self, step: int) -> float:
+        """That measuring is expected to take after so many steps."""
+
+
 @dataclass
 class Callbacks:
     """What the loop calls between iterations; each is optional.
 
-    `measure` and `moments` are the same on every rank; the others are the first rank's alone.
+    `measure` is the same on every rank; the others are the first rank's alone.
 
     Attributes:
         progress: after every iteration.
         stop: asked before every iteration; True ends the loop as "interrupted".
         checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
         preview: called with the stylizer about every `preview_seconds`.
-        measure: called with the stylizer after each of the `moments`, and before the first step for 0; its time does
-            not count as the job's.
+        measure: called with the stylizer after each step for which it is due, and before the first one for 0; its time
+            does not count as the job's.
     """
 
     progress: Callable[[Progress], None] | None = None
@@ -58,8 +81,7 @@ class Callbacks:
     checkpoint_seconds: float = 300.0
     preview: Callable[[Stylizer], None] | None = None
     preview_seconds: float = 60.0
-    measure: Callable[[Stylizer], None] | None = None
-    moments: Container[int] = ()
+    measure: Measuring | None = None
 
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
@@ -72,23 +94,24 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
 
 def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     """As `run`, which clears up after it."""
-    started, before = time.perf_counter(), stylizer.step
-    last_checkpoint = last_preview = started
+    last_checkpoint = last_preview = time.perf_counter()
+    pace = _pace(stylizer)
     _measure(stylizer, callbacks)
     while stylizer.step < stylizer.total:
         reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
             return _end_early(stylizer, callbacks, reason)
-        stylizer.run_step()
+        _step(stylizer, pace)
         now = time.perf_counter()
         if callbacks.progress:
-            callbacks.progress(_progress(stylizer, (now - started) / (stylizer.step - before)))
+            callbacks.progress(_progress(stylizer, callbacks, pace))
         if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
             _checkpoint(stylizer, callbacks.checkpoint)
             last_checkpoint = time.perf_counter()
         if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
             callbacks.preview(stylizer)
             last_preview = time.perf_counter()
+        pace.add_beside(time.perf_counter() - now)
         _measure(stylizer, callbacks)
     return "finished"
 
@@ -116,16 +139,46 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
     measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # before a resume
-    if callbacks.measure and stylizer.step in callbacks.moments and not measured:
+    if callbacks.measure and not measured and callbacks.measure.due(stylizer.step):
         callbacks.measure(stylizer)
 
 
-def _progress(stylizer: Stylizer, seconds_per_step: float) -> Progress:
-    record = stylizer.history[-1]
-    left = seconds_per_step * (stylizer.total - stylizer.step)
-    if stylizer.settings.max_seconds:
-        left = min(left, max(stylizer.settings.max_seconds - stylizer.seconds, 0.0))
-    return Progress(record.stage, record.step, stylizer.total, record.loss, stylizer.seconds, left)
+def _pace(stylizer: Stylizer) -> SecondsLeft:
+    """What tells the seconds left, with the steps of sessions before this one."""
+    expected = stylizer.plan.prediction or Prediction(0.0, 0.0, 0)
+    seconds = {
+        "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
+        "sos": (expected.seconds, expected.first_visit),
+    }
+    phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.schedule]
+    views_per_step = stylizer.settings.views_per_step
+    pace = SecondsLeft(phases, stylizer.views.covered, views_per_step, stylizer.prepared)
+    if views_per_step == 1:  # records name one view of each step
+        before = 0.0
+        for record in stylizer.history:
+            pace.add_step(record.stage, [record.view], record.seconds - before, record.parts.get("prepare", 0.0))
+            before = record.seconds
+        pace.resume()
+    return pace
+
+
+def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
+    """Make a step and count what it took."""
+    before = stylizer.seconds
+    record = stylizer.run_step()
+    pace.add_step(record.stage, stylizer.latest, stylizer.seconds - before, record.parts.get("prepare", 0.0))
+
+
+def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:
+    record, most, measure = stylizer.history[-1], stylizer.settings.max_seconds, callbacks.measure
+    left = pace.left(
+        stylizer.step,
+        stylizer.coming,
+        measuring=measure.seconds_left(stylizer.step) if measure else 0.0,
+        limit=most - stylizer.seconds if most else None,
+    )
+    stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
+    return Progress(stage, record.step, stylizer.total, record.loss, stylizer.seconds, left)
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

@@ -94,6 +94,8 @@ class Stylizer:
         self.history: list[StepRecord] = []
         #: What was measured between steps (`loop.Callbacks.measure`): values for JSON, kept through a resume.
         self.measured: list[dict[str, Any]] = []
+        #: Views of the latest step.
+        self.latest: list[int] = []
         self.weights = weights
         self.photos = photos
         self.style = style
@@ -264,7 +266,7 @@ class Stylizer:
         phase = self.phase
         if phase.scale is None:
             self._coarse = None  # phase 1 is over
-        views = [self._next_view() for _ in range(self.settings.views_per_step)]
+        self.latest = views = [self._next_view() for _ in range(self.settings.views_per_step)]
         gradient, results = self._mean_gradient(views, phase)
         with self.timer("optimiser"):
             largest = self._optimiser.update(gradient, self.settings.learning_rate_at(self.share_done()))
@@ -382,6 +384,16 @@ class Stylizer:
         else:
             return
         self.views.look_ahead(index, phase.scales(self.scale_count(index)))
+
+    @property
+    def coming(self) -> list[int]:
+        """Views left in this round, the next one first."""
+        return self._queue[::-1]
+
+    @property
+    def prepared(self) -> list[int]:
+        """Views that had been visited before the first step, for the loss of the unstylized scene."""
+        return self.evaluation_views if self._start is not None else []
 
     def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
         """Mean SOS loss over views, split by scale; changes nothing, its time does not count.

@@ -477,9 +477,16 @@ def test_kept_coarse_weights_need_no_exchange_of_images() -> None:
 
 def test_measuring_takes_memory_but_changes_no_decision() -> None:
     plain, measured = (decide(probe(), make_settings(), measured=flag) for flag in (False, True))
-    assert plain.decisions == measured.decisions
+    assert plain.decisions == measured.decisions[:-1]
     assert plain.prediction is not None
-    assert measured.prediction == replace(plain.prediction, peak_bytes=plain.prediction.peak_bytes + MEASURING_BYTES)
+    assert measured.prediction is not None
+    assert measured.prediction.measuring > 2 * measured.prediction.evaluation > 0 == plain.prediction.measuring
+    assert measured.prediction == replace(
+        plain.prediction,
+        peak_bytes=plain.prediction.peak_bytes + MEASURING_BYTES,
+        measuring=measured.prediction.measuring,
+        job=plain.prediction.job + measured.prediction.measuring,
+    )
     assert (plain.measured, measured.measured) == (False, True)
 
 

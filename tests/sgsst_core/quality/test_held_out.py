@@ -22,8 +22,9 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.loss.sos_reference import box_average_reference, features_reference
 from sgsst_core.loss.terms import GRAM_WEIGHT
+from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE
-from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, moments, neighbours
+from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbours
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
@@ -174,7 +175,7 @@ def test_an_unordered_list_is_put_in_order(seed: int):
     ],
 )
 def test_moments_are_geometric_and_hold_both_ends(total: int, expected: list[int]):
-    assert moments(total) == expected
+    assert LEVELS[0].moments(total) == expected
 
 
 @pytest.fixture(scope="module")

@@ -290,5 +290,5 @@ def test_fingerprint_tells_jobs_apart() -> None:
 
 def test_fingerprint_leaves_budgets_free() -> None:
     scene, views, image = wall(), cameras(), style()
-    free = make_settings(max_seconds=3, memory_limit=10**9)
+    free = make_settings(max_seconds=3, memory_limit=10**9, measure=0.0)
     assert fingerprint(scene, views, image, free, "w") == fingerprint(scene, views, image, make_settings(), "w")

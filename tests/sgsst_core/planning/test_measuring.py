@@ -1,0 +1,95 @@
+"""What is measured beside the steps: by how much it is thinned out, and what the plan says of it."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from sgsst_core.planning.cost import RasterCost
+from sgsst_core.planning.decide import decide
+from sgsst_core.planning.measuring import LEAST_ALLOWED, LEVELS, Prices, choose_level, held_out_seconds
+from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.settings import make_settings
+from tests.sgsst_core.planning.test_decide import probe, said
+
+#: 4 M Gaussians: every first look at a view takes long.
+SLOW = RasterCost(2.0, 1.0, 10**9, 10**9 // 2, first_seconds=5.0)
+
+
+def plan_of(raster: RasterCost, **values: Any) -> Plan:
+    settings = make_settings(**{"steps_coarse": 8, "steps_sos": 16, "position_weights": "off", **values})
+    return decide(probe(raster=raster), settings, measured=True)
+
+
+def expected(plan: Plan) -> Prediction:
+    assert plan.prediction is not None
+    return plan.prediction
+
+
+@pytest.mark.parametrize("total", [1, 2, 3, 24, 300, 20_000])
+def test_every_level_measures_the_end_and_no_more_than_the_one_before(total: int) -> None:
+    prices = Prices(3.0, 0.5, 0.25)
+    costs = [prices.of(level, len(level.moments(total))) for level in LEVELS]
+    assert all(level.moments(total)[-1] == total for level in LEVELS)
+    assert costs == sorted(costs, reverse=True)
+    for richer, poorer in itertools.pairwise(LEVELS):
+        assert set(poorer.moments(total)) <= set(richer.moments(total))
+        assert poorer.views <= richer.views
+
+
+def test_the_first_level_that_is_allowed_is_taken() -> None:
+    """300 steps, prices 1, 0.5 and 0.25: 4 * 1 + 7 * 2.25, 4 * 1 + 4 * 2.25, 2 * 1 + 4 * 1.25, 2 + 2.5, 1 + 1.5."""
+    prices = Prices(1.0, 0.5, 0.25)
+    costs = [19.75, 13.0, 7.0, 4.5, 2.5, 1.75]
+    assert [prices.of(level, len(level.moments(300))) for level in LEVELS] == costs
+    for place, cost in enumerate(costs):
+        assert choose_level(prices, cost, 300) == place
+        assert choose_level(prices, cost - 0.01, 300) == min(place + 1, len(LEVELS) - 1)
+    assert choose_level(prices, 1e9, 300, first=3) == 3  # what the plan has thinned out stays so
+
+
+def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() -> None:
+    steps = Prediction(1.0, 1.0, 0, evaluation=1.5, measuring=50.0, job=1050.0)
+    assert held_out_seconds(0.1, steps) == 100.0 - 3.0
+    assert held_out_seconds(0.001, steps) == LEAST_ALLOWED - 3.0
+    assert held_out_seconds(0.001, replace(steps, evaluation=16.0)) == 0.0
+    assert held_out_seconds(0.0, steps) == 0.0
+
+
+def test_a_plan_keeps_to_the_share_where_a_level_does() -> None:
+    for steps in (16, 200, 2000, 20_000):
+        plan = plan_of(SLOW, steps_sos=steps)
+        found = expected(plan)
+        allowed = max(LEAST_ALLOWED, 0.1 * (found.job - found.measuring))
+        assert found.measuring <= allowed or plan.measuring == len(LEVELS) - 1
+        assert f"{found.measuring:.2g} s beside" in said(plan, "measuring")
+    assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [len(LEVELS) - 1, 0]
+    assert "at the end up to 1 view between" in said(plan_of(SLOW), "measuring")
+    assert "at 7 moments up to 4 views between" in said(plan_of(RasterCost(0.01), steps_sos=300), "measuring")
+
+
+def test_nothing_is_measured_without_a_share() -> None:
+    plan = plan_of(SLOW, measure=0.0)
+    assert said(plan, "measuring").startswith("the loss before and after alone: asked for")
+    assert expected(plan).measuring == 2 * expected(plan).evaluation > 0
+
+
+def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
+    """Four views, all of them visited in either phase; lists and kept weights come with the first one."""
+    found = expected(plan_of(SLOW))
+    steps = 8 * found.seconds_coarse + 16 * found.seconds
+    assert found.job == pytest.approx(steps + 4 * (found.first_visit_coarse + found.first_visit) + found.measuring)
+    assert found.first_visit_coarse > SLOW.first_seconds + SLOW.seconds
+    assert 0 < found.first_visit < SLOW.first_seconds
+    alone = expected(plan_of(SLOW, steps_coarse=0))
+    assert alone.first_visit > SLOW.first_seconds
+    limited = expected(plan_of(SLOW, max_seconds=5.0))
+    assert limited.job - limited.measuring == pytest.approx(5.0)
+
+
+def test_an_iteration_takes_as_long_as_its_views() -> None:
+    one, three = (expected(plan_of(SLOW, views_per_step=views)) for views in (1, 3))
+    assert (three.seconds, three.seconds_coarse) == pytest.approx((3 * one.seconds, 3 * one.seconds_coarse))

@@ -1,0 +1,112 @@
+"""How much of a job is measured: as the plan says, less where views take longer, the same after a resume."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sgsst_core import Stylizer, make_settings, run
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.plan import Prediction
+from sgsst_core.quality.measure import Measurements
+from sgsst_core.stylizing.loop import Callbacks
+from tests.small_scenes import cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+STEPS = 16
+#: Of steps that take hours: whatever is measured here is little beside them.
+LONG = Prediction(1e3, 1e3, 0, job=1e6)
+#: What the loss takes is already more than is allowed.
+EXPENSIVE = Prediction(1e3, 1e3, 0, evaluation=1e6, job=1e6)
+
+
+def make(
+    weights: BackboneWeights, prediction: Prediction | None = LONG, level: int = 0, measure: float = 0.1
+) -> Stylizer:
+    settings = make_settings(steps_sos=STEPS, steps_coarse=0, measure=measure)
+    stylizer = Stylizer.planned(wall(), cameras(5), style(), settings, weights=weights)
+    stylizer.plan = replace(stylizer.plan, prediction=prediction, measuring=level)
+    return stylizer
+
+
+def measured(stylizer: Stylizer) -> list[int]:
+    """Run to the end; the steps after which it was measured."""
+    measure = Measurements(stylizer)
+    run(stylizer, Callbacks(measure=measure))
+    measure.at_the_end()
+    return [entry["step"] for entry in stylizer.measured]
+
+
+def test_all_moments_where_they_are_cheap(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights)
+    assert measured(stylizer) == [0, 1, 2, 4, 8, 16]
+    first = stylizer.measured[0]
+    assert first["level"] == 0
+    assert len(first["held_out_views"]) == 3  # first ones of the pairs of four views
+    assert first["again"] > 0 < first["seconds"]
+    assert stylizer.seconds_by_part["measuring"] >= sum(entry["seconds"] for entry in stylizer.measured)
+
+
+def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeights) -> None:
+    """Nothing is allowed: the start has been measured by then, and the end is measured all the same."""
+    stylizer = make(tiny_weights, EXPENSIVE)
+    assert measured(stylizer) == [0, 16]
+    assert stylizer.measured[0]["level"] == len(LEVELS) - 1
+    start, end = (entry["held_out"]["gram_relative"] for entry in stylizer.measured)
+    assert start == 1 > end
+    assert len(stylizer.measured[0]["held_out_views"]) == 1
+
+
+def test_the_end_alone_is_compared_with_nothing(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, level=len(LEVELS) - 1)
+    assert measured(stylizer) == [16]
+    moment = stylizer.measured[0]["held_out"]
+    assert moment["gram_relative"] is None
+    assert all(value > 0 for value in moment["gram"].values())
+
+
+def test_nothing_is_measured_without_a_share_and_colours_are_the_same(tiny_weights: BackboneWeights) -> None:
+    nothing, everything, least = (
+        make(tiny_weights, measure=0.0),
+        make(tiny_weights),
+        make(tiny_weights, EXPENSIVE),
+    )
+    assert measured(nothing) == []
+    measured(everything)
+    measured(least)
+    for other in (everything, least):
+        assert torch.equal(nothing.stylized(), other.stylized())
+
+
+def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> None:
+    """A plan made anew, or other prices, change nothing of what was decided at the first moment."""
+    for prediction, steps in ((LONG, [0, 1, 2, 4, 8, 16]), (EXPENSIVE, [0, 16])):
+        stopped = make(tiny_weights, prediction)
+        measure = Measurements(stopped)
+        asked = iter([False, False, False, True])
+        run(stopped, Callbacks(measure=measure, stop=asked.__next__))
+        before = list(stopped.measured)
+        resumed = make(tiny_weights, LONG, level=2)
+        going_on = Measurements(resumed)
+        resumed.load_state(stopped.state())
+        assert going_on.moments == measure.moments
+        run(resumed, Callbacks(measure=going_on))
+        assert [entry["step"] for entry in resumed.measured] == steps
+        assert resumed.measured[: len(before)] == before
+
+
+def test_seconds_left_of_measuring(tiny_weights: BackboneWeights) -> None:
+    """First the plan's, then what a moment takes after the first one, then their median; the loss at the end."""
+    stylizer = make(tiny_weights, Prediction(1.0, 1.0, 0, evaluation=3.0, measuring=18.0, job=100.0))
+    measure = Measurements(stylizer)
+    assert measure.seconds_left(0) == 6 * 2.0 + 3.0  # 12 s of 6 moments
+    stylizer.measured = [{"step": 0, "level": 0, "again": 1.5, "seconds": 9.0}]
+    assert measure.seconds_left(0) == 5 * 1.5 + 3.0
+    stylizer.measured += [{"step": step, "seconds": seconds} for step, seconds in ((1, 5.0), (2, 0.5), (4, 1.0))]
+    assert measure.seconds_left(4) == 2 * 1.0 + 3.0
+    assert measure.seconds_left(8) == 2 * 1.0 + 3.0  # that of step 8 comes next
+    stylizer.measured += [{"step": step, "seconds": 1.0} for step in (8, STEPS)]
+    assert measure.seconds_left(STEPS) == 3.0

@@ -1,0 +1,118 @@
+"""How long a job will still take, on simulated histories whose seconds are known."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, replace
+
+import pytest
+
+from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
+
+VIEWS = 12
+#: What steps really take; sums of these are exact in binary.
+COARSE = ExpectedPhase("coarse", 30, 1.0, 8.0)
+SOS = ExpectedPhase("sos", 60, 4.5, 2.25)
+
+
+@dataclass(frozen=True)
+class Told:
+    """After a step: what was told to be left, and what there was."""
+
+    stage: str
+    number: int  # of the phase's steps in this session, from 1
+    left: float
+    truth: float
+
+
+def session(
+    phases: list[ExpectedPhase], expected: list[ExpectedPhase], start: int = 0, views_per_step: int = 1, seed: int = 0
+) -> list[Told]:
+    """Steps of a job from `start` on, in rounds of all views; what is made at first visits is made anew after it."""
+    chance = random.Random(seed)
+    pace = SecondsLeft(expected, range(VIEWS), views_per_step)
+    queue: list[int] = []
+    order = [phase for phase in phases for _ in range(phase.steps)]
+    visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
+    prices: list[float] = []
+    told: list[Told] = []
+    for step, phase in enumerate(order, start=1):
+        views = []
+        for _ in range(views_per_step):
+            queue = queue or chance.sample(range(VIEWS), VIEWS)
+            views.append(queue.pop(0))
+        if step == start + 1:
+            visited = {phase.stage: set() for phase in phases}
+            pace.resume()
+        fresh = len(set(views) - visited[phase.stage])
+        visited[phase.stage].update(views)
+        prices.append(phase.seconds + fresh * phase.first_visit)
+        pace.add_step(phase.stage, views, prices[-1], fresh * phase.first_visit / 2)
+        number = sum(entry.stage == phase.stage for entry in told[start:]) + 1
+        told.append(Told(phase.stage, number, pace.left(step, queue), 0.0))
+    return [replace(entry, truth=sum(prices[index + 1 :])) for index, entry in enumerate(told)][start:]
+
+
+@pytest.mark.parametrize("start", [0, 7, 30, 40])
+@pytest.mark.parametrize("views_per_step", [1, 3])
+def test_where_steps_take_what_was_expected_nothing_is_off(start: int, views_per_step: int) -> None:
+    """From the first step to the last, over both phases, and after a resume in the middle of either."""
+    told = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
+    assert len(told) == 90 - start
+    for entry in told:
+        assert entry.left == entry.truth, entry
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 4.0])
+@pytest.mark.parametrize("start", [0, 40])
+def test_another_machine_than_expected_is_noticed_when_views_come_again(factor: float, start: int) -> None:
+    slower = [replace(p, seconds=p.seconds * factor, first_visit=p.first_visit * factor) for p in (COARSE, SOS)]
+    for entry in session(slower, [COARSE, SOS], start)[0 if start else VIEWS :]:
+        assert entry.left == pytest.approx(entry.truth, rel=1e-12), entry
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("known", "first"), [(1.0, 4.0), (1.25, 0.25), (0.8, 0.0), (1.25, 6.0)])
+def test_after_five_steps_of_the_last_phase_a_quarter_is_not_missed(known: float, first: float, seed: int) -> None:
+    """Steps and first visits are off by factors of their own; the first five steps are all first visits."""
+    real = [replace(p, seconds=p.seconds * known, first_visit=p.first_visit * first) for p in (COARSE, SOS)]
+    for start in (0, 40):
+        for entry in session(real, [COARSE, SOS], start, seed=seed):
+            if entry.stage == "sos" and entry.number >= 5:
+                assert entry.left == pytest.approx(entry.truth, rel=0.25), entry
+
+
+def test_without_expectations_the_steps_themselves_tell() -> None:
+    nothing = [ExpectedPhase(phase.stage, phase.steps) for phase in (COARSE, SOS)]
+    told = session([COARSE, SOS], nothing)
+    assert all(entry.left > 0 for entry in told[:-1])
+    later = [entry for entry in told if entry.stage == "sos" and entry.number > VIEWS + VIEWS]
+    assert all(entry.left == entry.truth for entry in later)
+
+
+def test_views_that_were_prepared_before_are_no_first_visits() -> None:
+    pace = SecondsLeft([SOS], range(VIEWS), visited=[0, 1])
+    pace.add_step("sos", [0], SOS.seconds)
+    assert pace.left(1, list(range(1, VIEWS))) == 59 * SOS.seconds + 10 * SOS.first_visit
+
+
+def test_an_unfinished_round_is_a_mean() -> None:
+    """4 steps are left: 2 of this round, 2 of the next one's 12; of these, 3 views are new, 1 of them comes soon."""
+    phase = ExpectedPhase("sos", 20, 1.0, 6.0)
+    pace = SecondsLeft([phase], range(VIEWS), visited=range(8))
+    pace.add_step("sos", [8], 7.0)
+    pace.add_step("sos", [1], 1.0)
+    assert pace.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
+
+
+def test_measuring_checkpoints_and_the_time_limit() -> None:
+    """Checkpoints have taken a quarter of the steps' time, and will; a limit bounds the steps alone."""
+    pace = SecondsLeft([ExpectedPhase("sos", 10)], [0])
+    pace.add_step("sos", [0], 3.0)
+    pace.add_step("sos", [0], 1.0)
+    pace.add_beside(1.0)
+    assert pace.left(2, []) == 8 * 1.0 * 1.25
+    assert pace.left(2, [], measuring=5.0) == 8 * 1.0 * 1.25 + 5.0
+    assert pace.left(2, [], limit=4.0) == 4.0 * 1.25
+    assert pace.left(2, [], measuring=5.0, limit=-1.0) == 5.0
+    assert pace.left(10, [], measuring=5.0) == 5.0
