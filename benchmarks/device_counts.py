@@ -3,8 +3,9 @@
     python -m benchmarks.device_counts [--size 980x545] [--name device_counts]
 
 VGG19's layers with random weights, three scales, a scene without a surround and a scan, whose statistics are weighted.
-Kernels are those that PyTorch's operations launch one by one; a library may take a few more for one of them. The image
-is computed in Triton's interpreter and takes minutes; the counts are the same for views of any size.
+Kernels are those that PyTorch's operations launch one by one; a library may take a few more for one of them. Steps are
+made of a small view, because Triton's interpreter takes minutes to render a large one. What depends on the size could
+only be the loss: it is counted for the given size, too.
 """
 
 from __future__ import annotations
@@ -16,39 +17,61 @@ from typing import Any
 
 os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
+import torch
+
 from benchmarks.machine import write_result
-from sgsst_core.settings import make_settings
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.settings import Precision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
 
+#: Of the view that steps are made of.
+SMALL = (64, 48)
 
-def counted(scan: bool, precision: str, size: tuple[int, int]) -> dict[str, Any]:
-    """Counts of the first step of a view, and of a later one."""
+
+def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str, Any]:
+    """Counts of the first step of a view, of a later one, and of the loss of a small and a large view."""
     settings = make_settings(
         steps_coarse=0,
         steps_sos=2,
-        coarsest_side=max(16, min(size) // 4),
+        coarsest_side=16,
         position_weights="on" if scan else "off",
         precision=precision,
     )
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     with pretend_cuda() as counts:
-        stylizer = Stylizer.planned(scene, cameras(1, *size), style(), settings, weights=tiny_weights("vgg19"))
+        stylizer = Stylizer.planned(scene, cameras(1, *SMALL), style(), settings, weights=tiny_weights("vgg19"))
         steps = []
         for _ in range(2):
             counts.clear()
             stylizer.run_step()
             steps.append(counts.copy())
+        losses = {}
+        for width, height in (SMALL, size):
+            loss = SosLoss(stylizer.network, coarsest=max(16, min(width, height) // 4))
+            losses[f"{width}x{height}"] = launches_of(loss, counts, (height, width), scan)
     return {
+        "launches of the loss": losses,
         "scales": stylizer.scale_count(0),
         "rasterizer": stylizer.plan.rasterizer,
         "first": totals(steps[0]),
         "steady": totals(steps[1]),
         "lines": {kind: dict(getattr(steps[1], kind).most_common()) for kind in ("launches", "waits", "copies")},
     }
+
+
+def launches_of(loss: SosLoss, counts: Counts, size: tuple[int, int], scan: bool) -> int:
+    """Of the loss of a view (height, width) in three scales, and its gradient."""
+    assert loss.scale_count(*size) == 3
+    image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0)).to("cuda")
+    view = loss.view_target(image.flip(0), image[..., 0] if scan else None)
+    targets = loss.style_targets(image.flip(1), size)
+    counts.clear()
+    loss.evaluate(image, targets, view)
+    return counts.launches.total()
 
 
 def totals(counts: Counts) -> dict[str, int]:
@@ -58,14 +81,16 @@ def totals(counts: Counts) -> dict[str, int]:
 
 def main() -> int:
     """Count and print."""
+    torch.set_num_threads(2)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--size", default="64x48", help="of the view, WIDTHxHEIGHT")
+    parser.add_argument("--size", default="980x545", help="of a large view, WIDTHxHEIGHT")
     parser.add_argument("--name", default=None, help="of the file in benchmarks/results; none is written without it")
     arguments = parser.parse_args()
     width, height = (int(side) for side in arguments.size.split("x"))
     found = {}
+    precisions: tuple[Precision, ...] = ("float32", "bfloat16")
     for scan in (False, True):
-        for precision in ("float32", "bfloat16"):
+        for precision in precisions:
             name = f"{'scan' if scan else 'scene'}, {precision}"
             found[name] = counted(scan, precision, (width, height))
             print(f"{name}: {found[name]['scales']} scales", flush=True)
@@ -73,6 +98,7 @@ def main() -> int:
                 print(
                     f"  {step:<8}" + "  ".join(f"{key} {value}" for key, value in found[name][step].items()), flush=True
                 )
+            print(f"  loss    {found[name]['launches of the loss']}", flush=True)
     for kind, lines in found["scan, float32"]["lines"].items():
         print(f"{kind} of a steady step, scan, float32")
         for line, count in lines.items():
