@@ -10,6 +10,8 @@ from torch import Tensor
 NEIGHBOURS = 8
 #: Unseen Gaussians at a time: their neighbours' changes and weights take some tens of megabytes.
 _CHUNK = 1 << 16
+#: Cells along each axis of the grid by which searches are ordered.
+_CELLS = 128
 
 
 def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
@@ -33,11 +35,19 @@ def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     tree = cKDTree(means[seen].double().numpy())
     weights, change, places = weights[seen], change[seen], means[~seen]
     votes = torch.empty((len(places), 3))
-    for start in range(0, len(places), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for part in _near_each_other(places).split(_CHUNK):
         _, nearest = tree.query(places[part].double().numpy(), k=count, workers=torch.get_num_threads())
-        votes[part] = _votes(torch.as_tensor(nearest).reshape(-1, count), change, weights)
+        votes[part] = _votes(torch.as_tensor(nearest).reshape(-1, count), change, weights).float()
     return votes
+
+
+def _near_each_other(places: Tensor) -> Tensor:
+    """Order [U] of points [U, 3] by the cells of a coarse grid: searches of neighbours read the same part of a tree."""
+    places = places.double()
+    lowest = places.amin(dim=0)
+    size = (places.amax(dim=0) - lowest).clamp_min(1e-300)
+    cells = ((places - lowest) / size * (_CELLS - 1)).long()
+    return torch.argsort((cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2], stable=True)
 
 
 def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
