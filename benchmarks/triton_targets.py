@@ -120,6 +120,8 @@ KERNELS: dict[str, Target] = {
     "render": Target(kernels.render, _CUTS, 8),
     "slot_gradients": Target(kernels.slot_gradients, _CUTS, 8),
     "add_slots": Target(kernels.add_slots, _ADDED, 4, {"slots": "*fp32"}),
+    "survey": Target(kernels.survey, _CUTS, 8, {"height": "i32"}),
+    "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
     "count_pieces": Target(kept_kernels.count_pieces, _CUTS, 8),
     **_of_kept_weights("float32"),
     **_of_kept_weights("half"),

@@ -1,7 +1,7 @@
 """A look at every view before the work: what each Gaussian contributes, and what of each view is covered.
 
-One forward and one backward pass of the rasterizer a view, with all colours 1; no feature network. Of several ranks,
-each looks at some of the views.
+One pass of the rasterizer a view (`Rasterizer.survey`); no feature network. Of several ranks, each looks at some of the
+views.
 """
 
 from __future__ import annotations
@@ -107,13 +107,12 @@ def survey(
 
 def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
     """What a view shows; its blend weights are added to weights [N] float64."""
-    coverage = rasterizer.coverage(camera)
+    coverage, summed = rasterizer.survey(camera)
     seen = sees_something(coverage)
     uncovered = float((1 - coverage).sum(dtype=torch.float64))
     shown = 0
     if seen:
-        ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
-        own = rasterizer.colour_gradient(ones, camera)[:, 0].cpu()
+        own = summed.cpu()
         weights += own.double()
         shown = int((own > 0).sum())
     return _Look(covered_region(coverage), uncovered, coverage.numel(), seen, shown)

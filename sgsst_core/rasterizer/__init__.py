@@ -50,6 +50,10 @@ class Rasterizer(Protocol):
         """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
         ...
 
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [h, width] of the whole view, and each Gaussian's blend weights summed over all its pixels [N]."""
+        ...
+
 
 def make_rasterizer(
     name: str,

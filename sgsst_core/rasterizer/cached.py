@@ -139,6 +139,10 @@ class CachedRasterizer:
             pixels = whole
         return kept.weights.colour_gradient(pixels)
 
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]; keeps nothing."""
+        return self.anew.survey(camera)
+
     def _kept_for(self, camera: Camera, band: Rows) -> _Kept | None:
         """The kept weights that serve a band, made now if they are new and fit; None where they do not fit."""
         key = camera_key(camera)

@@ -20,6 +20,7 @@ from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import coarse_kernels, kernels
 from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colours
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
@@ -248,6 +249,10 @@ class CoarseRasterizer:
             pixels = torch.zeros((*grid.shape(operator.scale), 3))
             add_upscaled_(pixels, of_squares, self.scale - operator.scale)
         return torch.from_numpy(operator.colour_gradient(pixels.numpy(), len(self.scene)))
+
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [h, W >> scale], and each Gaussian's blend weights summed over its pixels [N]."""
+        return plain_survey(self, camera)
 
     def _band(self, camera: Camera, rows: Rows | None) -> Rows:
         """The band of rows at the scale as (start, stop); None is the whole view."""

@@ -101,6 +101,21 @@ class CpuRasterizer:
             kernels.add_slots(slot_gradients, lists.first_slots, projection.gaussians, gradient)
         return torch.from_numpy(gradient)
 
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [height, width] and each Gaussian's blend weights summed over all pixels [N], float32, in one pass.
+
+        The same bits as `coverage`, and as a column of `colour_gradient` of ones.
+        """
+        lists = self.lists(camera)
+        slot_weights = np.empty(len(lists.ranks), dtype=np.float32)
+        weights = np.zeros(len(self.scene), dtype=np.float32)
+        transmittance = np.empty((camera.height, camera.width), dtype=np.float32)
+        values = lists.projection.values
+        with kernel_threads():
+            kernels.survey(lists.ranks, lists.slots, lists.starts, values, self.alpha_max, slot_weights, transmittance)
+            kernels.add_slot_weights(slot_weights, lists.first_slots, lists.projection.gaussians, weights)
+        return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
+
     def _render(self, colours: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Image and final transmittance of a band."""
         lists = self.lists(camera)

@@ -25,6 +25,7 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
+from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -132,6 +133,10 @@ class CudaRasterizer:
             image, _ = self._rasterize(colours, camera, band)
             (gradient,) = torch.autograd.grad(image, colours, pixels)
         return gradient
+
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]."""
+        return plain_survey(self, camera)
 
     def _rasterize(self, colours: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Image [h, width, 3] over black and 1 - T_final [h, width, 1]."""

@@ -34,7 +34,9 @@ from sgsst_core.rasterizer.vectors import (
     dot_pieces,
     dot_pixels,
     keep_vector,
+    prefetch,
     sum_lanes,
+    sum_weights,
 )
 
 _ONE = np.float32(1.0)
@@ -43,6 +45,9 @@ _SUPPORT = -math.log2(ALPHA_MIN)
 _TILE = RASTER_TILE
 _LAST = RASTER_TILE - 1
 _PIXELS = RASTER_TILE**2
+_COLUMNS = 8
+#: Entries between asking for a Gaussian's values and reading them: some 100 ns of blending.
+_AHEAD = 8
 
 
 @compiled()
@@ -131,6 +136,7 @@ def render(entries, starts, values, gaussians, colours, background, first_row, a
     width, last_row = image.shape[1], first_row + image.shape[0]
     across = (width + _LAST) // _TILE
     first_tile = first_row // _TILE * across
+    flat = values.reshape(values.size)
     for step in numba.prange((last_row + _LAST) // _TILE * across - first_tile):
         tile = first_tile + step
         x, y = tile % across * _TILE, tile // across * _TILE
@@ -140,9 +146,11 @@ def render(entries, starts, values, gaussians, colours, background, first_row, a
         pixels = np.zeros((_PIXELS // LANES, 3, LANES), dtype=np.float32)
         weights = block.reshape(2 * _PIXELS)
         _start_tile(block, alive, columns, low, high)
-        for position in range(starts[tile], starts[tile + 1]):
+        end = starts[tile + 1]
+        for position in range(starts[tile], end):
             if alive[_TILE] == 0:
                 break
+            prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
             rank = entries[position]
             first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
             colour = colours[gaussians[rank]]
@@ -159,6 +167,7 @@ def colour_gradient(entries, slots, starts, values, image_gradient, first_row, a
     """dL/dcolour of every (Gaussian, tile) in its own slot [E, 3]; zero where the tile is outside the band."""
     width, last_row = image_gradient.shape[1], first_row + image_gradient.shape[0]
     across = (width + _LAST) // _TILE
+    flat = values.reshape(values.size)
     for tile in numba.prange(starts.size - 1):
         x, y = tile % across * _TILE, tile // across * _TILE
         low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
@@ -168,9 +177,11 @@ def colour_gradient(entries, slots, starts, values, image_gradient, first_row, a
         weights = block.reshape(2 * _PIXELS)
         _start_tile(block, alive, columns, low, high)
         _load_pixels(image_gradient, y - first_row, x, low, high, columns, pixels)
-        for position in range(starts[tile], starts[tile + 1]):
+        end = starts[tile + 1]
+        for position in range(starts[tile], end):
             first, stop = 0, 0
             if alive[_TILE] > 0:
+                prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
                 first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
             begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
             total = dot_pixels(weights, _PIXELS + begin * LANES, vectors, pixels, begin)
@@ -190,6 +201,46 @@ def add_slots(slot_gradients, first_slots, gaussians, gradient):
             blue += slot_gradients[slot, 2]
         gaussian = gaussians[rank]
         gradient[gaussian, 0], gradient[gaussian, 1], gradient[gaussian, 2] = red, green, blue
+
+
+@compiled(parallel=True)
+def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittance):
+    """Final transmittance [h, w] of a whole view, and the sum of each (Gaussian, tile)'s weights in its slot [E].
+
+    The same bits as `render` and as `colour_gradient` of ones, in one pass.
+    """
+    height, width = transmittance.shape
+    across = (width + _LAST) // _TILE
+    flat = values.reshape(values.size)
+    for tile in numba.prange(starts.size - 1):
+        x, y = tile % across * _TILE, tile // across * _TILE
+        high, columns = min(height - y, _TILE), min(width - x, _TILE)
+        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+        alive = np.empty(_TILE + 1, dtype=np.int32)
+        weights = block.reshape(2 * _PIXELS)
+        _start_tile(block, alive, columns, 0, high)
+        position, end = starts[tile], starts[tile + 1]
+        while position < end and alive[_TILE] > 0:
+            prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
+            first, stop = _blend(block, alive, values[entries[position]], x, y, 0, high, alpha_max)
+            begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
+            slot_weights[slots[position]] = sum_weights(weights, _PIXELS + begin * LANES, vectors)
+            position += 1
+        for rest in range(position, end):
+            slot_weights[slots[rest]] = _ZERO
+        for row in range(high):
+            for i in range(columns):
+                transmittance[y + row, x + i] = abs(block[0, row, i])
+
+
+@compiled(parallel=True)
+def add_slot_weights(slot_weights, first_slots, gaussians, weights):
+    """Add up each Gaussian's slots [E], in order and in float64, into its place in `weights` [N]: see `add_slots`."""
+    for rank in numba.prange(gaussians.size):
+        total = 0.0
+        for slot in range(first_slots[rank], first_slots[rank + 1]):
+            total += slot_weights[slot]
+        weights[gaussians[rank]] = total
 
 
 # Kept weights. A strip is half a raster tile, 8 columns by 16 rows; it is cut into 4 blocks of 4 rows. An item is one

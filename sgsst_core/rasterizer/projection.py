@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR
+from sgsst_core.rasterizer.depth_order import depth_order
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -106,12 +107,14 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR) -> Projection:
             depths,
             outcomes,
         )
-    visible = np.flatnonzero(outcomes == Outcome.VISIBLE)
-    order = visible[np.argsort(depths[visible], kind="stable")]
+    order = depth_order(depths, np.flatnonzero(outcomes == Outcome.VISIBLE))
+    front_to_back = np.empty((len(order), len(Column)))
+    with kernel_threads():
+        _take_rows(values, order, front_to_back)
     tally = np.bincount(outcomes, minlength=len(Outcome))
     return Projection(
-        gaussians=order.astype(np.int32),
-        values=values[order],
+        gaussians=order,
+        values=front_to_back,
         outcomes={outcome: int(tally[outcome]) for outcome in Outcome},
     )
 
@@ -199,3 +202,11 @@ def _project_all(means, quats, scales, logits, pose, intrinsics, near, values, d
         outcomes[i], depths[i] = _project_one(
             means[i], quats[i], scales[i], logits[i], pose, intrinsics, near, values[i]
         )
+
+
+@compiled(parallel=True)
+def _take_rows(values, order, out):
+    """values[order], on all cores."""
+    for rank in numba.prange(order.size):
+        for column in range(values.shape[1]):
+            out[rank, column] = values[order[rank], column]

@@ -24,6 +24,8 @@ from sgsst_core.scene.gaussians import Scene
 MAX_INTERSECTIONS = 2**31 - 1
 #: What a pair of Gaussian and raster tile takes: rank, slot, and the slot's gradient in the backward pass.
 _PAIR_BYTES = 4 + 4 + 12
+#: Parts of the Gaussians that a thread lists, one after the other.
+_PARTS = 4
 _TILE = RASTER_TILE
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
 
@@ -76,18 +78,30 @@ def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> R
             can hold; counted before anything of that size is allocated.
     """
     projection = project(scene, camera, near=near)
-    counts = np.empty(len(projection.gaussians), dtype=np.int64)
+    values, size = projection.values, (camera.width, camera.height)
+    across, down = tile_grid(camera)
+    counts = np.empty(len(values), dtype=np.int64)
     with kernel_threads():
-        _count_tiles(projection.values, camera.width, camera.height, counts)
-    first_slots = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
+        threads = numba.get_num_threads()
+        parts = np.linspace(0, len(values), threads * _PARTS + 1).astype(np.int64)
+        places = np.zeros((len(parts) - 1, across * down), dtype=np.int64)
+        _count_tiles(values, *size, parts, threads, counts, places)
+    first_slots = _starts(counts)
     total = int(first_slots[-1])
     check_intersections(total, len(counts), camera)
     _check_memory(total, len(counts), camera)
-    across, down = tile_grid(camera)
-    starts = np.zeros(across * down + 1, dtype=np.int64)
+    starts = _starts(places.sum(axis=0))
+    # Where each part's first entry of a tile goes: behind those of the parts in front of it.
+    places = starts[:-1] + np.cumsum(places, axis=0) - places
     ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
-    _fill_tiles(projection.values, camera.width, camera.height, starts, ranks, slots)
+    with kernel_threads():
+        _fill_tiles(values, *size, parts, threads, first_slots, places, ranks, slots)
     return RasterLists(projection, starts, ranks, slots, first_slots)
+
+
+def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each of some lists begins that lie one behind the other, and the end of the last one."""
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
 
 
 def check_intersections(total: int, gaussians: int, camera: Camera) -> None:
@@ -146,41 +160,44 @@ def _tile_span(value, first, last, width):
     return int(begin) // _TILE, int(end) // _TILE + 1
 
 
-@compiled(parallel=True)
-def _count_tiles(values, width, height, counts):
-    """How many tiles each Gaussian touches."""
-    for rank in numba.prange(values.shape[0]):
-        first, last = _tile_rows(values[rank], height)
-        total = 0
-        for down in range(first // _TILE, last // _TILE + 1):
-            begin, end = _tile_span(values[rank], max(first, down * _TILE), min(last, down * _TILE + _TILE - 1), width)
-            total += end - begin
-        counts[rank] = total
-
-
 @compiled()
-def _fill_tiles(values, width, height, starts, ranks, slots):
+def _own_part(step, threads):
+    """The part that comes `step`th, so that every thread gets parts from front to back: nearer ones have more work."""
+    return step % _PARTS * threads + step // _PARTS
+
+
+@compiled(parallel=True)
+def _count_tiles(values, width, height, parts, threads, counts, places):
+    """How many tiles each Gaussian touches, and how many Gaussians of each part touch each tile."""
+    across = (width + _TILE - 1) // _TILE
+    for step in numba.prange(parts.size - 1):
+        part = _own_part(step, threads)
+        for rank in range(parts[part], parts[part + 1]):
+            first, last = _tile_rows(values[rank], height)
+            total = 0
+            for down in range(first // _TILE, last // _TILE + 1):
+                top, bottom = max(first, down * _TILE), min(last, down * _TILE + _TILE - 1)
+                begin, end = _tile_span(values[rank], top, bottom, width)
+                total += end - begin
+                for tile in range(down * across + begin, down * across + end):
+                    places[part, tile] += 1
+            counts[rank] = total
+
+
+@compiled(parallel=True)
+def _fill_tiles(values, width, height, parts, threads, first_slots, places, ranks, slots):
     """Counting sort of all pairs by tile; Gaussians come in order of depth, so every tile's list does too."""
     across = (width + _TILE - 1) // _TILE
-    for pass_ in range(2):
-        slot = 0
-        for rank in range(values.shape[0]):
+    for step in numba.prange(parts.size - 1):
+        part = _own_part(step, threads)
+        for rank in range(parts[part], parts[part + 1]):
             first, last = _tile_rows(values[rank], height)
+            slot = first_slots[rank]
             for down in range(first // _TILE, last // _TILE + 1):
-                begin, end = _tile_span(
-                    values[rank], max(first, down * _TILE), min(last, down * _TILE + _TILE - 1), width
-                )
+                top, bottom = max(first, down * _TILE), min(last, down * _TILE + _TILE - 1)
+                begin, end = _tile_span(values[rank], top, bottom, width)
                 for tile in range(down * across + begin, down * across + end):
-                    if pass_ == 0:
-                        starts[tile + 1] += 1
-                    else:
-                        ranks[starts[tile]] = rank
-                        slots[starts[tile]] = slot
-                        starts[tile] += 1
-                        slot += 1
-        if pass_ == 0:
-            for tile in range(starts.size - 1):
-                starts[tile + 1] += starts[tile]
-    for tile in range(starts.size - 1, 0, -1):
-        starts[tile] = starts[tile - 1]
-    starts[0] = 0
+                    place = places[part, tile]
+                    ranks[place], slots[place] = rank, slot
+                    places[part, tile] = place + 1
+                    slot += 1

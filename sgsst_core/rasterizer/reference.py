@@ -22,6 +22,7 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
+from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -165,6 +166,10 @@ class ReferenceRasterizer:
         for pixels, gaussians, weights, _ in self._blended(camera, band):
             gradient.index_add_(0, gaussians.flatten(), torch.bmm(weights.mT, flat[pixels]).flatten(0, 1))
         return gradient
+
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]."""
+        return plain_survey(self, camera)
 
     def near_cutoff(self, camera: Camera, tolerance: float, rows: Rows | None = None) -> Tensor:
         """Pixels [h, width] bool where a decision is close: alpha or transmittance within `tolerance` of its cut.

@@ -148,6 +148,30 @@ class TritonRasterizer:
         add_slots_(gradient, slots, lists.first_slots, lists.gaussians)
         return gradient
 
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Coverage [height, width] and each Gaussian's blend weights summed over all pixels [N], float32, in one pass.
+
+        The same bits as `coverage`, and as a column of `colour_gradient` of ones.
+        """
+        from sgsst_core.rasterizer import triton_kernels as kernels
+
+        lists = self.lists(camera)
+        weights = torch.zeros(len(self.scene), device=self.device)
+        slots = torch.zeros(len(lists.ranks), device=self.device)
+        transmittance = torch.empty((camera.height, camera.width), device=self.device)
+        across, tiles = tiles_of(camera, (0, camera.height))
+        kernels.survey[(tiles,)](
+            lists.ranks, lists.slots, lists.starts, lists.values, slots, transmittance,
+            camera.width, camera.height, across,
+            **self.cuts(),
+        )  # fmt: skip
+        visible, block = len(lists.gaussians), kernels.ADDED.value
+        if visible:
+            kernels.add_slot_weights[(-(-visible // block),)](
+                slots, lists.first_slots, lists.gaussians, weights, visible, BLOCK=block, SLOTS=kernels.SLOTS.value
+            )
+        return 1 - transmittance, weights
+
     def _render(self, colours: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Image and final transmittance of a band."""
         from sgsst_core.rasterizer import triton_kernels as kernels

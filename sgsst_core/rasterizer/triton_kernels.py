@@ -335,3 +335,47 @@ def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, 
     tl.store(row, tl.sum(red, 1).to(tl.float32), mask=there)
     tl.store(row + 1, tl.sum(green, 1).to(tl.float32), mask=there)
     tl.store(row + 2, tl.sum(blue, 1).to(tl.float32), mask=there)
+
+
+@triton.jit
+def survey(
+    ranks, slots, starts, values, out, transmittances, width, height, across,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+):  # fmt: skip
+    """Final transmittance [h, width] of a whole view, and the sum of each pair's weights in its slot [E].
+
+    Slots hold zeros before. What `render` and `slot_gradients` of ones give, in one pass; one program a raster tile.
+    """
+    tile = tl.program_id(0)
+    x0, y0 = tile % across * _TILE, tile // across * _TILE
+    pixel = tl.arange(0, _PIXELS)
+    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
+    inside = (x < width) & (y < height)
+    left = tl.where(inside, 1.0, 0.0)
+    k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    going = tl.max(left, 0)
+    while (k < end) & (going > 0):
+        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
+        j = k + tl.arange(0, K)
+        there = j < end
+        slot = tl.load(slots + j, mask=there, other=0).to(tl.int64)
+        tl.store(out + slot, tl.sum(weights, 1), mask=there)
+        going = tl.max(left, 0)
+        k += K
+    tl.store(transmittances + y.to(tl.int64) * width + x, tl.abs(left), mask=inside)
+
+
+@triton.jit
+def add_slot_weights(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, SLOTS: tl.constexpr):
+    """Add up each Gaussian's slots [E], as `add_slots` does, into its place in `out` [N]."""
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = rank < visible
+    slot = tl.load(first_slots + rank, mask=there, other=0).to(tl.int64)
+    end = tl.load(first_slots + rank + 1, mask=there, other=0).to(tl.int64)
+    total = tl.zeros([BLOCK, SLOTS], tl.float64)
+    while tl.max(end - slot, 0) > 0:
+        j = slot[:, None] + tl.arange(0, SLOTS)[None, :]
+        total += tl.load(slots + j, mask=j < end[:, None], other=0.0).to(tl.float64)
+        slot += SLOTS
+    gaussian = tl.load(gaussians + rank, mask=there, other=0).to(tl.int64)
+    tl.store(out + gaussian, tl.sum(total, 1).to(tl.float32), mask=there)

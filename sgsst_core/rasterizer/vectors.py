@@ -248,6 +248,50 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
 
 
 @intrinsic
+def sum_weights(typingctx, weights, begin, vectors):
+    """Sum over v < vectors and lanes i of weights[begin + 8 v + i]: `dot_pixels` of pixels that are all 1, bit for bit.
+
+    `weights` is flat, float32. Nothing is checked.
+    """
+    if not _is_weights(weights) or weights.dtype != types.float32:
+        return None
+    signature = types.float32(weights, types.int64, types.int64)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        weights_, begin_, vectors_ = args
+        source = _data(context, builder, sig.args[0], weights_, begin_)
+        total = cgutils.alloca_once(builder, _VECTOR)
+        builder.store(ir.Constant(_VECTOR, [0.0] * LANES), total)
+        with cgutils.for_range(builder, vectors_) as loop:
+            w = _load(builder, builder.gep(source, [builder.mul(loop.index, _number(LANES))]))
+            builder.store(builder.fadd(builder.load(total), w), total)
+        return _lane_sum(builder, builder.load(total))
+
+    return signature, generate
+
+
+@intrinsic
+def prefetch(typingctx, values, place):
+    """Ask for the cache line of `values`, flat, at an element that will be read soon: a hint, which cannot fail."""
+    if not isinstance(values, types.Array) or values.layout != "C":
+        return None
+    signature = types.void(values, types.int64)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = _data(context, builder, sig.args[0], args[0], args[1])
+        byte = ir.IntType(8).as_pointer()
+        hint = [byte, *[ir.IntType(32)] * 3]
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), hint), "llvm.prefetch.p0"
+        )
+        flags = [ir.Constant(ir.IntType(32), flag) for flag in (0, 3, 1)]  # to read, keep near, data
+        builder.call(function, [builder.bitcast(pointer, byte), *flags])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
 def add_pieces(typingctx, weights, items, first, count, colours, pixels, offset):
     """pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colours[items[piece], c] over the pieces.
 

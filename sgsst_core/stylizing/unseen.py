@@ -8,6 +8,10 @@ from torch import Tensor
 
 #: Seen neighbours that vote on an unseen Gaussian's colour change.
 NEIGHBOURS = 8
+#: Unseen Gaussians at a time: their neighbours' changes and weights take some tens of megabytes.
+_CHUNK = 1 << 16
+#: Cells along each axis of the grid by which searches are ordered.
+_CELLS = 128
 
 
 def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
@@ -29,10 +33,26 @@ def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
         return torch.zeros((0, 3))
     count = min(NEIGHBOURS, int(seen.sum()))
     tree = cKDTree(means[seen].double().numpy())
-    _, nearest = tree.query(means[~seen].double().numpy(), k=count)
-    nearest = torch.as_tensor(nearest).reshape(-1, count)
-    own = weights[seen][nearest]
+    weights, change, places = weights[seen], change[seen], means[~seen]
+    votes = torch.empty((len(places), 3))
+    for part in _near_each_other(places).split(_CHUNK):
+        _, nearest = tree.query(places[part].double().numpy(), k=count, workers=torch.get_num_threads())
+        votes[part] = _votes(torch.as_tensor(nearest).reshape(-1, count), change, weights).float()
+    return votes
+
+
+def _near_each_other(places: Tensor) -> Tensor:
+    """Order [U] of points [U, 3] by the cells of a coarse grid: searches of neighbours read the same part of a tree."""
+    places = places.double()
+    lowest = places.amin(dim=0)
+    size = (places.amax(dim=0) - lowest).clamp_min(1e-300)
+    cells = ((places - lowest) / size * (_CELLS - 1)).long()
+    return torch.argsort((cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2], stable=True)
+
+
+def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean changes [U, 3] float64 of seen Gaussians `nearest` [U, K]; `change` [S, 3], `weights` [S]."""
+    own = weights[nearest]
     # Relative to the largest of the eight, so that eight tiny weights still have a mean.
     share = own / own.amax(dim=1, keepdim=True)
-    votes = (change[seen].double()[nearest] * share[:, :, None]).sum(dim=1) / share.sum(dim=1, keepdim=True)
-    return votes.float()
+    return (change[nearest].double() * share[:, :, None]).sum(dim=1) / share.sum(dim=1, keepdim=True)

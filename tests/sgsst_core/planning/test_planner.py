@@ -188,6 +188,22 @@ def test_unseen_gaussians_follow_their_seen_neighbours() -> None:
     assert neighbours_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
 
 
+def test_unseen_gaussians_follow_the_same_neighbours_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(3)
+    means, change = torch.randn(400, 3, generator=generator), torch.randn(400, 3, generator=generator)
+    weights = torch.rand(400, generator=generator).double() * (torch.arange(400) % 4 > 0)
+    seen = weights > 0
+    found = neighbours_change(means, change, weights)
+    distances, nearest = torch.cdist(means[~seen].double(), means[seen].double()).sort(dim=1)
+    assert bool((distances[:, :9].diff(dim=1) > 0).all())  # no ties: the neighbours are those
+    own = weights[seen][nearest[:, :8]]
+    expected = (change[seen].double()[nearest[:, :8]] * own[..., None]).sum(1) / own.sum(1, keepdim=True)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
+    for part in (1, 7, 100):
+        monkeypatch.setattr("sgsst_core.stylizing.unseen._CHUNK", part)
+        assert torch.equal(neighbours_change(means, change, weights), found)
+
+
 def test_unseen_gaussians_keep_their_colour_in_paper(tiny_weights: BackboneWeights) -> None:
     scene = behind(wall())
     cases: list[tuple[PresetName, bool]] = [("paper", False), ("standard", True)]

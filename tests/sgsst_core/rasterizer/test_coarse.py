@@ -249,6 +249,9 @@ def test_bands_put_together_are_the_whole_view(scale: int, max_bytes: int | None
     parts = [coarse.colour_gradient(pixels[slice(*band)], view, band) for band in bands]
     assert relative_error(sum(parts), coarse.colour_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
     assert torch.allclose(coarse.coverage(view), downscale(CpuRasterizer(scene).coverage(view), scale), atol=1e-6)
+    coverage, weights = coarse.survey(view)
+    assert torch.equal(coverage, coarse.coverage(view))
+    assert relative_error(weights.sum(), coverage.sum()) < 1e-5
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:

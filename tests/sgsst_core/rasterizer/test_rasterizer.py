@@ -25,6 +25,7 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import Rows, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.raster_lists import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
 from sgsst_core.rasterizer.vectors import as_float
@@ -80,6 +81,22 @@ def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
 def test_fast_ones_agree_with_the_reference(case: tuple[Scene, Camera]) -> None:
     scene, view = case
     assert_agree(FAST, scene, view, (1.0, 0.25, 0.5))
+
+
+def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera]) -> None:
+    scene, view = case
+    reference = ReferenceRasterizer(scene)
+    band = reference.near_cutoff(view, CLOSE)
+    expected, summed = reference.survey(view)
+    for name in FAST:
+        fast = make_rasterizer(name, scene)
+        coverage, weights = fast.survey(view)
+        plain, gradient = plain_survey(CpuRasterizer(scene), view)
+        assert torch.equal(coverage, plain)
+        assert torch.equal(weights, gradient)
+        assert_close_outside_band(coverage, expected, band, tolerance=1e-4)
+        # A pixel where a cut-off flips moves weights of at most 1 from one Gaussian to others.
+        assert float((weights - summed).abs().max()) <= 1e-4 * float(summed.max()) + 2 * int(band.sum())
 
 
 def assert_agree(
@@ -182,7 +199,8 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
             rasterizer = make_rasterizer(name, scene)
-            results.append((rasterizer.render(colours, view), rasterizer.colour_gradient(pixels, view)))
+            image, gradient = rasterizer.render(colours, view), rasterizer.colour_gradient(pixels, view)
+            results.append((image, gradient, *rasterizer.survey(view)))
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
@@ -227,6 +245,7 @@ def test_a_view_without_gaussians_is_background(name: str, scene: Scene) -> None
     assert image[..., 0].eq(0.5).all()
     assert image[..., 2].eq(0.125).all()
     assert not rasterizer.coverage(view).any()
+    assert not any(found.any() for found in rasterizer.survey(view))
     gradient = rasterizer.colour_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()

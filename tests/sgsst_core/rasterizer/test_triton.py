@@ -25,6 +25,7 @@ if not torch.cuda.is_available():
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
@@ -101,6 +102,22 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera], one_thread: None)
     assert relative_error(gradient, reference.colour_gradient(pixels, view)) < 5e-6
 
 
+def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera], one_thread: None) -> None:
+    scene, view = case
+    coverage, weights = on_device(scene).survey(view)
+    plain, gradient = plain_survey(on_device(scene), view)
+    assert torch.equal(coverage, plain)
+    if DEVICE == "cpu":
+        assert torch.equal(weights, gradient)
+    reference = ReferenceRasterizer(scene)
+    band = reference.near_cutoff(view, CLOSE)
+    expected, summed = reference.survey(view)
+    assert_close_outside_band(coverage.cpu(), expected, band, tolerance=1e-5)
+    # A pixel where a cut-off flips moves weights of at most 1 from one Gaussian to others.
+    assert float((weights.cpu() - summed).abs().max()) <= 1e-5 * float(summed.max()) + 2 * int(band.sum())
+    assert relative_error(weights, gradient) < 1e-6
+
+
 def test_lists_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
     scene, view = case
     lists, expected = on_device(scene).lists(view), build_raster_lists(scene, view)
@@ -137,6 +154,7 @@ def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
     rasterizer, view = on_device(scene), camera(20, 18)
     assert torch.equal(rasterizer.render(colours_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not rasterizer.coverage(view).any()
+    assert not any(found.any() for found in rasterizer.survey(view))
     gradient = rasterizer.colour_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()

@@ -1,0 +1,162 @@
+"""Scenes of millions of Gaussians on the CPU: what reading, looking, rendering and unseen Gaussians take.
+
+    python -m benchmarks.large_scene [--millions 1 4 12] [--views 4] [--parts reading survey ...]
+
+The plush scene is multiplied: each copy of a Gaussian is moved by up to its size, and scales are reduced so that the
+volume stays the same; where the data is not there, a generated scene takes its place. Seeded. Every size runs in a
+process of its own, for its peak of memory. Of what was made faster, the plain way runs in the same process, and the
+ratio is what counts: seconds depend on what else the machine does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import resource
+import statistics
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from scipy.spatial import cKDTree
+
+from benchmarks.machine import write_result
+from benchmarks.rasterizer import DATA, generated_scene, timed
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.plain_survey import plain_survey
+from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.scene.camera import Camera, orbit, spread
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import reference_rest_colours, rest_colours
+from sgsst_core.stylizing.unseen import NEIGHBOURS, neighbours_change
+
+PARTS = ("reading", "harmonics", "survey", "unseen")
+_PLUSH = DATA / "snowmiku_plush"
+#: Gaussians on which the slow twin of spherical harmonics is timed.
+_HARMONICS_SAMPLE = 200_000
+
+
+def multiplied(scene: Scene, count: int) -> Scene:
+    """So many Gaussians: copies of a scene's, each moved by up to its size, with the same volume together."""
+    generator = torch.Generator().manual_seed(0)
+    copies = -(-count // len(scene))
+    many = scene.subset(torch.arange(len(scene)).repeat(copies)[:count])
+    moved = (2 * torch.rand(count, 3, generator=generator) - 1) * many.scales.exp()
+    scales = many.scales - math.log(copies) / 3
+    return Scene(many.means + moved, many.quats, scales, many.opacities, many.sh_dc, many.sh_rest)
+
+
+def small_scene() -> tuple[Scene, list[Camera], str]:
+    """What is multiplied, its cameras, and its name."""
+    if _PLUSH.is_dir():
+        return read_scene(_PLUSH / "point_cloud.ply").scene, read_cameras(_PLUSH / "cameras.json"), "plush"
+    scene = generated_scene(50_000)
+    harmonics = 0.1 * torch.randn(len(scene), 15, 3, generator=torch.Generator().manual_seed(1))
+    scene = Scene(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, harmonics)
+    return scene, orbit(scene, 24, width=990, height=742), "generated"
+
+
+def middle(action: Callable[[Camera], object], cameras: list[Camera]) -> float:
+    """Median over the views of the seconds that one call takes."""
+    return statistics.median(timed(lambda camera=camera: action(camera)) for camera in cameras)  # type: ignore[misc]
+
+
+def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
+    """Spherical harmonics of a view, and how much faster than their slow twin they are, on a part of the scene."""
+    part = scene.subset(torch.arange(min(_HARMONICS_SAMPLE, len(scene))))
+    rest_colours(part.sh_rest, part.means, cameras[0])  # compiles
+    slow = middle(lambda camera: reference_rest_colours(part.sh_rest, part.means, camera, scene.sh_degree), cameras)
+    fast = middle(lambda camera: rest_colours(part.sh_rest, part.means, camera), cameras)
+    whole = middle(lambda camera: rest_colours(scene.sh_rest, scene.means, camera), cameras)
+    return {"harmonics_seconds": whole, "ratio_reference_to_harmonics": slow / fast}
+
+
+def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
+    """Lists of a view, on one thread and on all; coverage and gradient of ones against the one pass of a survey."""
+    CpuRasterizer(scene.subset(torch.arange(100))).survey(cameras[0])  # compiles
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    alone = middle(lambda camera: build_raster_lists(scene, camera), cameras)
+    torch.set_num_threads(threads)
+    lists = middle(lambda camera: build_raster_lists(scene, camera), cameras)
+    rasterizer = CpuRasterizer(scene, max_list_bytes=0)  # the last view's lists alone
+    found: dict[str, list[float]] = {"render": [], "gradient": [], "plain": [], "survey": []}
+    colours = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
+    for camera in cameras:
+        rasterizer.lists(camera)
+        image = rasterizer.render(colours, camera)
+        found["render"].append(timed(lambda camera=camera: rasterizer.render(colours, camera)))  # type: ignore[misc]
+        gradient = timed(lambda image=image, camera=camera: rasterizer.colour_gradient(image, camera))  # type: ignore[misc]
+        found["gradient"].append(gradient)
+        found["plain"].append(timed(lambda camera=camera: plain_survey(rasterizer, camera)))  # type: ignore[misc]
+        found["survey"].append(timed(lambda camera=camera: rasterizer.survey(camera)))  # type: ignore[misc]
+    seconds = {f"{name}_seconds": statistics.median(values) for name, values in found.items()}
+    return {
+        "lists_seconds": lists,
+        "ratio_lists_one_thread_to_all": alone / lists,
+        **seconds,
+        "ratio_plain_to_survey": seconds["plain_seconds"] / seconds["survey_seconds"],
+    }
+
+
+def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
+    """Neighbours of what the views do not see; against a search on one core in the order of the file."""
+    rasterizer = CpuRasterizer(scene, max_list_bytes=0)
+    weights = torch.zeros(len(scene), dtype=torch.float64)
+    for camera in cameras:
+        weights += rasterizer.survey(camera)[1].double()
+    seen = weights > 0
+
+    def plain() -> None:
+        tree = cKDTree(scene.means[seen].double().numpy())
+        tree.query(scene.means[~seen].double().numpy(), k=NEIGHBOURS)
+
+    slow = timed(plain)
+    fast = timed(lambda: neighbours_change(scene.means, scene.sh_dc, weights))
+    return {"unseen": int((~seen).sum()), "unseen_seconds": fast, "ratio_plain_to_unseen": slow / fast}
+
+
+def measure(count: int, views: int, parts: list[str]) -> dict[str, float]:
+    """All figures of one size; `parts`: of PARTS."""
+    small, cameras, _ = small_scene()
+    scene, cameras = multiplied(small, count), spread(cameras, views)
+    figures: dict[str, float] = {"gaussians": count}
+    if "reading" in parts:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "point_cloud.ply"
+            write_scene(path, scene)
+            figures["file_bytes"] = path.stat().st_size
+            figures["read_seconds"] = timed(lambda: read_scene(path))
+    if "harmonics" in parts:
+        figures |= measure_harmonics(scene, cameras)
+    if "survey" in parts:
+        figures |= measure_views(scene, cameras)
+    if "unseen" in parts:
+        figures |= measure_unseen(scene, cameras)
+    figures["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
+    return figures
+
+
+def main() -> None:
+    """Measure every size in a process of its own, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--millions", type=float, nargs="+", default=[1, 4, 12])
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    arguments = parser.parse_args()
+    sizes = []
+    for millions in arguments.millions:
+        # A new process, not a copy of this one: its peak of memory and its threads are its own.
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            sizes.append(pool.apply(measure, (int(millions * 1e6), arguments.views, arguments.parts)))
+        print(json.dumps(sizes[-1], indent=2), flush=True)
+    print(write_result("large_scene", {"scene": small_scene()[2], "views": arguments.views, "sizes": sizes}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Gaussians in order of depth, on all cores: a stable sort of positive float64 numbers.
+
+Positive floats are ordered as their bits are, read as integers. The bits' upper part puts each Gaussian into one of
+many buckets, by a counting sort of which every thread takes a part; then each bucket is sorted by itself. Equal depths
+keep the order of the file, so the result is that of any stable sort, whatever the number of threads.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.compiled import compiled, kernel_threads
+
+#: Gaussians that a bucket holds where depths are spread evenly.
+_BUCKET = 16
+_MOST_BUCKETS = 1 << 17
+#: Buckets of up to so many are sorted by insertion, larger ones by merging.
+_INSERTED = 48
+
+
+def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> NDArray[np.int32]:
+    """`visible` [V], ascending indices into `depths` [N], by depth as int32; equal depths by index.
+
+    The depths of what is visible are positive: the near plane is.
+    """
+    count = len(visible)
+    if not count:
+        return np.empty(0, dtype=np.int32)
+    with kernel_threads():
+        threads = numba.get_num_threads()
+        bits = np.empty(count, dtype=np.int64)
+        _gather(depths.view(np.int64), visible, bits)
+        lowest, highest = int(bits.min()), int(bits.max())
+        wanted = min(max(count // _BUCKET, 1), _MOST_BUCKETS)
+        shift = max((highest - lowest).bit_length() - wanted.bit_length(), 0)
+        buckets = ((highest - lowest) >> shift) + 1
+        parts = np.linspace(0, count, threads + 1).astype(np.int64)
+        ends = np.zeros((threads, buckets), dtype=np.int64)
+        _count(bits, lowest, shift, parts, ends)
+        # The place of each part's first Gaussian of a bucket: after all smaller buckets, and the parts before it.
+        totals = ends.sum(axis=0)
+        starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(totals)])
+        ends = starts[:-1] + np.cumsum(ends, axis=0) - ends
+        order, keys = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
+        _scatter(bits, visible, lowest, shift, parts, ends, order, keys)
+        shares = np.searchsorted(starts, parts).astype(np.int64)
+        _sort_buckets(starts, shares, keys, order)
+    return order
+
+
+@compiled(parallel=True)
+def _gather(values, places, out):
+    for i in numba.prange(places.size):
+        out[i] = values[places[i]]
+
+
+@compiled(parallel=True)
+def _count(bits, lowest, shift, parts, counts):
+    """How many Gaussians of each part fall into each bucket."""
+    for part in numba.prange(parts.size - 1):
+        for i in range(parts[part], parts[part + 1]):
+            counts[part, (bits[i] - lowest) >> shift] += 1
+
+
+@compiled(parallel=True)
+def _scatter(bits, visible, lowest, shift, parts, places, order, keys):
+    """Every part's Gaussians into their buckets, in the order in which they come."""
+    for part in numba.prange(parts.size - 1):
+        for i in range(parts[part], parts[part + 1]):
+            bucket = (bits[i] - lowest) >> shift
+            place = places[part, bucket]
+            order[place], keys[place] = visible[i], bits[i]
+            places[part, bucket] = place + 1
+
+
+@compiled(parallel=True)
+def _sort_buckets(starts, shares, keys, order):
+    """Sort each bucket by its keys; equal keys stay as they are."""
+    for share in numba.prange(shares.size - 1):
+        for bucket in range(shares[share], shares[share + 1]):
+            begin, end = starts[bucket], starts[bucket + 1]
+            if end - begin > _INSERTED:
+                sorted_ = np.argsort(keys[begin:end], kind="mergesort")
+                order[begin:end] = order[begin:end][sorted_]
+                continue
+            for i in range(begin + 1, end):
+                key, gaussian = keys[i], order[i]
+                j = i
+                while j > begin and keys[j - 1] > key:
+                    keys[j], order[j] = keys[j - 1], order[j - 1]
+                    j -= 1
+                keys[j], order[j] = key, gaussian

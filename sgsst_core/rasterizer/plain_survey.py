@@ -1,0 +1,16 @@
+"""`Rasterizer.survey` by the other methods of the protocol, and what the fast ones are tested against."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scene.camera import Camera
+
+
+def plain_survey(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Coverage [h, width], and each Gaussian's blend weights summed over all pixels [N]: the gradient of ones."""
+    coverage = rasterizer.coverage(camera)
+    ones = torch.ones((*coverage.shape, 3), dtype=rasterizer.dtype, device=coverage.device)
+    return coverage, rasterizer.colour_gradient(ones, camera)[:, 0]
