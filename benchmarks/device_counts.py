@@ -29,7 +29,7 @@ from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
 
 #: Of the view that steps are made of.
-SMALL = (64, 48)
+SMALL = (64, 64)
 
 
 def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str, Any]:

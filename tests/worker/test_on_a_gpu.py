@@ -110,7 +110,7 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
     """With VGG19, the larger network, on three scales. The number is the same for views of any size."""
     settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, position_weights="on" if scan else "off")
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
-    stylizer = Stylizer.planned(scene, cameras(1), style(), settings, weights=networks.tiny_weights("vgg19"))
+    stylizer = Stylizer.planned(scene, cameras(1, 64, 64), style(), settings, weights=networks.tiny_weights("vgg19"))
     assert stylizer.scale_count(0) == 3
     for _ in range(2):
         counts.clear()
