@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+
+if not torch.cuda.is_available():
+    # Read when Triton is first imported, by whichever test that is: kernels then run in its interpreter.
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import BackboneWeights, fetch_network_weights, load_network_weights

@@ -197,6 +197,7 @@ def test_made_by_its_name() -> None:
     assert make_rasterizer("triton", cloud(10)).device.type == DEVICE
 
 
+@pytest.mark.slow
 def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
     """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
     # The other tests need not even pydantic: they run on a bare machine that has a GPU.

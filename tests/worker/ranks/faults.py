@@ -145,7 +145,7 @@ def _fired(request: StylizeRequest) -> Path:
 def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.loss.sos import SosLoss
     from sgsst_core.stylizing import checkpoint
-    from sgsst_core.stylizing.stylizer import Stylizer
+    from sgsst_core.stylizing.optimiser import ColourOptimiser
     from sgsst_core.stylizing.views import Views
     from worker.ranks.process_group import ProcessGroupCollectives
 
@@ -153,7 +153,7 @@ def _places() -> dict[str, tuple[Any, str]]:
     return {
         "render": (Views, "render"),
         "loss": (SosLoss, "evaluate"),
-        "optimiser": (Stylizer, "_update"),
+        "optimiser": (ColourOptimiser, "update"),
         "checkpoint": (checkpoint, "_write"),
         **{name: (ProcessGroupCollectives, name) for name in exchanges},
     }
