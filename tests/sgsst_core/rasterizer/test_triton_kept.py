@@ -237,6 +237,7 @@ def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) ->
     assert min(found.seconds, found.kept_seconds, found.keeping_seconds) > 0
 
 
+@pytest.mark.slow
 def test_a_job_goes_on_with_the_lists_of_its_plan(tiny_weights: BackboneWeights) -> None:
     scene, losses = ball(60), {}
     settings = make_settings("preview", steps_coarse=0, steps_sos=1, kept_weights="half")

@@ -139,6 +139,7 @@ def test_a_step_reads_the_next_photo_and_waits_once(
     assert not threads()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "views_per_step"), [(3, 1), (2, 2)])
 def test_losses_are_those_of_photos_read_when_they_are_needed(
     tiny_weights: BackboneWeights,
