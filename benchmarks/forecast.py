@@ -1,6 +1,6 @@
 """Forecast of a step on one H200, from counted operations, bytes and launches, to hold a measurement against.
 
-python -m benchmarks.forecast [--launches 478]
+python -m benchmarks.forecast [--launches 494]
 
 Nothing here is measured on a GPU: peaks are the data sheet's, and how much of them is reached are the `SHARES` below.
 The feature network, the image pyramid, colours and the content loss are counted by running the project's own code on
@@ -41,7 +41,7 @@ BANDWIDTH, MEMORY, L2 = 4.8e12, 141e9, 50e6
 LANES = PEAKS["float32"] / 2
 PRECISIONS = ("float32", "tf32", "bfloat16")
 #: Launches of a step in which all that is kept of a view is there: a scan's in bfloat16, as `device_counts` has them.
-LAUNCHES = 478
+LAUNCHES = 494
 #: Of a view's lists of raster tiles: two sorts in passes, a sum in passes, kernels and copies.
 LIST_LAUNCHES = 40
 #: Instructions a pixel of a pair of Gaussian and raster tile, as the source of `blend_weights` and of its callers has
