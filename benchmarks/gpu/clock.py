@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 import torch
 
+from sgsst_core.timing import wait_for
+
 
 def seconds(action: Callable[[], object], device: torch.device, repeats: int) -> float:
     """Median of so many calls, after one that does not count: between events on a GPU, by the clock on a CPU."""
@@ -31,17 +33,11 @@ def _once(action: Callable[[], object], device: torch.device) -> float:
 
 def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
     """Wall-clock seconds of one call, until the device has done all of it."""
-    wait(device)
+    wait_for(device)
     started = time.perf_counter()
     action()
-    wait(device)
+    wait_for(device)
     return time.perf_counter() - started
-
-
-def wait(device: torch.device) -> None:
-    """Until the device has done what it was given."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def forget_peak(device: torch.device) -> None:

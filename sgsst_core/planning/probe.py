@@ -47,7 +47,7 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, Settings
-from sgsst_core.timing import Timer
+from sgsst_core.timing import Timer, wait_for
 
 #: Largest side of the picture that the network is timed on: large enough that its rate is that of a partition tile.
 #: A GPU has more to do before the seconds of its launches do not count.
@@ -388,7 +388,7 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
     for _ in range(2):
         started = time.perf_counter()
         cached.count(camera).keep(form)
-        _wait_for(cached.device)
+        wait_for(cached.device)
         seconds = time.perf_counter() - started
     return seconds
 
@@ -400,12 +400,6 @@ def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera) -> t
     for visit in range(2):
         started = time.perf_counter()
         rasterizer.colour_gradient(rasterizer.render(colours, camera), camera)
-        _wait_for(rasterizer.device)
+        wait_for(rasterizer.device)
         seconds[visit] = time.perf_counter() - started
     return seconds[0], seconds[1]
-
-
-def _wait_for(device: torch.device) -> None:
-    """Until a device has done what it was given."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

@@ -18,6 +18,7 @@ from sgsst_core.features.partition import choose_tile_size, computed_twice, kept
 from sgsst_core.parallel.collectives import Collectives, Traffic
 from sgsst_core.parallel.division import Piece, divide, rounds
 from sgsst_core.parallel.shown import gaussians_sent
+from sgsst_core.timing import wait_for
 
 #: Channels of the style layers: their statistics travel as n, mean and one half of C, in float64.
 _STYLE_CHANNELS = (64, 128, 256, 512, 512)
@@ -151,19 +152,13 @@ def _slowest_sum(collectives: Collectives, device: torch.device, size: int) -> f
     tensor = torch.zeros(size // 4, device=device)
     seconds = 0.0
     for _ in range(3):  # the first one makes the connections
-        _wait_for(device)
+        wait_for(device)
         collectives.all_gather(None)
         started = time.perf_counter()
         collectives.all_reduce(tensor)
-        _wait_for(device)
+        wait_for(device)
         seconds = time.perf_counter() - started
     return max(collectives.all_gather(seconds))
-
-
-def _wait_for(device: torch.device) -> None:
-    """Until a device has done what it was given."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 @dataclass(frozen=True)

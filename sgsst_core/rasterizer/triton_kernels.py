@@ -249,16 +249,22 @@ def blend_weights(
 
 
 @triton.jit
+def tile_pixels(tile, across, width, first_row, last_row):
+    """Corner (x0, y0) of a raster tile, x and y of its pixels [PIXELS], and which of these are in the rows."""
+    x0, y0 = tile % across * _TILE, tile // across * _TILE
+    pixel = tl.arange(0, _PIXELS)
+    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
+    return x0, y0, x, y, (x < width) & (y >= first_row) & (y < last_row)
+
+
+@triton.jit
 def render(
     ranks, starts, gaussians, values, colours, background, image, transmittances, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
     """Image [h, width, 3] and final transmittance [h, width] of rows first_row..last_row; one program a raster tile."""
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0 = tile % across * _TILE, tile // across * _TILE
-    pixel = tl.arange(0, _PIXELS)
-    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
-    inside = (x < width) & (y >= first_row) & (y < last_row)
+    x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
     left = tl.where(inside, 1.0, 0.0)
     red, green, blue = tl.zeros([_PIXELS], tl.float32), tl.zeros([_PIXELS], tl.float32), tl.zeros([_PIXELS], tl.float32)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
@@ -289,10 +295,7 @@ def slot_gradients(
 ):  # fmt: skip
     """dL/dcolour of every pair of Gaussian and tile in its own slot [E, 3], which holds zeros before."""
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0 = tile % across * _TILE, tile // across * _TILE
-    pixel = tl.arange(0, _PIXELS)
-    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
-    inside = (x < width) & (y >= first_row) & (y < last_row)
+    x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
     place = (y - first_row).to(tl.int64) * width + x
     red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
     green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)
@@ -347,10 +350,7 @@ def survey(
     Slots hold zeros before. What `render` and `slot_gradients` of ones give, in one pass; one program a raster tile.
     """
     tile = tl.program_id(0)
-    x0, y0 = tile % across * _TILE, tile // across * _TILE
-    pixel = tl.arange(0, _PIXELS)
-    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
-    inside = (x < width) & (y < height)
+    x0, y0, x, y, inside = tile_pixels(tile, across, width, 0, height)
     left = tl.where(inside, 1.0, 0.0)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     going = tl.max(left, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterator
 
@@ -13,7 +12,6 @@ from torch import Tensor
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU", allow_module_level=True)
-os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda

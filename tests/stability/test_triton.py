@@ -7,16 +7,12 @@ shown by hundreds here, and by all of them where `sgsst bench stability` runs on
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
-
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
 from sgsst_core.bench.stability import Case, case
 from sgsst_core.bench.stability import gaussian_cases as gaussians

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 import torch
 from torch import Tensor
-
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
 from sgsst_core.features.fused_statistics import fused_statistics
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics_reference

@@ -19,9 +19,6 @@ import numpy as np
 import pytest
 import torch
 
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
-
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import make_rasterizer
@@ -228,6 +225,7 @@ def test_without_a_gpu_the_error_says_what_to_do() -> None:
     assert "set TRITON_INTERPRET=1" in ended.stderr
 
 
+@pytest.mark.slow
 def test_kernels_compile_for_real_targets_within_their_registers() -> None:
     """Spilled registers cost memory traffic in the innermost loop: none on NVIDIA, few on AMD."""
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,6 @@ from torch import Tensor
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU: the pretend one would stand in its way", allow_module_level=True)
-os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights

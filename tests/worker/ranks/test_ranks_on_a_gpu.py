@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 import torch
 from torch import Tensor
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
-os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
 
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives
