@@ -4,8 +4,9 @@
 
 Real processes of `sgsst serve`, with curl, `sgsst submit` and plain tus requests as clients. A connection is cut in the
 middle of the tus upload and of a download, and both go on. Of each stage: seconds, the share of them that files were
-checked or planned (`inspecting_seconds`), what the API's memory grew by at most, and the peaks of the processes that
-read the scene (with the pages of the file that they map). Clients run on the same machine and take a share of it.
+checked or planned (`inspecting_seconds`), the API's memory before and at most, and the peaks of the processes that read
+the scene, with the pages of the file that they map and without (`own`). Clients run on the same machine and take a
+share of it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import base64
 import contextlib
 import hashlib
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -69,7 +71,7 @@ class Memory:
 
     def figures(self) -> dict[str, float]:
         """Peaks in MB since `begin`, and seconds in which something was inspected."""
-        peaks = {f"{name}_peak_mb": round(size / 1e6, 1) for name, size in self._peaks.items()}
+        peaks = {f"{name}_mb": round(size / 1e6, 1) for name, size in self._peaks.items()}
         return {"inspecting_seconds": round(self._inspecting, 1), **peaks}
 
     def close(self) -> None:
@@ -82,19 +84,24 @@ class Memory:
         before = time.perf_counter()
         while not self._over.wait(_LOOK_SECONDS):
             for name, module in _PROCESSES.items():
-                size = max((_resident(process) for process in self._service.processes(module)), default=0)
-                self._peaks[name] = max(self._peaks.get(name, 0), size)
+                for process in self._service.processes(module):
+                    for field, size in memory_of(process).items():
+                        self._peaks[name + field] = max(self._peaks.get(name + field, 0), size)
             now = time.perf_counter()
             if folder.is_dir() and any(folder.iterdir()):
                 self._inspecting += now - before
             before = now
 
 
-def _resident(process: psutil.Process) -> int:
+def memory_of(process: psutil.Process) -> dict[str, int]:
+    """Bytes that a process has now, with what it maps (`_peak`) and without (`_own_peak`); nothing of a dead one."""
     try:
-        return int(process.memory_info().rss)
-    except psutil.Error:
-        return 0
+        status = Path(f"/proc/{process.pid}/status").read_text()
+    except OSError:
+        return {}
+    found = dict(re.findall(r"(VmRSS|RssAnon):\s+(\d+) kB", status))
+    names = {"_peak": "VmRSS", "_own_peak": "RssAnon"}
+    return {field: 1024 * int(found[name]) for field, name in names.items() if name in found}
 
 
 class Trial:
@@ -203,6 +210,7 @@ class Trial:
 
 
 def _run(command: list[str]) -> str:
+    """What a command prints; raises CalledProcessError where it fails."""
     return subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.PIPE, text=True).stdout
 
 
@@ -255,7 +263,7 @@ def main() -> None:
             assert api is not None
             memory = Memory(service)
             trial = Trial(service, folder, files, parameters)
-            stages = run_stages(trial, memory, arguments.stages, lambda: _resident(api))
+            stages = run_stages(trial, memory, arguments.stages, lambda: memory_of(api)["_peak"])
             memory.close()
     figures = {"bytes": size, "parameters": parameters, "stages": stages}
     print(write_result("large_upload", figures))

@@ -108,6 +108,7 @@ class InspectionProcess:
                 show(answer["planning"])
             return None
         except (OSError, ValueError):
+            await self.close()  # what else it has to say belongs to no later request
             return None
         except asyncio.CancelledError:  # its answer would be taken for that to the next request
             await self.close()

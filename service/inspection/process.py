@@ -218,8 +218,8 @@ def _limit_resources(seconds: float, size: int) -> None:
 def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
     """Fork, limit, answer; the lines that the child has to say come through a pipe.
 
-    A child that ends without an answer hit a limit, of which it has three: processor time, memory, and twice the
-    processor time on the clock.
+    A child that ends without an answer hit a limit, of which it has three: processor time of each thread, memory, and
+    twice that time on the clock.
     """
     reading, writing = os.pipe()
     child = os.fork()
@@ -250,7 +250,8 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
         if request["threads"] > 1:  # no thread has been started yet, so that none is missing here
             torch.set_num_threads(request["threads"])
         _die_first()
-        _limit_resources(request["seconds"], request["bytes"] + _beside_reading(request))
+        # each thread takes processor time while it waits for the others
+        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _beside_reading(request))
         with os.fdopen(writing, "w") as file:
 
             def show(now: PlanningProgress) -> None:
