@@ -36,7 +36,7 @@ from tests.small_scenes import write_files
 
 STAGES = ("tus", "dry_run", "submit", "curl", "download")
 #: Of `tests.api.service`, but with the times and threads that a service has.
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "SGSST_MIN_FREE_BYTES": "1000000000",
     "SGSST_CHECKPOINT_SECONDS": "60",
     "SGSST_PREVIEW_SECONDS": "20",
@@ -151,10 +151,10 @@ class Trial:
 
     def dry_run(self) -> dict[str, Any]:
         """A dry run that names the upload."""
-        parts = [("scene", (None, self._upload)), ("parameters", (None, json.dumps(self._parameters)))]
+        told = {"scene": self._upload, "parameters": json.dumps(self._parameters)}
         with self._files["style"].open("rb") as style, self._files["cameras"].open("rb") as cameras:
-            files = [*parts, ("style", ("style.png", style)), ("cameras", ("cameras.json", cameras))]
-            answer = self._client.post("/v1/jobs", params={"dry_run": True}, files=files)
+            files = {"style": ("style.png", style), "cameras": ("cameras.json", cameras)}
+            answer = self._client.post("/v1/jobs", params={"dry_run": True}, data=told, files=files)
         answer.raise_for_status()
         plan = answer.json()
         return {name: plan[name] for name in ("gaussians", "views", "estimated_seconds", "memory_bytes")}

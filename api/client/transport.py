@@ -178,7 +178,8 @@ def _has_file(response: httpx.Response) -> bool:
 
 
 def _has_events(response: httpx.Response) -> bool:
-    return response.headers.get("content-type", "").startswith("text/event-stream")
+    kind: str = response.headers.get("content-type", "")
+    return kind.startswith("text/event-stream")
 
 
 class BlockingDriver:
@@ -412,7 +413,7 @@ class AwaitingDriver:
     async def _call(self, call: Call) -> httpx.Response:
         return checked(await self._http.request(call.method, call.path, **call.options))
 
-    async def _hear(self, step: Hear) -> httpx.Response:
+    async def _hear(self, step: Hear) -> httpx.Response | None:
         call = step.call
         async with aconnect_sse(self._http, call.method, call.path, **call.options) as source:
             if not _has_events(source.response):

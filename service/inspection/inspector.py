@@ -225,12 +225,13 @@ class Inspector:
         if work == "validate":
             return reading
         known = self.recall("validate", inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
-        views = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
-        return self._settings.dry_run_seconds + reading + views + _PLAN_SECONDS_PER_PIXEL * known["pixels"]
+        looking: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
+        looking += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
+        return self._settings.dry_run_seconds + reading + looking
 
     def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
         """Memory that reading may take; photos are read one after the other."""
-        size = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
+        size: int = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
         least = self._settings.inspection_bytes
         most = max(least, int(_MEMORY_SHARE * psutil.virtual_memory().total))
         return min(least + _MEMORY_PER_BYTE * size, most)
