@@ -27,8 +27,9 @@ class ServiceSettings(BaseSettings):
         max_photos: files in one job.
         max_jobs_per_key: unfinished jobs of one key.
         min_free_bytes: nothing is taken in once the disk has less left.
-        inspection_seconds, inspection_bytes: what checking one input may take, processor time and memory.
-        dry_run_seconds: what planning without running may take.
+        inspection_seconds, inspection_bytes: what checking a job's files may take, processor time and memory; their
+            size adds to both (`service.inspection.inspector`).
+        dry_run_seconds: processor time that planning without running may take; Gaussians and views add to it.
         receive_seconds: a request's body that stands still for so long is given up.
         upload_hours: after which an unfinished upload, or a finished one that no job uses, expires.
         retention_days: after which a finished job's results expire; the job's record stays as long again.

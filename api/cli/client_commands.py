@@ -66,7 +66,10 @@ def submit(
     chosen = {"name": scene.stem, **told, **_parse_parameters(parameters)}
     with _client(url, key) as client:
         if dry_run:
-            plan = client.plan(scene, style, cameras=cameras, photos=images, **chosen)
+            with _sending_and_planning() as (progress, planning):
+                plan = client.plan(
+                    scene, style, cameras=cameras, photos=images, progress=progress, planning=planning, **chosen
+                )
             out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
         with _transfer("sending") as progress:
@@ -196,6 +199,24 @@ def _transfer(what: str) -> Iterator[Any]:
     with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total or None)
+
+
+@contextmanager
+def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
+    """One bar for the files' bytes and then for the views that are looked at, on a terminal; nothing elsewhere."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+    with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
+        task = bar.add_task("checking", total=None, text="")
+
+        def sent(done: int, total: int) -> None:
+            bar.update(task, description="sending", completed=done, total=total or None, text=f"{done / 1e6:.0f} MB")
+            if done == total:
+                bar.update(task, description="checking", total=None, text="")
+
+        def planned(done: int, total: int) -> None:
+            bar.update(task, description="planning", completed=done, total=total, text=f"view {done} of {total}")
+
+        yield sent, planned
 
 
 def _follow(client: Client, job_id: str, as_json: bool) -> Job:

@@ -87,8 +87,12 @@ def checked(response: httpx.Response) -> httpx.Response:
         message = str(problem["detail"])
     except (ValueError, KeyError, TypeError):
         problem, message = {}, f"{response.request.url} answered {response.status_code}"
-    kind = RequestError if response.status_code < 500 else ApiError
-    raise kind(message, response.status_code, problem)
+    raise refusal(message, response.status_code, problem)
+
+
+def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
+    """A refused request as an error: its own fault, or the service's."""
+    return (RequestError if status < 500 else ApiError)(message, status, problem)
 
 
 def is_passing(error: Exception) -> bool:

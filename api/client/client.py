@@ -76,8 +76,7 @@ class JobMethods(Methods):
             RequestError: something cannot be used; the message says what.
         """
         files = Path(scene), Path(style), _path(cameras), _path(photos)
-        answer = yield from uploads.create_job(files, parameters, webhook=webhook, progress=progress, dry_run=False)
-        return Job.of(answer)
+        return Job.of((yield from uploads.create_job(files, parameters, webhook=webhook, progress=progress)))
 
     @Operation
     def plan(
@@ -88,11 +87,17 @@ class JobMethods(Methods):
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
+        progress: Progress = no_progress,
+        planning: Progress = no_progress,
         **parameters: Any,
     ) -> Steps[dict[str, Any]]:
-        """What a job would do and need; nothing is queued. Arguments are those of `submit`."""
+        """What a job would do and need; nothing is queued. Arguments are those of `submit`.
+
+        Args:
+            planning: called with the views that have been looked at and all of them.
+        """
         files = Path(scene), Path(style), _path(cameras), _path(photos)
-        return (yield from uploads.create_job(files, parameters, progress=no_progress, dry_run=True))
+        return (yield from uploads.plan_job(files, parameters, progress=progress, planning=planning))
 
     @Operation
     def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> Steps[str]:

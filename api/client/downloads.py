@@ -30,6 +30,8 @@ class Download:
         self._stamp = target.with_name(target.name + ".part.etag")
         self._tag = ""
         self._done = self._size = 0
+        #: Of the part's first bytes, so many.
+        self._digest, self._hashed = hashlib.sha256(), 0
 
     def headers(self) -> dict[str, str]:
         """Of the request: where to go on."""
@@ -48,7 +50,8 @@ class Download:
         if response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
             return False
         if response.status_code != httpx.codes.PARTIAL_CONTENT:
-            self._done = 0
+            self._done = self._hashed = 0
+            self._digest = hashlib.sha256()
             self._stamp.write_text(self._tag)
             self._part.write_bytes(b"")
         self._size = self._done + int(response.headers.get("content-length", 0))
@@ -58,6 +61,9 @@ class Download:
         """Put a block behind what is there."""
         with self._part.open("ab") as file:
             file.write(block)
+        if self._hashed == self._done:
+            self._digest.update(block)
+            self._hashed += len(block)
         self._done += len(block)
 
     def report(self) -> None:
@@ -72,12 +78,16 @@ class Download:
         """
         expected = self._stamp.read_text() if self._stamp.exists() else self._tag
         self._stamp.unlink(missing_ok=True)
-        if _sha256(self._part) != expected.strip('"'):
+        if self._sha256() != expected.strip('"'):
             self._part.unlink()
             raise ApiError(f"{self.path}: what arrived is not what was sent. Try again.", 460)
         self._part.replace(self._target)
 
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    def _sha256(self) -> str:
+        """Of the part that is there; what was not hashed as it came, another program has left."""
+        with self._part.open("rb") as file:
+            file.seek(self._hashed)
+            while block := file.read(BLOCK):
+                self._digest.update(block)
+                self._hashed += len(block)
+        return self._digest.hexdigest()

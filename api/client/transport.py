@@ -1,8 +1,8 @@
 """The clients' methods, written once: generators that say what they need done, and two drivers that do it.
 
-A method yields steps (`Call`, `Fetch`, `Listen`, `FileWork`, `Wait`) and is sent the result of each, or its error.
-`BlockingDriver` does them in the caller's thread; `AwaitingDriver` awaits them, and leaves files to other threads.
-`Operation` and `Iteration` make a method of either kind out of such a generator.
+A method yields steps (`Call`, `Hear`, `Fetch`, `Listen`, `FileWork`, `Wait`); each is done, and the method is sent its
+result or its error. `BlockingDriver` does them in the caller's thread; `AwaitingDriver` awaits them, and leaves files
+to other threads. `Operation` and `Iteration` make a method of either kind out of such a generator.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, overload
 
 import httpx
 import stamina
-from httpx_sse import aconnect_sse, connect_sse
+from httpx_sse import ServerSentEvent, aconnect_sse, connect_sse
 
 from api.client.answers import Event, checked, is_passing, unreachable
 from api.client.downloads import BLOCK, Download
@@ -47,6 +47,16 @@ class Call:
     method: str
     path: str
     options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Hear:
+    """A request that may be answered by events: each goes to `take`, and there is no other result. Any other answer is
+    that of a `Call`.
+    """
+
+    call: Call
+    take: Callable[[ServerSentEvent], None]
 
 
 @dataclass(frozen=True)
@@ -84,7 +94,7 @@ class Listen:
     stream: EventStream
 
 
-Step = Call | FileWork | Fetch | Listen | Wait
+Step = Call | Hear | FileWork | Fetch | Listen | Wait
 Steps = Generator[Step, Any, T]
 Walk = Generator[Step | Item[T], Any, None]
 
@@ -167,6 +177,11 @@ def _has_file(response: httpx.Response) -> bool:
     return not response.is_error or response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE
 
 
+def _has_events(response: httpx.Response) -> bool:
+    kind: str = response.headers.get("content-type", "")
+    return kind.startswith("text/event-stream")
+
+
 class BlockingDriver:
     """Does steps in the caller's thread.
 
@@ -246,6 +261,8 @@ class BlockingDriver:
         match step:
             case Call():
                 return self._retry(self._call, step)
+            case Hear():
+                return self._retry(self._hear, step)
             case Fetch():
                 return self._retry(self._fetch, step.download)
             case Listen():
@@ -263,6 +280,16 @@ class BlockingDriver:
 
     def _call(self, call: Call) -> httpx.Response:
         return checked(self._http.request(call.method, call.path, **call.options))
+
+    def _hear(self, step: Hear) -> httpx.Response | None:
+        call = step.call
+        with connect_sse(self._http, call.method, call.path, **call.options) as source:
+            if not _has_events(source.response):
+                source.response.read()
+                return checked(source.response)
+            for sent in source.iter_sse():
+                step.take(sent)
+            return None
 
     def _fetch(self, download: Download) -> None:
         with self._http.stream("GET", download.path, headers=download.headers()) as response:
@@ -366,6 +393,8 @@ class AwaitingDriver:
         match step:
             case Call():
                 return await self._retry(self._call, step)
+            case Hear():
+                return await self._retry(self._hear, step)
             case Fetch():
                 return await self._retry(self._fetch, step.download)
             case Listen():
@@ -383,6 +412,16 @@ class AwaitingDriver:
 
     async def _call(self, call: Call) -> httpx.Response:
         return checked(await self._http.request(call.method, call.path, **call.options))
+
+    async def _hear(self, step: Hear) -> httpx.Response | None:
+        call = step.call
+        async with aconnect_sse(self._http, call.method, call.path, **call.options) as source:
+            if not _has_events(source.response):
+                await source.response.aread()
+                return checked(source.response)
+            async for sent in source.aiter_sse():
+                step.take(sent)
+            return None
 
     async def _fetch(self, download: Download) -> None:
         headers = await asyncio.to_thread(download.headers)

@@ -11,10 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from api.client.answers import ApiError, RequestError
+from httpx_sse import ServerSentEvent
+
+from api.client.answers import ApiError, RequestError, refusal
 from api.client.downloads import Progress
 from api.client.inputs import InputFile, input_files
-from api.client.transport import Call, FileWork, Steps
+from api.client.transport import Call, FileWork, Hear, Steps
 
 #: Files from this size on are uploaded in parts.
 PART_BYTES = 16 << 20
@@ -64,13 +66,11 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
     }
 
 
+Files = tuple[Path, Path, Path | None, Path | None]
+
+
 def create_job(
-    files: tuple[Path, Path, Path | None, Path | None],
-    parameters: Mapping[str, Any],
-    *,
-    webhook: str | None = None,
-    progress: Progress,
-    dry_run: bool,
+    files: Files, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
 ) -> Steps[dict[str, Any]]:
     """Send a job; returns what the service answers.
 
@@ -79,8 +79,49 @@ def create_job(
         parameters: of the job; None leaves one out.
         webhook: URL that is told when the job has ended.
         progress: called with the bytes that are up and those of all large files.
-        dry_run: plan the job instead of queueing it.
     """
+    fields = yield from _send_files(files, parameters, progress)
+    if webhook:
+        fields.append(("webhook", (None, webhook)))
+    options = {"files": fields, "headers": {"Idempotency-Key": secrets.token_hex(16)}}
+    answer: dict[str, Any] = (yield Call("POST", "/v1/jobs", options)).json()
+    return answer
+
+
+def plan_job(
+    files: Files, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
+) -> Steps[dict[str, Any]]:
+    """Plan a job instead of queueing it; arguments are those of `create_job`.
+
+    Args:
+        planning: called with the views that have been looked at, and all of them.
+    """
+    fields = yield from _send_files(files, parameters, progress)
+    told: dict[str, Any] = {}
+
+    def take(sent: ServerSentEvent) -> None:
+        if not sent.data:
+            return
+        data = json.loads(sent.data)
+        if sent.event == "planning":
+            planning(data["step"], data["total"])
+        elif sent.event == "problem":
+            raise refusal(data["detail"], data["status"], data)
+        else:
+            told.update(data)
+
+    call = Call("POST", "/v1/jobs", {"params": {"dry_run": True}, "files": fields})
+    answer = yield Hear(call, take)
+    if answer is not None:
+        whole: dict[str, Any] = answer.json()
+        return whole
+    if not told:  # the service was stopped, or something between it and here cut the answer off
+        raise ApiError("The connection ended before the plan had come. Try again.", 502)
+    return told
+
+
+def _send_files(files: Files, parameters: Mapping[str, Any], progress: Progress) -> Steps[list[tuple[str, Any]]]:
+    """Upload what is large; returns the fields of the request, which carries the rest."""
     inputs: list[InputFile] = yield FileWork(partial(input_files, *files))
     total = sum(file.size for file in inputs if file.size > PART_BYTES)
     done = 0
@@ -95,12 +136,7 @@ def create_job(
             fields.append((file.role, (file.name, content, "application/octet-stream")))
     told = {name: value for name, value in parameters.items() if value is not None}
     fields.append(("parameters", (None, json.dumps(told))))
-    if webhook:
-        fields.append(("webhook", (None, webhook)))
-    headers = {} if dry_run else {"Idempotency-Key": secrets.token_hex(16)}
-    options = {"params": {"dry_run": dry_run}, "files": fields, "headers": headers}
-    answer: dict[str, Any] = (yield Call("POST", "/v1/jobs", options)).json()
-    return answer
+    return fields
 
 
 def _report_sum(progress: Progress, before: int, total: int, done: int, _size: int) -> None:

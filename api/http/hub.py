@@ -19,7 +19,7 @@ from service.store.tables import EventRow
 #: Seconds between two looks into the store; a watcher learns of an event after half of it on average.
 _POLL_SECONDS = 0.3
 #: Seconds of silence after which a comment is sent, so that proxies do not take the connection for dead.
-_HEARTBEAT_SECONDS = 15.0
+HEARTBEAT_SECONDS = 15.0
 #: Events of a watched job that are kept for its watchers; who is farther behind reads the store.
 _KEPT = 300
 
@@ -95,7 +95,7 @@ class Hub:
                 if items:
                     continue
                 try:
-                    await asyncio.wait_for(changed.wait(), _HEARTBEAT_SECONDS)
+                    await asyncio.wait_for(changed.wait(), HEARTBEAT_SECONDS)
                 except TimeoutError:
                     yield b": still here\n\n"
         finally:

@@ -86,6 +86,7 @@ class _Writer:
         self._file.truncate(row.offset)  # a crash may have left more, of which nothing is known
         self._file.seek(row.offset)
         self._digest = hashlib.new(wanted[0]) if wanted else None
+        self._whole = context.blobs.digest_so_far(row.id, row.offset)
         self._offset = self._saved = row.offset
         self._seconds = context.settings.upload_hours * 3600
 
@@ -97,6 +98,8 @@ class _Writer:
         self._context.blobs.ensure_room(len(block))
         write_all(self._file, block)
         self._offset += len(block)
+        if self._whole is not None:
+            self._whole.update(block)
         if self._digest is not None:
             self._digest.update(block)
         elif self._offset - self._saved >= _SAVE_BYTES:
@@ -106,6 +109,7 @@ class _Writer:
         """Make what has come durable, then tell the store."""
         os.fsync(self._file.fileno())
         self._saved = self._offset
+        self._context.blobs.keep_digest(self._row.id, self._offset, self._whole)
         return self._context.store.inputs.advance_upload(self._row.id, self._offset, self._seconds)
 
     def finish(self) -> float:

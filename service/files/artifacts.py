@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import mimetypes
+import os
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -16,6 +18,8 @@ from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 
 _CHUNK = 1 << 20
+#: What the system says where a file cannot have another name there: it is on another file system, or on one without.
+_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK)
 _MEDIA_TYPES = {
     ".ply": "application/octet-stream",
     ".json": "application/json",
@@ -33,17 +37,24 @@ class Artifacts:
         if self.local:
             self._files.makedirs(self._root, exist_ok=True)
 
-    def put(self, job_id: str, epoch: int, name: str, source: Path) -> Published:
-        """Copy a file in; it is durable and whole when this returns, and visible once its row is in the store."""
+    def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:
+        """Bring a file in; it is durable and whole when this returns, and visible once its row is in the store.
+
+        Args:
+            final: nobody writes to the file any more, though another may take its name: in a folder of the same file
+                system it is not copied, but has one more name.
+        """
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
-        size, sha256 = _digest(source)
-        if self.local:
-            target = Path(self._root, location)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(target) as temporary:
-                shutil.copyfile(source, temporary)
-        else:
+        if not self.local:
+            size, sha256 = _digest(source)
             self._files.put_file(str(source), f"{self._root}/{location}")
+            return Published(name, location, size, sha256)
+        target = Path(self._root, location)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(target) as temporary:
+            if not (final and _linked(source, temporary)):
+                shutil.copyfile(source, temporary)
+            size, sha256 = _digest(temporary)
         return Published(name, location, size, sha256)
 
     def read(self, location: str, start: int, stop: int) -> Iterator[bytes]:
@@ -103,6 +114,18 @@ class Artifacts:
 def media_type(name: str) -> str:
     """What a result is, for HTTP."""
     return _MEDIA_TYPES.get(Path(name).suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+def _linked(source: Path, target: Path) -> bool:
+    """Put a file's second name in the place of another file, where the file system can."""
+    target.unlink()
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        return False
+    return True
 
 
 def _digest(path: Path) -> tuple[int, str]:

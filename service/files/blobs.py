@@ -7,8 +7,10 @@ import os
 import secrets
 import shutil
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from service.errors import NoSpaceError, NotFoundError, TooLargeError
 from service.store.inputs import Inputs
@@ -17,6 +19,21 @@ from service.store.tables import UploadRow
 #: Files that no row refers to are removed at this age: a younger one's row may still be on its way.
 _ORPHAN_SECONDS = 3600.0
 _PIECE = 1 << 20
+#: Unfinished uploads whose digests so far are remembered; what is forgotten is read again at the end.
+_MAX_DIGESTS = 10_000
+
+
+class Digest(Protocol):
+    """What `hashlib` makes."""
+
+    def update(self, data: bytes, /) -> None:
+        """Take bytes in."""
+
+    def copy(self) -> Digest:
+        """One more, of the same bytes so far."""
+
+    def hexdigest(self) -> str:
+        """Of all bytes so far."""
 
 
 class Receiver:
@@ -65,6 +82,7 @@ class BlobFolder:
             path.mkdir(parents=True, exist_ok=True)
         self._inputs = inputs
         self._min_free = min_free_bytes
+        self._digests: OrderedDict[str, tuple[int, Digest]] = OrderedDict()
 
     def ensure_room(self, size: int) -> None:
         """Raise NoSpaceError where `size` more bytes would leave too little of the disk."""
@@ -95,18 +113,36 @@ class BlobFolder:
             final.unlink()
         return self._blobs / used
 
+    def digest_so_far(self, upload_id: str, offset: int) -> Digest | None:
+        """The SHA-256 of an upload's bytes before an offset, to go on with; None where this process has not seen all of
+        them, or has forgotten it.
+        """
+        if not offset:
+            return hashlib.sha256()
+        at, digest = self._digests.get(upload_id, (-1, None))
+        return digest.copy() if digest is not None and at == offset else None
+
+    def keep_digest(self, upload_id: str, offset: int, digest: Digest | None) -> None:
+        """Remember an upload's digest up to an offset for the request that goes on there."""
+        self._digests.pop(upload_id, None)
+        if digest is not None:
+            self._digests[upload_id] = offset, digest.copy()
+            if len(self._digests) > _MAX_DIGESTS:
+                self._digests.popitem(last=False)
+
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
         """Make an upload whose last byte is on the disk a blob, and tie it to that; returns the blob's SHA-256.
 
         The upload's own file stays until the store knows of the blob: when the process dies on the way, the same can
-        be done again.
+        be done again. The file is read for its digest only where that was not computed while it came.
 
         Raises:
             NotFoundError: the file is gone.
         """
         path = self.upload_path(upload.id)
         try:
-            sha256 = _digest(path)
+            digest = self.digest_so_far(upload.id, upload.length)
+            sha256 = digest.hexdigest() if digest is not None else _digest(path)
             self.keep(path, sha256, upload.length, leave=True)
         except FileNotFoundError:  # unless another request has just done it
             known = self._inputs.upload(upload.id, upload.owner).sha256
@@ -114,6 +150,7 @@ class BlobFolder:
                 raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
             return known
         self._inputs.finish_upload(upload.id, sha256, seconds)
+        self.keep_digest(upload.id, upload.length, None)
         path.unlink(missing_ok=True)
         return sha256
 

@@ -11,10 +11,12 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
+
+import psutil
 
 from service.errors import BusyError, RefusedInputError
 from service.files.staging import Staged, stage
@@ -30,18 +32,39 @@ _VERSION = "1"
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
 _LEFT_SECONDS = 3600.0
+#: What files add to the limits of their inspection, by their bytes. Processor seconds: the slowest readers, of text and
+#: of images, read 30 MB in a second and more; this allows 8. Memory: numbers of text become doubles of four times their
+#: size at most, since each has a digit and a space, and then float32 of twice; a binary file is mapped (once its size),
+#: and becomes float32 of four times its size where it has numbers of one byte.
+_SECONDS_PER_BYTE = 120 / 1e9
+_MEMORY_PER_BYTE = 6
+#: Of all memory, what that comes to at most.
+_MEMORY_SHARE = 0.8
+#: What planning may take on top of its own limit, in processor seconds: for each Gaussian and each pixel of each view.
+#: They take less than a third of it.
+_PLAN_SECONDS_PER_GAUSSIAN = 5e-6
+_PLAN_SECONDS_PER_PIXEL = 5e-6
+#: Jobs with more bytes of files are checked by a process of their own: small ones do not wait for them.
+_LARGE_BYTES = 64 << 20
+
+Show = Callable[[dict[str, Any]], None]
 
 
 class InspectionProcess:
-    """The process, started when it is first needed and again when it has died; one request at a time."""
+    """The process, started when it is first needed and again when it has died; one request at a time.
 
-    def __init__(self) -> None:
+    Args:
+        threads: that it may compute with.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        self._threads = threads
         self._process: asyncio.subprocess.Process | None = None
         self._lock = asyncio.Lock()
         self._waiting = 0
 
-    async def ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        """The answer to a request.
+    async def ask(self, request: dict[str, Any], show: Show = lambda now: None) -> dict[str, Any]:
+        """The answer to a request; `show` is told how far a plan is.
 
         Raises:
             BusyError: too many wait already, or the process died twice.
@@ -52,14 +75,15 @@ class InspectionProcess:
         try:
             async with self._lock:
                 for _ in range(2):
-                    answer = await self._exchange(json.dumps(request).encode() + b"\n")
+                    line = json.dumps({**request, "threads": self._threads}).encode() + b"\n"
+                    answer = await self._exchange(line, show)
                     if answer is not None:
                         return answer
         finally:
             self._waiting -= 1
         raise BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10)
 
-    async def _exchange(self, line: bytes) -> dict[str, Any] | None:
+    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable,
@@ -68,7 +92,7 @@ class InspectionProcess:
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=_MAX_ANSWER,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
+                env=self._environment(),
                 start_new_session=True,
             )
         process = self._process
@@ -77,9 +101,14 @@ class InspectionProcess:
         try:
             process.stdin.write(line)
             await process.stdin.drain()
-            said = await process.stdout.readline()
-            return json.loads(said) if said else None
+            while said := await process.stdout.readline():
+                answer: dict[str, Any] = json.loads(said)
+                if "planning" not in answer:
+                    return answer
+                show(answer["planning"])
+            return None
         except (OSError, ValueError):
+            await self.close()  # what else it has to say belongs to no later request
             return None
         except asyncio.CancelledError:  # its answer would be taken for that to the next request
             await self.close()
@@ -88,8 +117,13 @@ class InspectionProcess:
             if process.returncode is None and process.stdout.at_eof():
                 await self.close()
 
+    def _environment(self) -> dict[str, str]:
+        """Of the process: libraries that start threads as they are imported must not, since it forks."""
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self._threads))
+        return {**os.environ, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+
     async def close(self) -> None:
-        """End the process."""
+        """End the process, and with it the child that reads."""
         process, self._process = self._process, None
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
@@ -103,7 +137,8 @@ class Inspector:
     def __init__(self, settings: ServiceSettings, store: Store) -> None:
         self._settings = settings
         self._store = store
-        self._validating, self._planning = InspectionProcess(), InspectionProcess()
+        self._validating, self._validating_large = InspectionProcess(), InspectionProcess()
+        self._planning = InspectionProcess(_threads_of_a_job(settings))
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
         for left in self._folder.iterdir():  # by a process that was killed
@@ -133,8 +168,16 @@ class Inspector:
         inputs: Sequence[Mapping[str, Any]],
         blobs: Mapping[str, Path],
         parameters: JobParameters,
+        show: Show = lambda now: None,
     ) -> dict[str, Any]:
         """What `service.inspection.process` finds in a job's inputs.
+
+        Args:
+            work: "plan" for what has been validated.
+            inputs: `role`, `name`, `sha256` and `size` of each file.
+            blobs: the files by digest.
+            parameters: of the job.
+            show: told `step`, `total`, `fraction` and `eta_s` of a plan; its steps are views.
 
         Raises:
             RefusedInputError: they cannot be used.
@@ -143,7 +186,7 @@ class Inspector:
         recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
         if recalled is not None:
             return recalled
-        answer = await self._ask_process(work, inputs, blobs, parameters)
+        answer = await self._ask_process(work, inputs, blobs, parameters, show)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
         if not passing:  # another day it may be otherwise
             key = self._key(work, inputs, parameters)
@@ -152,26 +195,46 @@ class Inspector:
 
     async def _ask_process(
         self,
-        work: str,
+        work: Work,
         inputs: Sequence[Mapping[str, Any]],
         blobs: Mapping[str, Path],
         parameters: JobParameters,
+        show: Show,
     ) -> dict[str, Any]:
-        seconds = self._settings.inspection_seconds if work == "validate" else self._settings.dry_run_seconds
-        process = self._validating if work == "validate" else self._planning
+        size = sum(entry["size"] for entry in inputs)
+        process = (
+            self._planning if work == "plan" else self._validating_large if size > _LARGE_BYTES else self._validating
+        )
+        seconds = await asyncio.to_thread(self._seconds, work, size, inputs, parameters)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             staged = await asyncio.to_thread(stage, Path(folder), inputs, blobs)
-            return await process.ask(
-                {
-                    "work": work,
-                    "folder": folder,
-                    "staged": _as_text(staged),
-                    "parameters": parameters.model_dump(mode="json"),
-                    "limits": self._limits,
-                    "seconds": seconds,
-                    "bytes": self._settings.inspection_bytes,
-                }
-            )
+            request = {
+                "work": work,
+                "folder": folder,
+                "staged": _as_text(staged),
+                "parameters": parameters.model_dump(mode="json"),
+                "limits": self._limits,
+                "seconds": seconds,
+                "bytes": self._memory(inputs),
+            }
+            return await process.ask(request, show)
+
+    def _seconds(self, work: Work, size: int, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> float:
+        """Processor time that a piece of work may take."""
+        reading = self._settings.inspection_seconds + _SECONDS_PER_BYTE * size
+        if work == "validate":
+            return reading
+        known = self.recall("validate", inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
+        looking: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
+        looking += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
+        return self._settings.dry_run_seconds + reading + looking
+
+    def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
+        """Memory that reading may take; photos are read one after the other."""
+        size: int = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
+        least = self._settings.inspection_bytes
+        most = max(least, int(_MEMORY_SHARE * psutil.virtual_memory().total))
+        return min(least + _MEMORY_PER_BYTE * size, most)
 
     def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
@@ -180,9 +243,15 @@ class Inspector:
         return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
 
     async def close(self) -> None:
-        """End both processes."""
-        await self._validating.close()
-        await self._planning.close()
+        """End all processes."""
+        for process in (self._validating, self._validating_large, self._planning):
+            await process.close()
+
+
+def _threads_of_a_job(settings: ServiceSettings) -> int:
+    """Threads that a job of this machine computes with: its plan tells of as many."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return int(told) if told.isdigit() and int(told) else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
 
 
 def _found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:

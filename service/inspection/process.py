@@ -2,11 +2,12 @@
 
 It imports what takes long once, then forks for each request a child with limits on time and memory, which reads the
 files and dies. So a hostile file can break nothing but the answer to its own request. Requests and answers are lines of
-JSON on stdin and stdout, one at a time.
+JSON on stdin and stdout, one at a time; before the answer to a plan come lines of how far it is, `{"planning": ...}`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -14,9 +15,9 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import psutil
 import torch
@@ -24,17 +25,25 @@ import torch
 from service.files.staging import Staged
 from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
+from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene
 from sgsst_core.files.ply_header import element_offsets, read_header
 from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from worker.inputs import check_something_in_view, read_cameras_of
+from worker.processes import die_with_parent
 from worker.request import check_steps
+
+#: Bytes of an answer.
+MAX_ANSWER = 64 << 20
+#: Address space that each thread reserves and hardly uses: its stack, and an arena of the C library.
+_THREAD_BYTES = 1 << 28
 
 
 class RefusedError(Exception):
@@ -100,12 +109,12 @@ def _read_inputs(
     return found, file.scene, cameras
 
 
-def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
-    """What a job would do: what `validate` finds, and the plan of `sgsst plan`."""
+def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
+    """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
     found, scene, cameras = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
-    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True)
+    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True, show=show)
     seconds = memory = on_device = None
     if made.prediction:
         memory, on_device = made.prediction.peak_bytes, made.prediction.device_bytes
@@ -120,8 +129,8 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> d
     }
 
 
-WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any]], dict[str, Any]]] = {
-    "validate": validate,
+WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {
+    "validate": lambda staged, parameters, limits, show: validate(staged, parameters, limits),
     "plan": plan,
 }
 
@@ -173,13 +182,14 @@ def _check_frames_have_sizes(path: Path) -> None:
 # --- one request in a child ----------------------------------------------------------------------------------------
 
 
-def _inspect(request: dict[str, Any]) -> dict[str, Any]:
-    """What a child writes: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
+def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
+    """What a child writes at last: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
         paths = {role: Path(path) if path else None for role, path in request["staged"].items()}
         staged = Staged(**paths)  # type: ignore[arg-type]
-        return {"found": WORK[request["work"]](staged, JobParameters(**request["parameters"]), request["limits"])}
+        work = WORK[request["work"]]
+        return {"found": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
     except (RefusedError, InvalidInputError) as error:
         return _refusal(error.code, str(error), getattr(error, "part", None))
     except MemoryError as error:
@@ -205,54 +215,102 @@ def _limit_resources(seconds: float, size: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _inspect_in_child(request: dict[str, Any]) -> bytes:
-    """Fork, limit, answer; what the child has to say comes through a pipe. A child that says nothing hit a limit."""
+def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
+    """Fork, limit, answer; the lines that the child has to say come through a pipe.
+
+    A child that ends without an answer hit a limit, of which it has three: processor time of each thread, memory, and
+    twice that time on the clock.
+    """
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(reading)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        try:
-            _limit_resources(request["seconds"], request["bytes"])
-            with os.fdopen(writing, "wb") as file:
-                file.write(json.dumps(_inspect(request)).encode())
-        finally:
-            os._exit(0)
+        _be_child(request, writing)
     os.close(writing)
-    answer = _read_to_end(reading, time.monotonic() + 2 * request["seconds"])
-    os.close(reading)
-    if answer is None:
-        os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+    answered = False
     try:
-        json.loads(answer or b"")
-    except ValueError:
-        limit = "Reading the files takes more time or memory than allowed, or breaks their reader."
-        return json.dumps(_refusal("inspection-limit", limit, None)).encode()
-    return answer or b""
+        for line in _lines(reading, time.monotonic() + 2 * request["seconds"]):
+            answered = "planning" not in json.loads(line)
+            yield line
+            if answered:
+                break
+    finally:
+        os.close(reading)
+        os.kill(child, signal.SIGKILL)  # a child that has said everything may be gone, but is not forgotten yet
+        os.waitpid(child, 0)
+    if not answered:
+        yield json.dumps(_refusal("inspection-limit", _limit_text(request), None)).encode()
 
 
-def _read_to_end(descriptor: int, deadline: float) -> bytes | None:
-    """All that comes until the other end closes; None where it is still open at the deadline."""
-    parts: list[bytes] = []
-    while (left := deadline - time.monotonic()) > 0:
-        if select.select([descriptor], [], [], left)[0]:
-            part = os.read(descriptor, 1 << 16)
-            if not part:
-                return b"".join(parts)
-            parts.append(part)
-    return None
+def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
+    """Answer a request and end. Nothing of the process that was forked is touched."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        die_with_parent()  # a fork does not take that over
+        if request["threads"] > 1:  # no thread has been started yet, so that none is missing here
+            torch.set_num_threads(request["threads"])
+        _die_first()
+        # each thread takes processor time while it waits for the others
+        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _beside_reading(request))
+        with os.fdopen(writing, "w") as file:
+
+            def show(now: PlanningProgress) -> None:
+                told = {"step": now.done, "total": now.total, "fraction": now.fraction, "eta_s": now.seconds_left}
+                print(json.dumps({"planning": told}), file=file, flush=True)
+
+            print(json.dumps(_inspect(request, show)), file=file)
+    finally:
+        os._exit(0)
+
+
+def _die_first() -> None:
+    """Where the machine's memory runs out, let the system end this process rather than a job."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("500")
+
+
+def _beside_reading(request: dict[str, Any]) -> int:
+    """Memory that is not taken for what the files hold: that of threads, and that which a plan measures with."""
+    threads: int = request["threads"] * _THREAD_BYTES
+    if request["work"] == "validate":
+        return threads
+    return threads + (request["parameters"]["memory_limit"] or default_memory_limit())
+
+
+def _limit_text(request: dict[str, Any]) -> str:
+    what = "Reading the files" if request["work"] == "validate" else "Planning the job"
+    text = f"{what} takes more time ({request['seconds']:.0f} s of a processor) or memory "
+    text += f"({request['bytes'] / 1e9:.1f} GB) than allowed for files of this size, or breaks their reader."
+    return text if request["work"] == "validate" else f"{text} Ask for fewer views, or submit it without a dry run."
+
+
+def _lines(descriptor: int, deadline: float) -> Iterator[bytes]:
+    """Whole lines of JSON that come until the other end closes, says what is none, or the deadline is over."""
+    begun = b""
+    while (left := deadline - time.monotonic()) > 0 and len(begun) < MAX_ANSWER:
+        if not select.select([descriptor], [], [], left)[0]:
+            continue
+        part = os.read(descriptor, 1 << 16)
+        if not part:
+            return
+        *whole, begun = (begun + part).split(b"\n")
+        for line in whole:
+            try:
+                if not isinstance(json.loads(line), dict):
+                    return
+            except ValueError:
+                return
+            yield line
 
 
 def main() -> None:
     """Answer requests until stdin closes."""
     torch.set_num_threads(1)  # a forked child of a process with threads could wait for them for ever
-    from worker.processes import die_with_parent
-
     die_with_parent()
     for line in sys.stdin.buffer:
-        sys.stdout.buffer.write(_inspect_in_child(json.loads(line)) + b"\n")
-        sys.stdout.buffer.flush()
+        for said in _inspect_in_child(json.loads(line)):
+            sys.stdout.buffer.write(said + b"\n")
+            sys.stdout.buffer.flush()
 
 
 if __name__ == "__main__":

@@ -87,7 +87,9 @@ class Publisher:
         """Copy a file to the results; None where it has just been replaced or removed."""
         try:
             step = _saved_step(path) if name == CHECKPOINT else None
-            return replace(self._artifacts.put(self._lease.job_id, self._lease.epoch, name, path), step=step)
+            # a later checkpoint takes the name of this one, and leaves its bytes
+            put = self._artifacts.put(self._lease.job_id, self._lease.epoch, name, path, final=name == CHECKPOINT)
+            return replace(put, step=step)
         except FileNotFoundError:
             return None
 
@@ -108,7 +110,7 @@ class Publisher:
             "loss.png": self._out / f"{stem}.loss.png",
         }
         put = [
-            self._artifacts.put(self._lease.job_id, self._lease.epoch, name, path)
+            self._artifacts.put(self._lease.job_id, self._lease.epoch, name, path, final=True)
             for name, path in names.items()
             if path.is_file()
         ]

@@ -313,6 +313,9 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
 
     common = [str(files["scene"]), "--style", str(files["style"]), "--cameras", str(files["cameras"])]
     extra = ["--steps-sos", str(STEPS), "--backbone", "vgg16", "--seed", "3", "--parameters", '{"early_stop": false}']
+    planned = sgsst("submit", *common, *extra, "--dry-run")
+    assert (planned.returncode, planned.stderr) == (0, "")
+    assert planned.stdout.startswith("616 Gaussians, 3 views")
     done = sgsst("submit", *common, *extra, "--out", "mine.ply")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "mine.ply").read_bytes() == expected

@@ -7,21 +7,21 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
-from fastapi.responses import JSONResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import BadRequestError, Received, body_blocks, check_file, parse_json, receive
+from api.http.planning import DRY_RUN, answer_plan
 from api.http.schemas import (
     JOB_ID,
     JobDetail,
     JobPage,
     JobView,
-    PlanView,
     StatusName,
     job_detail,
     job_view,
@@ -69,7 +69,7 @@ _FOLLOWING_OPERATIONS = ("get_job", "cancel_job", "retry_job", "delete_job", "wa
     response_model=JobView,
     openapi_extra=BODY,
     responses={
-        200: {"model": PlanView, "description": "With `dry_run`: the plan. Nothing was queued."},
+        200: DRY_RUN,
         202: {
             "description": "The job was accepted: it will not be lost.",
             "headers": headers("Location", "Retry-After", maybe=("Idempotency-Replayed",)),
@@ -95,7 +95,8 @@ async def create_job(
     if not wanted.checked:
         await context.inspector.inspect("validate", wanted.inputs, wanted.paths, wanted.parameters)
     if dry_run:
-        return await _plan_job(context, wanted.inputs, wanted.paths, wanted.parameters)
+        plan = partial(context.inspector.inspect, "plan", wanted.inputs, wanted.paths, wanted.parameters)
+        return await answer_plan(request, plan, wanted.parameters.workers)
     return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key)
 
 
@@ -214,14 +215,6 @@ def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
             input=role,
         )
     return sha256
-
-
-async def _plan_job(
-    context: Context, inputs: Sequence[Mapping[str, Any]], paths: Mapping[str, FilePath], parameters: JobParameters
-) -> Response:
-    found = await context.inspector.inspect("plan", inputs, paths, parameters)
-    view = PlanView(**found, workers=parameters.workers)
-    return JSONResponse(view.model_dump(mode="json"))
 
 
 def _idempotency(

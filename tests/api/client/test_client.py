@@ -232,6 +232,25 @@ def test_a_plan_queues_nothing_and_bad_files_are_refused(
 
 
 @both
+def test_a_plan_tells_how_far_it_is(connect: Any, service: Service, files: dict[str, Path]) -> None:
+    options = {"preset": "preview", "backbone": "vgg16", "resolution": 64, "cameras": files["cameras"]}
+    told: list[tuple[int, int]] = []
+    with connect(service.url) as client:
+        plan = client.plan(
+            files["scene"],
+            files["style"],
+            planning=lambda done, total: told.append((done, total)),
+            learning_rate=0.1 if connect is Client else 0.3,  # what has been planned is remembered, and tells nothing
+            **options,
+        )
+        assert (plan["gaussians"], plan["views"]) == (616, 3)
+        assert told[-1] == (3, 3)
+        with pytest.raises(RequestError, match="prun") as caught:
+            client.plan(files["scene"], files["style"], prune_weight=1e9, **options)
+        assert (caught.value.status, caught.value.problem["code"]) == (422, "invalid-settings")
+
+
+@both
 def test_one_upload_serves_many_jobs(connect: Any, service: Service, files: dict[str, Path]) -> None:
     with connect(service.url) as client:
         uploaded = client.upload(files["scene"], "other.ply")

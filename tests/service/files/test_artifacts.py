@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,31 @@ def test_a_file_comes_back_whole_and_in_parts(artifacts: Artifacts, tmp_path: Pa
     assert (tmp_path / "back").read_bytes() == source.read_bytes()
     with pytest.raises(OSError, match="shorter"):
         list(artifacts.read(put.location, 0, put.size + 1))
+
+
+def test_a_file_that_nobody_writes_to_is_not_copied(artifacts: Artifacts, tmp_path: Path) -> None:
+    source = tmp_path / "checkpoint"
+    source.write_bytes(b"first")
+    put = artifacts.put("job_1", 1, ".checkpoint", source, final=True)
+    assert source.stat().st_nlink == (2 if artifacts.local else 1)
+    later = tmp_path / "later"
+    later.write_bytes(b"second")
+    later.replace(source)
+    assert b"".join(artifacts.read(put.location, 0, put.size)) == b"first"
+    assert put.sha256 == hashlib.sha256(b"first").hexdigest()
+
+
+def test_where_names_cannot_be_shared_it_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(source: object, target: object) -> None:
+        raise OSError(errno.EXDEV, "Invalid cross-device link")
+
+    monkeypatch.setattr("service.files.artifacts.os.link", refuse)
+    source = tmp_path / "stylized.ply"
+    source.write_bytes(bytes(3_000_000))
+    put = Artifacts(f"file://{tmp_path / 'results'}").put("job_1", 1, "stylized.ply", source, final=True)
+    assert (tmp_path / "results" / put.location).read_bytes() == source.read_bytes()
+    with pytest.raises(FileNotFoundError):
+        Artifacts(f"file://{tmp_path / 'results'}").put("job_1", 1, "stylized.ply", tmp_path / "none", final=True)
 
 
 def test_what_no_row_refers_to_is_swept(artifacts: Artifacts, tmp_path: Path) -> None:

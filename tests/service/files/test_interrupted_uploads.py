@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import signal
 from pathlib import Path
@@ -24,8 +25,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"scene": ply, "cameras": cameras, "style": style}
 
 
-def append(service: Service, where: str, offset: int, content: bytes) -> httpx.Response:
+def append(service: Service, where: str, offset: int, content: bytes, checksum: str = "") -> httpx.Response:
     headers = {**TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
+    headers |= {"Upload-Checksum": checksum} if checksum else {}
     return httpx.patch(f"{service.url}{where}", content=content, headers=headers, timeout=60)
 
 
@@ -88,3 +90,22 @@ def test_missing_bytes_do_not_become_zeros(files: dict[str, Path], tmp_path: Pat
         part.unlink()
         answer = append(service, where, files["scene"].stat().st_size - 1, b"x")
         assert (answer.status_code, answer.json()["code"]) == (404, "not-found")
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_the_digest_of_many_parts_is_that_of_the_file(files: dict[str, Path], tmp_path: Path, killed: bool) -> None:
+    content = files["scene"].read_bytes()
+    middle = len(content) // 2
+    with Service(tmp_path / "data", alone=True) as service:
+        headers = {**TUS, "Upload-Length": str(len(content))}
+        where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
+        assert append(service, where, 0, content[:middle]).status_code == 204
+        wrong = base64.b64encode(hashlib.sha256(b"another").digest()).decode()
+        assert append(service, where, middle, bytes(100), f"sha256 {wrong}").status_code == 460
+        if killed:  # the digest so far is lost
+            service.stop(signal.SIGKILL)
+            service.start()
+        assert append(service, where, middle, content[middle:-1]).status_code == 204
+        assert append(service, where, len(content) - 1, content[-1:]).status_code == 204
+        shown = httpx.get(f"{service.url}{where}").json()
+        assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())

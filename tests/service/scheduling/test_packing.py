@@ -159,12 +159,12 @@ def test_places_are_parts_of_cores_and_memory() -> None:
     small = room.grant(job(GB), [], 9)
     assert small is not None
     assert (small.places, small.threads) == (1, 4)
-    assert small.memory == 20 * GB - 2 * GB
-    large = room.grant(job(12 * GB), [small], 9)
+    assert small.memory == 20 * GB - 4 * GB
+    large = room.grant(job(8 * GB), [small], 9)
     assert large is not None
     assert (large.places, large.threads) == (2, 8)
     assert room.free([small, large]) == 1
-    assert room.grant(job(12 * GB), [small, large], 9) is None, "two places, and one is free"
+    assert room.grant(job(8 * GB), [small, large], 9) is None, "two places, and one is free"
     asked = room.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
     assert asked is not None
     assert (asked.places, asked.memory) == (1, 3 * GB)
@@ -184,7 +184,7 @@ def test_jobs_side_by_side_never_plan_with_more_memory_than_there_is(
         grant = room.grant(job(scene, memory_limit=limit), held, len(jobs))
         if grant is not None:
             held.append(grant)
-            planned.append((grant.memory or 0) + 2 * scene)
+            planned.append((grant.memory or 0) + 4 * scene)
     assert bool(held) == bool(jobs), "the first one always runs, were it too big"
     assert len(held) < 2 or sum(planned) <= 100 * GB
 

@@ -1,0 +1,92 @@
+"""The answer to a dry run: the plan, or events on the way to it for who accepts them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import AsyncIterator, Coroutine, Mapping
+from typing import Any, Protocol
+
+from fastapi import Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
+
+from api.http.hub import HEARTBEAT_SECONDS
+from api.http.problems import InternalError, from_service
+from api.http.schemas import PlanView
+from service.errors import ServiceError
+
+_EVENTS = "text/event-stream"
+_EVENT = {
+    "type": "object",
+    "required": ["event", "data"],
+    "properties": {
+        "event": {"type": "string", "enum": ["planning", "plan", "problem"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
+_PLANNING = {"step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
+#: For the OpenAPI document.
+DRY_RUN: dict[str, Any] = {
+    "model": PlanView,
+    "description": "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: "
+    "`planning`, how many views have been looked at; at last `plan`, or the `problem` that was found after the answer "
+    "had begun.",
+    "content": {
+        _EVENTS: {
+            "schema": _EVENT,
+            "examples": {"planning": {"value": {"event": "planning", "data": json.dumps(_PLANNING)}}},
+        }
+    },
+}
+
+_log = logging.getLogger(__name__)
+
+
+class Planning(Protocol):
+    """Plans, and tells how far it is."""
+
+    def __call__(self, show: Any) -> Coroutine[Any, Any, dict[str, Any]]:
+        """What was found; `show` is called with each `planning`."""
+
+
+async def answer_plan(request: Request, plan: Planning, workers: int | None) -> Response:
+    """The plan as JSON once it is there; or at once a stream of events, where the request accepts that."""
+    if _EVENTS in request.headers.get("accept", ""):
+        sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        return StreamingResponse(_events(plan, workers), 200, sent, _EVENTS)
+    return JSONResponse(_view(await plan(lambda now: None), workers))
+
+
+def _view(found: Mapping[str, Any], workers: int | None) -> dict[str, Any]:
+    return PlanView(**found, workers=workers).model_dump(mode="json")
+
+
+async def _events(plan: Planning, workers: int | None) -> AsyncIterator[bytes]:
+    """What is told of a plan; who stops listening ends the planning."""
+    told: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+    task = asyncio.create_task(plan(told.put_nowait))
+    task.add_done_callback(lambda _: told.put_nowait(None))
+    try:
+        while True:
+            try:
+                now = await asyncio.wait_for(told.get(), HEARTBEAT_SECONDS)
+            except TimeoutError:
+                yield b": still here\n\n"
+                continue
+            if now is None:
+                break
+            yield _event("planning", now)
+        try:
+            yield _event("plan", _view(task.result(), workers))
+        except ServiceError as error:
+            yield _event("problem", json.loads(bytes(from_service(error).body)))
+        except Exception as error:
+            _log.exception("a dry run broke", exc_info=error)
+            yield _event("problem", json.loads(bytes(from_service(InternalError()).body)))
+    finally:
+        task.cancel()
+
+
+def _event(kind: str, data: Mapping[str, Any]) -> bytes:
+    return f"event: {kind}\ndata: {json.dumps(data)}\n\n".encode()

@@ -1,0 +1,78 @@
+"""What looking into files may take grows with them: an honest scene is not refused for its size."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from service.errors import RefusedInputError
+from service.inspection.inspector import Inspector
+from service.parameters import JobParameters
+from service.settings import ServiceSettings
+from service.store import open_store
+from sgsst_core.files.ply import write_scene
+from tests.small_scenes import wall, write_files
+
+
+def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
+    """What validation finds, with these limits of the settings."""
+    settings = ServiceSettings(data=folder / "data", **limits)
+    blobs = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
+    inputs = [
+        {"role": role, "name": path.name, "sha256": blobs[role], "size": path.stat().st_size}
+        for role, path in files.items()
+    ]
+
+    async def ask() -> dict[str, Any]:
+        inspector = Inspector(settings, store)
+        try:
+            paths = {blobs[role]: path for role, path in files.items()}
+            return await inspector.inspect("validate", inputs, paths, JobParameters(backbone="auto"))
+        finally:
+            await inspector.close()
+
+    (folder / "data").mkdir(exist_ok=True)
+    store = open_store(settings)
+    try:
+        return asyncio.run(ask())
+    finally:
+        store.close()
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    scene, cameras, style = write_files(tmp_path, wall())
+    return {"scene": scene, "cameras": cameras, "style": style}
+
+
+def large(path: Path, side: int) -> Path:
+    """A scene of side squared Gaussians with all harmonics."""
+    write_scene(path, wall(side, side, sh_degree=3))
+    return path
+
+
+def test_a_large_scene_may_take_what_its_size_asks_for(files: dict[str, Path], tmp_path: Path) -> None:
+    files["scene"] = large(tmp_path / "large.ply", 300)
+    found = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
+    assert (found["gaussians"], found["sh_degree"]) == (90_000, 3)
+
+
+def test_a_small_file_that_becomes_large_may_not(files: dict[str, Path], tmp_path: Path) -> None:
+    Image.new("RGB", (6000, 6000)).save(files["style"])  # 432 MB as float32, 100 kB as a file
+    assert files["style"].stat().st_size < 1_000_000
+    with pytest.raises(RefusedInputError, match="memory") as caught:
+        inspect(tmp_path, files, inspection_bytes=64_000_000)
+    assert caught.value.code == "inspection-limit"
+
+
+@pytest.mark.slow
+def test_a_quarter_of_a_gigabyte_is_read_with_little_more_than_its_size(files: dict[str, Path], tmp_path: Path) -> None:
+    files["scene"] = large(tmp_path / "large.ply", 1010)
+    assert files["scene"].stat().st_size > 250_000_000
+    found = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
+    assert found["gaussians"] == 1010**2
