@@ -63,8 +63,8 @@ def go_on(job: Job, steps: int | None = None) -> Result:
     ("preset", "scan", "settings"),
     [
         ("preview", False, {"position_weights": "off"}),
-        ("standard", True, {"precision": "bfloat16", "views_per_step": 2}),
-        ("paper", False, {"position_weights": "off", "kept_weights": "half"}),
+        pytest.param("standard", True, {"precision": "bfloat16", "views_per_step": 2}, marks=pytest.mark.slow),
+        pytest.param("paper", False, {"position_weights": "off", "kept_weights": "half"}, marks=pytest.mark.slow),
     ],
 )
 def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, settings: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.ply import read_scene
 
 
+@pytest.mark.slow
 def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
     vgg16_weights: BackboneWeights,
     tmp_path: Path,
