@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from rich.table import Column, Table
+from torch import Tensor
 
 from sgsst_core.bench.error_time import Curve, Point, Variant, as_dict, choose_variants, error_time, write_plot
+from sgsst_core.bench.quality import Quality, compare_quality, write_sheet
+from sgsst_core.bench.quality import write_plot as write_quality_plot
 from sgsst_core.bench.stability import Case, Measurement, all_cases, measure
 from sgsst_core.errors import OutputError, SettingsError
-from sgsst_core.features.network_weights import load_network_weights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.ply import write_stylized
+from sgsst_core.files.ply import SceneFile, write_stylized
 from sgsst_core.report.machine import machine
+from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_cameras
 from worker.request import SceneRequest, check_choice, check_folder
 
+Found = TypeVar("Found")
+
 
 @dataclass(frozen=True)
-class ErrorTimeRequest:
-    """What `sgsst bench error-time` was asked for.
+class VariantsRequest:
+    """What `sgsst bench error-time` and `sgsst bench quality` were asked for.
 
     Attributes:
         source: scene and cameras.
@@ -45,8 +51,55 @@ class ErrorTimeRequest:
     backbone: str
     settings: dict[str, Any]
 
+    @property
+    def title(self) -> str:
+        """Scene and style, for people."""
+        return f"{self.source.scene.parent.name or self.source.scene.stem}, {self.style.stem}"
 
-def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
+
+@dataclass(frozen=True)
+class _Inputs:
+    """What a request names, read."""
+
+    file: SceneFile
+    cameras: list[Camera]
+    style: Tensor
+    weights: BackboneWeights
+    variants: list[Variant]
+
+    @staticmethod
+    def of(request: VariantsRequest) -> _Inputs:
+        """Check and read; the quick checks come first."""
+        check_choice(request.source)
+        variants = choose_variants(request.variants)
+        check_folder(request.out)
+        weights = load_network_weights(request.backbone)
+        style = load_image(request.style)
+        file, cameras = read_scene_and_cameras(request.source)
+        ensure_writable_folder(request.out)
+        return _Inputs(file, cameras, style, weights, variants)
+
+    def run(self, measure: Callable[..., Found], request: VariantsRequest, progress: Any) -> Found:
+        """Of a function with the arguments of `error_time`."""
+        arguments = (self.file.scene, self.cameras, self.style, self.variants, request.seconds)
+        return measure(*arguments, weights=self.weights, progress=progress, **request.settings)
+
+    def as_dict(self, request: VariantsRequest) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "version": 1,
+            "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
+            "style": request.style.name,
+            "views": len(self.cameras),
+            "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in self.cameras})],
+            "budget_seconds": request.seconds,
+            "settings": request.settings,
+            "backbone": self.weights.name,
+            "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
+        }
+
+
+def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """Run the variants and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
 
     Args:
@@ -55,34 +108,62 @@ def run_error_time(request: ErrorTimeRequest, progress: Any) -> list[Curve]:
     Raises:
         InvalidInputError: in one of its forms, for the first input that cannot be used.
     """
-    check_choice(request.source)
-    variants: list[Variant] = choose_variants(request.variants)
-    check_folder(request.out)
-    weights = load_network_weights(request.backbone)
-    style = load_image(request.style)
-    file, cameras = read_scene_and_cameras(request.source)
-    ensure_writable_folder(request.out)
-    arguments = (file.scene, cameras, style, variants, request.seconds)
-    curves = error_time(*arguments, weights=weights, progress=progress, **request.settings)
-    values = {
-        "version": 1,
-        "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
-        "style": request.style.name,
-        "views": len(cameras),
-        "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],
-        "budget_seconds": request.seconds,
-        "settings": request.settings,
-        "backbone": weights.name,
-        "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
-        **as_dict(curves),
-    }
-    write_json(request.out / "error_time.json", values)
-    title = f"{request.source.scene.parent.name or request.source.scene.stem}, {request.style.stem}"
-    write_plot(request.out / "error_time.png", curves, title)
+    inputs = _Inputs.of(request)
+    curves = inputs.run(error_time, request, progress)
+    write_json(request.out / "error_time.json", {**inputs.as_dict(request), **as_dict(curves)})
+    write_plot(request.out / "error_time.png", curves, request.title)
     for curve in curves:
         if curve.sh_dc is not None:
-            write_stylized(file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
+            write_stylized(inputs.file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
     return curves
+
+
+def run_quality(request: VariantsRequest, progress: Any) -> Quality:
+    """Run the variants, judge them, and write `quality.json`, `quality.png`, `quality.jpg` and scenes into the folder.
+
+    Args:
+        progress: called with a variant and each of its points.
+
+    Raises:
+        InvalidInputError: in one of its forms, for the first input that cannot be used.
+    """
+    inputs = _Inputs.of(request)
+    quality = inputs.run(compare_quality, request, progress)
+    write_json(request.out / "quality.json", {**inputs.as_dict(request), **quality.as_dict()})
+    write_quality_plot(request.out / "quality.png", quality, request.title)
+    write_sheet(request.out / "quality.jpg", quality)
+    for outcome in quality.outcomes[1:]:
+        write_stylized(inputs.file, request.out / f"{outcome.name}.ply", outcome.sh_dc)
+    return quality
+
+
+def quality_table(quality: Quality) -> Table:
+    """Outcomes against what they were judged by; a star for those on the front."""
+    figures = ("style", "palette", "content", "features", "swing", "saturated")
+    columns = (*figures, "short RMSE", "long RMSE", "loss left", "steps")
+    table = Table(
+        Column("", no_wrap=True),
+        *columns,
+        title="after the same seconds: distances, less is better; * on the front of style and content",
+    )
+    front = quality.front()
+    for outcome in quality.outcomes:
+        one = outcome.judgement
+        table.add_row(
+            outcome.name + (" *" if outcome in front else ""),
+            f"{one.style:.3f}",
+            f"{one.palette:.0f}",
+            *(f"{value:.3f}" for value in (one.content, one.features, one.swing)),
+            f"{one.saturated:.1%}",
+            *(_number(found.rmse if found else None) for found in (outcome.short, outcome.long)),
+            _number(outcome.loss),
+            str(outcome.steps or "-"),
+        )
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
 
 
 def error_time_table(curves: Sequence[Curve]) -> Table:

@@ -23,6 +23,7 @@ from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
+    from api.cli.bench import VariantsRequest
     from worker.description import Prepared
     from worker.execute import Result
     from worker.ranks.attempts import RanksResult, WorkerOptions
@@ -346,6 +347,9 @@ def demo(
     _stylize(request, arguments)
 
 
+BenchSeconds = Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")]
+
+
 @bench_app.command("error-time")
 @with_options(ViewOptions)
 @with_options(StylizeOptions, "chosen", only=("coarsest_side", "background", "backbone", "memory_limit"))
@@ -355,25 +359,66 @@ def bench_error_time(
     out: Annotated[Path, typer.Option(help="Folder for table, plot, JSON and scenes.")] = Path("error_time"),
     cameras: CamerasOption = None,
     variants: Annotated[str, typer.Option(help="Names with commas between. [all]")] = "",
-    seconds: Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")] = 300.0,
+    seconds: BenchSeconds = 300.0,
     *,
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
     """Run variants of a job for the same time each, and plot the error that is left against seconds."""
-    from api.cli.bench import ErrorTimeRequest, error_time_table, point_line, run_error_time
-    from worker.request import SceneRequest
+    from api.cli.bench import error_time_table, point_line, run_error_time
 
-    source = SceneRequest.of(scene, cameras, options)
-    settings = {**chosen.given_settings(), "near": options.near}
-    names = [name.strip() for name in variants.split(",") if name.strip()]
-    request = ErrorTimeRequest(source, style, out, names, seconds, chosen.backbone, settings)
+    request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
     curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
     Console(width=TABLE_WIDTH).print(error_time_table(curves))
     for curve in curves:
         if curve.left_out:
             out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
     out_console.print(f"{'results:':<22}{out}")
+
+
+@bench_app.command("quality")
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=("coarsest_side", "background", "backbone", "memory_limit"))
+def bench_quality(
+    scene: SceneArgument,
+    style: StyleOption,
+    out: Annotated[Path, typer.Option(help="Folder for JSON, plot, pictures and scenes.")] = Path("quality"),
+    cameras: CamerasOption = None,
+    variants: Annotated[str, typer.Option(help="Names with commas between.")] = "standard,one-scale,warm-start",
+    seconds: BenchSeconds = 300.0,
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> None:
+    """Run variants of a job for the same time each, and judge results by a network that none of them optimises."""
+    from api.cli.bench import point_line, quality_table, run_quality
+
+    request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
+    quality = run_quality(request, lambda variant, point: error_console.print(point_line(variant, point)))
+    Console(width=TABLE_WIDTH).print(quality_table(quality))
+    for name, reason in quality.left_out.items():
+        out_console.print(f"{name} was left out: {reason}")
+    out_console.print(f"{'results:':<22}{out}")
+
+
+def _variants_request(
+    scene: Path,
+    style: Path,
+    out: Path,
+    cameras: Path | None,
+    variants: str,
+    seconds: float,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> VariantsRequest:
+    """What a command that runs variants was asked for."""
+    from api.cli.bench import VariantsRequest
+    from worker.request import SceneRequest
+
+    source = SceneRequest.of(scene, cameras, options)
+    settings = {**chosen.given_settings(), "near": options.near}
+    names = [name.strip() for name in variants.split(",") if name.strip()]
+    return VariantsRequest(source, style, out, names, seconds, chosen.backbone, settings)
 
 
 @bench_app.command("stability")

@@ -60,6 +60,10 @@ def _coarse_only(_scales: int) -> list[tuple[str, int | None, float]]:
     return [("coarse", 0, 1.0)]
 
 
+def _full_size_only(scales: int) -> list[tuple[str, int | None, float]]:
+    return [("one scale", scales - 1, 1.0)]
+
+
 def _coarse_to_fine(scales: int) -> list[tuple[str, int | None, float]]:
     return [(f"scale {scales - 1 - scale}", scale, 1 / scales) for scale in range(scales)]
 
@@ -89,6 +93,7 @@ VARIANTS = {
         Variant("paper-rate", "the same with the paper's constant learning rate and clamp", settings=PAPER_RATE),
         Variant("no-phase-1", "all scales from the beginning", _sos),
         Variant("coarse-only", "the coarsest scale alone", _coarse_only),
+        Variant("one-scale", "the paper's loss at full size alone", _full_size_only),
         Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
         Variant("warm-start", "standard, from the style's mean colour and spread", settings={"warm_start": True}),
         Variant("warm-no-phase-1", "warm start instead of phase 1", _sos, {"warm_start": True}),

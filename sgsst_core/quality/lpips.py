@@ -82,7 +82,7 @@ class Lpips:
         self.minimum_side = _MINIMUM_SIDE[network]
         tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(network, folder).items()}
         self._heads = [tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
-        self._features: Callable[[Tensor], list[Tensor]] = (
+        self._layers: Callable[[Tensor], list[Tensor]] = (
             _alexnet(tensors) if network == "alex" else _vgg16(self._heads, folder, dtype, self.device)
         )
 
@@ -100,16 +100,21 @@ class Lpips:
             raise ValueError(
                 f"LPIPS ({self.network}) of {size[1]} x {size[0]} pixels: {self.minimum_side} are the least"
             )
+        return self.between(self.features(first), self.features(second), size)
+
+    @torch.no_grad()
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Features [h, w, c] of the five layers of an image [H, W, 3], values 0..1, sides at least `minimum_side`."""
+        return self._layers(image.to(self.device, self.dtype))
+
+    def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> PerceptualDistance:
+        """Distance of two images of a size (height, width) by their `features`."""
         mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
-        layers = zip(self._features(self._input(first)), self._features(self._input(second)), self._heads, strict=True)
-        for x, y, head in layers:
-            distances = ((_unit(x) - _unit(y)).square_() @ head)[None, None]
+        for x, y, head in zip(first, second, self._heads, strict=True):
+            distances = ((unit_features(x) - unit_features(y)).square_() @ head)[None, None]
             mean += float(distances.mean(dtype=torch.float64))
             spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
         return PerceptualDistance(mean, spatial)
-
-    def _input(self, image: Tensor) -> Tensor:
-        return image.to(self.device, self.dtype)
 
 
 def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Lpips | None:
@@ -122,7 +127,7 @@ def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None =
     return Lpips(device=device, folder=folder) if installed else None
 
 
-def _unit(features: Tensor) -> Tensor:
+def unit_features(features: Tensor) -> Tensor:
     """Features [h, w, c] scaled to unit length at every position."""
     lengths: Tensor = torch.linalg.vector_norm(features, dim=2, keepdim=True)
     return features / (lengths + _LENGTH_EPS)

@@ -42,6 +42,31 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
         sheet.save(temporary, format="JPEG", quality=88)
 
 
+def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Tensor]]]) -> None:
+    """Write a JPEG: the style image, and rows of pictures [H, W, 3] one below the other, each with its name above it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    named = [
+        (name, [_fitted(_picture(image), _MAX_CELL_WIDTH, _CELL_HEIGHT) for image in images])
+        for name, images in [("style", [style]), *rows]
+    ]
+    line = _LABEL + _GAP
+    widths = [sum(picture.width + _GAP for picture in pictures) for _, pictures in named]
+    heights = [max(picture.height for picture in pictures) + line for _, pictures in named]
+    sheet = Image.new("RGB", (max(widths) + _GAP, sum(heights) + _GAP), PAPER)
+    draw, top = ImageDraw.Draw(sheet), line
+    for (name, pictures), height in zip(named, heights, strict=True):
+        left = _GAP
+        for place, picture in enumerate(pictures):
+            _place(sheet, draw, picture, left, top, "" if place else name)
+            left += picture.width + _GAP
+        top += height
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="JPEG", quality=88)
+
+
 def _picture(image: Tensor) -> Image.Image:
     values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
     return Image.fromarray(values.numpy())

@@ -1,0 +1,235 @@
+"""How good the results of several ways to run one job are, after the same seconds each.
+
+Variants are those of `error_time`. What they have reached is judged by a network that none of them optimises (`Judge`),
+on views between the job's cameras, beside the loss that is left, and beside the unstylized scene and a closed-form
+colour transfer alone. A variant on the front has no other with both more style and more content.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from sgsst_core.bench.error_time import Curve, Point, Variant, error_time
+from sgsst_core.errors import SettingsError, WeightsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.quality.consistency import Consistency
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.held_out import HeldOut, HeldOutMoment
+from sgsst_core.quality.judge import Judge, Judgement
+from sgsst_core.quality.lpips import load_lpips_or_none
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.charts import STYLE
+from sgsst_core.report.contact_sheet import write_rows
+from sgsst_core.report.palette import INK, colour_of
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.warm_start import warm_start
+
+#: What is judged beside the variants.
+UNSTYLIZED, TRANSFER = "unstylized", "transfer"
+#: Views of the sheet.
+_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One way to run the job, and what came of it.
+
+    Attributes:
+        name: of the variant, or `UNSTYLIZED`, or `TRANSFER`.
+        what: for people.
+        sh_dc: [N, 3], its colours.
+        judgement: of the views between the cameras.
+        short, long: consistency of views 1 and 7 apart; None where there is no such pair.
+        loss: that is left, relative to the unstylized scene's; None where it was not asked.
+        steps: that were made.
+        seconds: of optimisation.
+    """
+
+    name: str
+    what: str
+    sh_dc: Tensor
+    judgement: Judgement
+    short: Consistency | None
+    long: Consistency | None
+    loss: float | None = None
+    steps: int = 0
+    seconds: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        ranges = {"short": self.short, "long": self.long}
+        return {
+            "name": self.name,
+            "what": self.what,
+            "loss": self.loss,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            **asdict(self.judgement),
+            "consistency": {
+                name: {"rmse": found.rmse, "lpips": found.lpips, "pairs": len(found.pairs)} if found else None
+                for name, found in ranges.items()
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What was compared.
+
+    Attributes:
+        outcomes: the unstylized scene, the transfer, and the variants.
+        left_out: variants that could not run, and why.
+        judge: judges further colours of the scene.
+        style: the style image [H, W, 3].
+    """
+
+    outcomes: list[Outcome]
+    left_out: dict[str, str]
+    judge: Judge
+    style: Tensor
+
+    def front(self) -> list[Outcome]:
+        """Stylized outcomes that no other one beats in both style and content, by style."""
+        front: list[Outcome] = []
+        stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
+        for outcome in sorted(stylized, key=lambda one: (one.judgement.style, one.judgement.content)):
+            if not front or outcome.judgement.content < front[-1].judgement.content:
+                front.append(outcome)
+        return front
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "views": [camera.name for camera in self.judge.cameras],
+            "outcomes": [outcome.as_dict() for outcome in self.outcomes],
+            "left_out": self.left_out,
+            "front": [outcome.name for outcome in self.front()],
+        }
+
+
+def compare_quality(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor,
+    variants: Sequence[Variant],
+    seconds: float,
+    *,
+    weights: BackboneWeights | None = None,
+    progress: Callable[[Variant, Point], None] = lambda variant, point: None,
+    **settings: Any,
+) -> Quality:
+    """Run variants on one scene, each for so many seconds, and judge them.
+
+    Args:
+        style: [H, W, 3] in 0..1.
+        seconds: of optimisation, for each variant.
+        progress: called after each evaluation of the loss.
+        settings: for all variants, on top of the standard preset.
+
+    Raises:
+        WeightsError: AlexNet is not installed.
+        SettingsError: no view between the cameras can be judged.
+    """
+    lpips = load_lpips_or_none()
+    if lpips is None:
+        raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
+    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
+    held_out = _held_out(stylizer)
+    views = [held_out.cameras[index] for index in held_out.views]
+    judge = Judge(lpips, style, scene, held_out.rasterizer, views, stylizer.settings.background)
+    if not judge.cameras:
+        raise SettingsError(
+            "no view between the cameras can be judged: neighbouring cameras are too far apart, or views are smaller "
+            f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
+        )
+    held_out.lpips = lpips
+
+    def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
+        found: HeldOutMoment = held_out.measure(sh_dc)
+        judgement = judge.judge(sh_dc)
+        assert judgement is not None
+        return Outcome(name, what, sh_dc, judgement, found.short, found.long)
+
+    blend_weights = stylizer.plan.survey.total_blend_weights
+    transferred = warm_start(scene.sh_dc, blend_weights, style)
+    outcomes = [
+        outcome(UNSTYLIZED, "the scene as it came", scene.sh_dc),
+        outcome(TRANSFER, "the style's mean colour and spread in closed form, no step", transferred),
+    ]
+    curves = error_time(scene, cameras, style, variants, seconds, weights=weights, progress=progress, **settings)
+    for curve in curves:
+        if curve.sh_dc is not None:
+            last = curve.points[-1]
+            found = outcome(curve.variant.name, curve.variant.what, curve.sh_dc)
+            outcomes.append(replace(found, loss=last.relative, steps=last.step, seconds=last.seconds))
+    return Quality(outcomes, _left_out(curves), judge, style)
+
+
+def _left_out(curves: Sequence[Curve]) -> dict[str, str]:
+    return {curve.variant.name: curve.left_out for curve in curves if curve.left_out}
+
+
+def _held_out(stylizer: Stylizer) -> HeldOut:
+    """Views between a job's cameras, of its whole scene."""
+    settings, twin = stylizer.settings, ExactTwin(stylizer)
+    rasterizer = make_rasterizer(stylizer.plan.anew, stylizer.scene, background=settings.background, near=settings.near)
+    return HeldOut(
+        stylizer.views.cameras,
+        stylizer.views.covered,
+        stylizer.scene,
+        rasterizer,
+        twin.loss,
+        twin.style_targets,
+        weighted=stylizer.plan.weighted,
+        memory=stylizer.memory // 16,
+    )
+
+
+def write_plot(path: Path, quality: Quality, title: str) -> None:
+    """Write a PNG: style against content, the front dashed; down and left is better.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7, 5), dpi=110, layout="constrained")
+        axes = figure.subplots()
+        for place, outcome in enumerate(quality.outcomes):
+            point = (outcome.judgement.content, outcome.judgement.style)
+            axes.plot(*point, "o", color=colour_of(place), clip_on=False)
+            axes.annotate(outcome.name, point, xytext=(5, 4), textcoords="offset points", color=INK)
+        front = [outcome.judgement for outcome in quality.front()]
+        axes.plot([one.content for one in front], [one.style for one in front], "--", color=INK, alpha=0.5)
+        axes.set_xlabel("content lost (LPIPS)")
+        axes.set_ylabel("distance to the style (AlexNet's Gram matrices)")
+        axes.margins(0.15)
+        figure.suptitle(f"{title} (dashed: Pareto front)")
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png")
+
+
+def write_sheet(path: Path, quality: Quality) -> None:
+    """Write a JPEG: the style, and a row for each outcome, of some views on black and the first one on white.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    cameras = quality.judge.cameras[:_SHOWN]
+    rows = []
+    for outcome in quality.outcomes:
+        pictures = [quality.judge.pictures(outcome.sh_dc, camera) for camera in cameras]
+        rows.append((outcome.name, [*(pair[0] for pair in pictures), pictures[0][1]]))
+    with torch.no_grad():
+        write_rows(path, quality.style, rows)

@@ -1,0 +1,233 @@
+"""How a stylized scene looks, judged by a network that no run optimises.
+
+A job's own loss cannot tell whether its result is good: it is what was minimised. AlexNet's features (those of LPIPS)
+are not, and so its Gram matrices say how near a picture's textures are to the style's, its distances how much is left
+of the content, and plain colours how near the palette is. Only what Gaussians cover counts, and every view is judged
+on black and on white behind them: an object scan has no surround of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from sgsst_core.constants import SH_C0
+from sgsst_core.loss.sos import resize_area
+from sgsst_core.quality.consistency import shown
+from sgsst_core.quality.lpips import Lpips, unit_features
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+
+#: Longer side in pixels at which views are judged: figures of one scene at several resolutions can be compared, and a
+#: view of many megapixels costs no more than one of one.
+JUDGED_SIDE = 1024
+#: Behind the Gaussians, in turn.
+_BEHIND = (0.0, 1.0)
+#: Views that Gaussians cover by less than this share are not judged.
+_LEAST_COVERAGE = 1e-3
+#: Colours are compared in steps of 8 bits.
+_LEVELS = 255.0
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Means over views, and over black and white behind them.
+
+    Attributes:
+        style: mean over AlexNet's five layers of |G - G_style| / |G_style|, Frobenius norms of Gram matrices (mean over
+            positions of F F^T); 0 is the style's texture.
+        palette: Frechet distance of the RGB colours, in levels of 8 bits: sqrt(|m - m_style|^2 + tr(C + C_style -
+            2 (C C_style)^1/2)); 0 is the style's mean and covariance.
+        content: LPIPS (AlexNet) against the unstylized scene; 0 is the same picture.
+        features: mean over the layers of 1 - cosine of AlexNet's features against the unstylized scene's.
+        swing: mean over views of how much `style` differs between black and white.
+        saturated: share of the Gaussians of whose colour a channel is outside [0, 1].
+    """
+
+    style: float
+    palette: float
+    content: float
+    features: float
+    swing: float
+    saturated: float
+
+
+class Judge:
+    """Judges colours of one scene by one style.
+
+    Args:
+        lpips: with AlexNet.
+        style: style image [H, W, 3] in 0..1.
+        scene: unstylized.
+        rasterizer: of the scene.
+        cameras: of the views; larger ones than `JUDGED_SIDE` are judged at that size. Those that see next to nothing
+            are left out, and so are those too small for AlexNet (a side below 31 pixels).
+        background: [3], what the rasterizer has behind the Gaussians.
+
+    Attributes:
+        cameras: those that are judged; without any there is no judgement.
+    """
+
+    def __init__(
+        self,
+        lpips: Lpips,
+        style: Tensor,
+        scene: Scene,
+        rasterizer: Rasterizer,
+        cameras: Sequence[Camera],
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.scene = scene
+        self._lpips, self._rasterizer = lpips, rasterizer
+        self._style = style.to(lpips.device, torch.float32)
+        self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
+        self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
+        pixels = self._style.reshape(-1, 3)
+        self._palette = _moments(pixels, torch.ones(len(pixels), device=pixels.device))
+        self._targets: dict[tuple[int, int], list[Tensor]] = {}
+        small = [resized(camera, min(JUDGED_SIDE, max(camera.width, camera.height))) for camera in cameras]
+        self.cameras = [
+            camera
+            for camera in small
+            if min(camera.width, camera.height) >= lpips.minimum_side
+            and float(rasterizer.coverage(camera).mean()) >= _LEAST_COVERAGE
+        ]
+
+    @torch.no_grad()
+    def judge(self, sh_dc: Tensor) -> Judgement | None:
+        """Of colours sh_dc [N, 3]; None without views.
+
+        Raises:
+            ValueError: a picture holds NaN or infinity.
+        """
+        if not self.cameras:
+            return None
+        sh_dc = sh_dc.detach().to(self._rasterizer.device)
+        views = [self._view(camera, sh_dc) for camera in self.cameras]
+        style, palette, content, features = (
+            fmean(fmean(one[place] for one in view) for view in views) for place in range(4)
+        )
+        swing = fmean(abs(view[0][0] - view[1][0]) for view in views)
+        return Judgement(style, palette, content, features, swing, saturated(sh_dc))
+
+    @torch.no_grad()
+    def pictures(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
+        """Pictures [H, W, 3] of colours sh_dc [N, 3] on black and on white."""
+        image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
+        return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
+
+    def _view(self, camera: Camera, sh_dc: Tensor) -> list[tuple[float, float, float, float]]:
+        """(style, palette, content, features) on black and on white."""
+        image, coverage = self._render(sh_dc, camera)
+        before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
+        weights = coverage.to(self._lpips.device)
+        found = []
+        for behind in _BEHIND:
+            picture, original = (self._on(values, coverage, camera, behind) for values in (image, before))
+            own, theirs = self._lpips.features(picture), self._lpips.features(original)
+            distance = self._lpips.between(own, theirs, (camera.height, camera.width)).map
+            found.append(
+                (
+                    self._style_distance(own, weights),
+                    frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette),
+                    _weighted_mean(distance, weights),
+                    fmean(_turned(x, y, weights) for x, y in zip(own, theirs, strict=True)),
+                )
+            )
+        return found
+
+    def _render(self, sh_dc: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Image [H, W, 3] over the rasterizer's background, and coverage [H, W]."""
+        rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
+        if self.scene.sh_degree:
+            rest = rest_colours(self._sh_rest, self._means, camera)
+        return self._rasterizer.render(view_colours(sh_dc, rest), camera), self._rasterizer.coverage(camera)
+
+    def _on(self, image: Tensor, coverage: Tensor, camera: Camera, behind: float) -> Tensor:
+        """The picture with another colour behind the Gaussians."""
+        return shown(image + (1 - coverage)[..., None] * (behind - self._background), camera, self._lpips.device)
+
+    def _style_distance(self, features: list[Tensor], coverage: Tensor) -> float:
+        targets = self._style_grams((int(coverage.shape[0]), int(coverage.shape[1])))
+        distances = []
+        for values, target in zip(features, targets, strict=True):
+            gram = _gram(values, _pooled(coverage, values))
+            distances.append(float((gram - target).norm() / target.norm().clamp_min(torch.finfo(target.dtype).tiny)))
+        return fmean(distances)
+
+    def _style_grams(self, view: tuple[int, int]) -> list[Tensor]:
+        """The style's Gram matrices at the size that it has in the loss of such a view; at least AlexNet's least."""
+        height, width = style_size((self._style.shape[0], self._style.shape[1]), view)
+        enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
+        size = (round(height * enlarged), round(width * enlarged))
+        if size not in self._targets:
+            features = self._lpips.features(resize_area(self._style, size))
+            self._targets[size] = [_gram(x, torch.ones(x.shape[:2], device=x.device)) for x in features]
+        return self._targets[size]
+
+
+def saturated(sh_dc: Tensor) -> float:
+    """Share of colours sh_dc [N, 3] of which a channel is outside [0, 1], where no screen shows it."""
+    colours = 0.5 + SH_C0 * sh_dc.double()
+    return float(((colours < 0) | (colours > 1)).any(dim=1).double().mean())
+
+
+def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
+    """Of two normal distributions of colours (mean [3], covariance [3, 3]) in 0..1, in levels of 8 bits."""
+    (mean, covariance), (other_mean, other) = first, second
+    other_mean, other = other_mean.to(mean), other.to(covariance)
+    root = _square_root(covariance)
+    # The trace of (C C')^1/2; rounding may put the eigenvalue of a direction without spread below 0.
+    shared = torch.linalg.eigvalsh(root @ other @ root).clamp_min(0).sqrt().sum()
+    spread = covariance.trace() + other.trace() - 2 * shared
+    return _LEVELS * float(((mean - other_mean).square().sum() + spread.clamp_min(0)).sqrt())
+
+
+def _square_root(matrix: Tensor) -> Tensor:
+    """Of a symmetric positive semidefinite matrix."""
+    values, vectors = torch.linalg.eigh(matrix)
+    root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
+    return root
+
+
+def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean [3] and covariance [3, 3], float64, of colours [n, 3]."""
+    colours, weights = colours.double(), weights.double()
+    total = weights.sum()
+    mean = weights @ colours / total
+    centred = colours - mean
+    return mean, (weights[:, None] * centred).T @ centred / total
+
+
+def _pooled(coverage: Tensor, features: Tensor) -> Tensor:
+    """Coverage [H, W], averaged over what each of the features' cells [h, w, c] has of the picture: [h, w]."""
+    height, width = features.shape[:2]
+    return F.adaptive_avg_pool2d(coverage[None, None].to(features.dtype), (height, width))[0, 0]
+
+
+def _gram(features: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean of F F^T over the positions of features [h, w, c], [c, c] float64.
+
+    The sums of a layer are made in the features' precision: positions of one picture, all terms at least 0.
+    """
+    flat = features.flatten(0, 1)
+    weighted = flat * weights.reshape(-1, 1).to(flat)
+    return (weighted.T @ flat).double() / weights.sum(dtype=torch.float64)
+
+
+def _turned(x: Tensor, y: Tensor, coverage: Tensor) -> float:
+    """Weighted mean of 1 - cosine of two pictures' features [h, w, c]; where both are zero nothing has changed."""
+    differences = (unit_features(x) - unit_features(y)).square().sum(dim=2) / 2
+    return _weighted_mean(differences, _pooled(coverage, x))
+
+
+def _weighted_mean(values: Tensor, weights: Tensor) -> float:
+    return float((values.double() * weights.double()).sum() / weights.sum(dtype=torch.float64))

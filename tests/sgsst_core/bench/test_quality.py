@@ -1,0 +1,75 @@
+"""Variants judged by a network that none of them optimises."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from sgsst_core.bench.error_time import choose_variants
+from sgsst_core.bench.quality import TRANSFER, UNSTYLIZED, Quality, compare_quality, write_plot, write_sheet
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from tests.small_scenes import cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def quality(tiny_weights: BackboneWeights, vgg16_weights: object) -> Quality:
+    """AlexNet comes with VGG16's weights."""
+    variants = choose_variants(["standard", "one-scale", "tf32"])
+    views = cameras(3, 96, 72)
+    return compare_quality(wall(), views, style(), variants, 1.0, weights=tiny_weights, coarsest_side=36)
+
+
+def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> None:
+    before, transfer, *variants = quality.outcomes
+    assert (before.name, transfer.name) == (UNSTYLIZED, TRANSFER)
+    assert [outcome.name for outcome in variants] == ["standard", "one-scale"]
+    assert "tf32" in quality.left_out  # there is no GPU for it
+    assert before.judgement.content == 0
+    assert transfer.judgement.palette < before.judgement.palette
+    for outcome in variants:
+        assert outcome.loss is not None
+        assert outcome.loss < 1
+        assert outcome.steps > 0
+        assert outcome.judgement.content > 0
+        assert outcome.short is not None
+    values = json.loads(json.dumps(quality.as_dict()))
+    assert values["outcomes"][2]["consistency"]["short"]["rmse"] > 0
+    assert values["views"]
+
+
+def test_the_front_holds_what_nothing_beats_in_style_and_content(quality: Quality) -> None:
+    def outcome(name: str, style: float, content: float) -> object:
+        judgement = replace(quality.outcomes[0].judgement, style=style, content=content)
+        return replace(quality.outcomes[0], name=name, judgement=judgement)
+
+    outcomes = [
+        outcome(UNSTYLIZED, 2.0, 0.0),  # is no result
+        outcome("a", 1.0, 0.5),
+        outcome("b", 0.8, 0.6),
+        outcome("beaten", 1.1, 0.55),
+        outcome("c", 1.5, 0.1),
+    ]
+    assert [one.name for one in replace(quality, outcomes=outcomes).front()] == ["b", "a", "c"]
+
+
+def test_pictures_are_written(quality: Quality, tmp_path: Path) -> None:
+    write_plot(tmp_path / "q.png", quality, "a wall")
+    write_sheet(tmp_path / "q.jpg", quality)
+    assert Image.open(tmp_path / "q.png").width > 600
+    sheet = Image.open(tmp_path / "q.jpg")
+    assert sheet.height > 4 * 300  # the style, and four rows
+    on_white = quality.judge.pictures(torch.zeros_like(wall().sh_dc), quality.judge.cameras[0])[1]
+    assert on_white.shape == (72, 96, 3)
+
+
+def test_without_neighbours_there_is_nothing_to_judge(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
+    with pytest.raises(SettingsError, match="more cameras"):
+        compare_quality(wall(), cameras(1, 96, 72), style(), [], 1.0, weights=tiny_weights, coarsest_side=36)

@@ -1,0 +1,146 @@
+"""The judge of a result: against plain float64 formulas, and what its figures mean."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from sgsst_core.constants import SH_C0
+from sgsst_core.loss.sos import resize_area
+from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgement, frechet_distance, saturated
+from sgsst_core.quality.lpips import Lpips
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import reference_rest_colours
+from tests.small_scenes import ball, blind_camera, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def alex(vgg16_weights: object) -> Lpips:
+    """AlexNet in float32; its weights come with VGG16's."""
+    return Lpips()
+
+
+def judge_of(lpips: Lpips, scene: Scene, views: list[Camera], picture: Tensor | None = None) -> Judge:
+    return Judge(lpips, style() if picture is None else picture, scene, CpuRasterizer(scene), views)
+
+
+def judged(judge: Judge, sh_dc: Tensor) -> Judgement:
+    found = judge.judge(sh_dc)
+    assert found is not None
+    return found
+
+
+def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple[list[float], float, float, float]:
+    """Style on black and on white, palette, content and features of one view, by loops over layers and positions."""
+    lpips = Lpips(dtype=torch.float64)
+    rasterizer = ReferenceRasterizer(scene)
+    rest = reference_rest_colours(scene.sh_rest, scene.means, camera, scene.sh_degree).double()
+    coverage = rasterizer.coverage(camera).double()
+    styles, palettes, contents, turns = [], [], [], []
+    for behind in (0.0, 1.0):
+        shown = []
+        for dc in (sh_dc, scene.sh_dc):
+            image = rasterizer.render((0.5 + SH_C0 * dc.double() + rest).clamp_min(0), camera)
+            shown.append((image + (1 - coverage)[..., None] * behind).clamp(0, 1))
+        own, theirs = map(lpips.features, shown)
+        wanted = lpips.features(resize_area(picture, (58, 48)).double())  # 48 is the view's shorter side
+        distances, angles = [], []
+        for x, y, z in zip(own, theirs, wanted, strict=True):
+            height, width = x.shape[:2]
+            a = F.adaptive_avg_pool2d(coverage[None, None], (height, width))[0, 0]
+            gram = sum(a[i, j] * torch.outer(x[i, j], x[i, j]) for i in range(height) for j in range(width)) / a.sum()
+            target = torch.einsum("ijc,ijd->cd", z, z) / (z.shape[0] * z.shape[1])
+            distances.append(float((gram - target).norm() / target.norm()))
+            cosine = F.cosine_similarity(x, y, dim=2, eps=1e-12)
+            angles.append(float((a * torch.where((x == y).all(dim=2), 0.0, 1 - cosine)).sum() / a.sum()))
+        styles.append(float(np.mean(distances)))
+        turns.append(float(np.mean(angles)))
+        contents.append(float((lpips.distance(*shown).map * coverage).sum() / coverage.sum()))
+        mass = coverage.reshape(-1).numpy()
+        pixels, others = shown[0].reshape(-1, 3).numpy(), picture.double().reshape(-1, 3).numpy()
+        mean, other = np.average(pixels, axis=0, weights=mass), others.mean(axis=0)
+        spread, other_spread = np.cov(pixels.T, aweights=mass, bias=True), np.cov(others.T, bias=True)
+        shared = scipy.linalg.sqrtm(spread @ other_spread).real
+        palettes.append(255 * np.sqrt(((mean - other) ** 2).sum() + np.trace(spread + other_spread - 2 * shared)))
+    return styles, float(np.mean(palettes)), float(np.mean(contents)), float(np.mean(turns))
+
+
+@pytest.mark.parametrize("scene", [wall(sh_degree=1), ball()], ids=["wall", "ball"])
+def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> None:
+    view = cameras(1)[0]
+    other = torch.randn(len(scene), 3, generator=torch.Generator().manual_seed(3))
+    found = judged(judge_of(alex, scene, [view]), other)
+    styles, palette, content, features = plain(scene, other, view, style())
+    assert found.style == pytest.approx(sum(styles) / 2, rel=1e-4)
+    assert found.swing == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
+    assert found.palette == pytest.approx(palette, rel=1e-4)
+    assert found.content == pytest.approx(content, rel=1e-3)
+    assert found.features == pytest.approx(features, rel=1e-3)
+
+
+def test_the_unstylized_scene_has_its_whole_content(alex: Lpips) -> None:
+    scene = ball()
+    found = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
+    assert found.content == 0
+    assert found.features == 0
+    assert found.swing > 0  # an object has a surround
+
+
+def test_a_scene_of_the_style_is_near_the_style(alex: Lpips) -> None:
+    """Figures fall from a scene of noise to one that shows the style image itself."""
+    scene, view = wall(56, 44), cameras(1)[0]
+    scene = replace(scene, scales=scene.scales - 0.69)
+    places = (scene.means[:, :2] / torch.tensor([2.4, 1.9])).clamp(-1, 1)
+    picture = style()
+    painted = F.grid_sample(picture.permute(2, 0, 1)[None], places[None, None], align_corners=False)[0, :, 0].T
+    judge = judge_of(alex, scene, [view], picture)
+    noise, like = judged(judge, scene.sh_dc), judged(judge, (painted - 0.5) / SH_C0)
+    assert like.style < 0.6 * noise.style
+    assert like.palette < 0.4 * judged(judge, torch.full_like(scene.sh_dc, 1.5)).palette
+    assert like.content > 0.1
+
+
+def test_views_that_show_nothing_are_left_out(alex: Lpips) -> None:
+    scene = ball()
+    assert [camera.name for camera in judge_of(alex, scene, [blind_camera(), *cameras(1)]).cameras] == ["view_0"]
+    assert judge_of(alex, scene, [blind_camera()]).judge(scene.sh_dc) is None
+    assert judge_of(alex, scene, cameras(1, 30, 20)).judge(scene.sh_dc) is None  # too small for AlexNet
+
+
+def test_large_views_are_judged_at_one_size(alex: Lpips) -> None:
+    found = judge_of(alex, ball(), cameras(1, 3000, 2250)).cameras[0]
+    assert (found.width, found.height) == (JUDGED_SIDE, JUDGED_SIDE * 3 // 4)
+
+
+@pytest.mark.parametrize("picture", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
+def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> None:
+    """A style of one pixel, a black one without any variance, and one that is a line."""
+    scene = ball()
+    found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
+    assert all(np.isfinite(value) for value in vars(found).values())
+    assert found.saturated == 1
+
+
+def test_frechet_distance_of_known_distributions() -> None:
+    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    none = torch.zeros(3, 3, dtype=torch.float64)
+    shifted = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
+    assert frechet_distance((zero, eye), (zero, eye)) == pytest.approx(0, abs=1e-4)
+    assert frechet_distance((zero, none), (shifted, none)) == pytest.approx(25.5)
+    assert frechet_distance((zero, 0.04 * eye), (zero, 0.01 * eye)) == pytest.approx(255 * 0.1 * 3**0.5)
+
+
+def test_colours_that_no_screen_shows_are_saturated() -> None:
+    colours = torch.tensor([[-0.01, 0.5, 0.5], [0.5, 0.5, 0.5], [0.2, 1.3, 0.4], [0.9, 0.1, 0.5]])
+    assert saturated((colours - 0.5) / SH_C0) == 0.5
