@@ -71,7 +71,9 @@ def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Spherical harmonics of a view, and how much faster than their slow twin they are, on a part of the scene."""
     part = scene.subset(torch.arange(min(_HARMONICS_SAMPLE, len(scene))))
     rest_colours(part.sh_rest, part.means, cameras[0])  # compiles
-    slow = middle(lambda camera: reference_rest_colours(held(part.sh_rest), part.means, camera, scene.sh_degree), cameras)
+    slow = middle(
+        lambda camera: reference_rest_colours(held(part.sh_rest), part.means, camera, scene.sh_degree), cameras
+    )
     fast = middle(lambda camera: rest_colours(part.sh_rest, part.means, camera), cameras)
     whole = middle(lambda camera: rest_colours(scene.sh_rest, scene.means, camera), cameras)
     return {"harmonics_seconds": whole, "ratio_reference_to_harmonics": slow / fast}

@@ -22,8 +22,8 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
 #: Trained quaternions are of any length around 1; far beyond, training or export went wrong.
 QUATERNION_LENGTHS = (1e-3, 1e3)

@@ -179,9 +179,10 @@ def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: i
         )
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()
-        if device_bytes + own > free:
+        needed = device_bytes + own
+        if needed > free:
             return SceneTooLargeError(
-                f"{where} {(device_bytes + own) / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
+                f"{where} {needed / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
                 f"{free / 1e9:.2f} GB are free. {advice}"
             )
     return None

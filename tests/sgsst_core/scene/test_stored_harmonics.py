@@ -1,4 +1,4 @@
-"""Spherical harmonics in the scene's file: the same bits as in memory, whatever is around them, and never another file's."""
+"""Spherical harmonics in the scene's file: the same bits as in memory, and never those of another file."""
 
 from __future__ import annotations
 
