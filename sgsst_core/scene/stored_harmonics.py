@@ -89,7 +89,7 @@ class RowFile:
         Raises:
             SceneError: the file ends before, or cannot be read.
         """
-        left = memoryview(buffer)
+        left = buffer.data
         while left:
             try:
                 count = os.preadv(self._descriptor, [left], offset)

@@ -23,7 +23,7 @@ from sgsst_core.files.ply import read_scene, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colours
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from sgsst_core.scene.stored_harmonics import RowFile, StoredHarmonics, held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import fingerprint
 from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
@@ -228,13 +228,13 @@ def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeyp
 
     def shrink(*arguments: object) -> int:
         degree = check(*arguments)  # type: ignore[arg-type]
-        opened = ply.RowFile.__init__
+        opened = RowFile.__init__
 
-        def late(self: ply.RowFile, name: Path) -> None:
+        def late(self: RowFile, name: Path) -> None:
             opened(self, name)
             os.truncate(name, 4000)
 
-        monkeypatch.setattr(ply.RowFile, "__init__", late)
+        monkeypatch.setattr(RowFile, "__init__", late)
         return degree
 
     monkeypatch.setattr(ply, "_check_properties", shrink)
