@@ -142,7 +142,9 @@ def fingerprint(
     for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
         digest.update(repr(tuple(tensor.shape)).encode())
         if isinstance(tensor, StoredHarmonics):
-            tensor.for_blocks(lambda start, block, rows: digest.update(np.ascontiguousarray(block[rows]).data), threads=1)
+            tensor.for_blocks(
+                lambda start, block, rows: digest.update(np.ascontiguousarray(block[rows]).data), threads=1
+            )
         else:
             digest.update(tensor.contiguous().numpy().data)
     for camera in cameras:
