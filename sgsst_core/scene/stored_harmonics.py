@@ -236,7 +236,7 @@ class StoredHarmonics:
             count = min(step, layout.rows - row)
             start, rows = row, every[:count]
             if self._chosen is not None:
-                start, stop = np.searchsorted(self._chosen, (row, row + count)).tolist()
+                start, stop = np.searchsorted(self._chosen, np.array((row, row + count), np.int32)).tolist()
                 rows = self._chosen[start:stop] - np.int32(row)
             if len(rows):
                 self._file.read(layout.offset + row * layout.row_bytes, buffer[: count * layout.row_bytes])
