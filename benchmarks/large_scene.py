@@ -33,6 +33,7 @@ from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.scene.camera import Camera, orbit, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colours, rest_colours
+from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.stylizing.unseen import NEIGHBOURS, neighbours_change
 
 PARTS = ("reading", "harmonics", "survey", "unseen")
@@ -70,7 +71,9 @@ def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Spherical harmonics of a view, and how much faster than their slow twin they are, on a part of the scene."""
     part = scene.subset(torch.arange(min(_HARMONICS_SAMPLE, len(scene))))
     rest_colours(part.sh_rest, part.means, cameras[0])  # compiles
-    slow = middle(lambda camera: reference_rest_colours(part.sh_rest, part.means, camera, scene.sh_degree), cameras)
+    slow = middle(
+        lambda camera: reference_rest_colours(held(part.sh_rest), part.means, camera, scene.sh_degree), cameras
+    )
     fast = middle(lambda camera: rest_colours(part.sh_rest, part.means, camera), cameras)
     whole = middle(lambda camera: rest_colours(scene.sh_rest, scene.means, camera), cameras)
     return {"harmonics_seconds": whole, "ratio_reference_to_harmonics": slow / fast}

@@ -6,6 +6,7 @@ Every rank goes through the same functions. Nothing is written and nothing is pr
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -38,6 +39,7 @@ class Job:
         resumed: checkpoint to go on from; None starts from the beginning.
         planned_ranks: that there were when the plan was made.
         workers: who takes part, and what happened to earlier attempts; for the report.
+        reading: seconds that reading and checking the inputs took.
     """
 
     request: StylizeRequest
@@ -49,6 +51,7 @@ class Job:
     resumed: Checkpoint | None
     planned_ranks: int
     workers: dict[str, Any]
+    reading: float
 
 
 def prepare(
@@ -72,7 +75,9 @@ def prepare(
         RankLeftOut: the job goes on without this rank.
     """
     outputs = collectives.broadcast(lambda: check_request(request))
+    started = time.perf_counter()
     inputs = read_inputs(request, collectives)
+    reading = time.perf_counter() - started
     settings = request.settings
     resume = resume or Resume(request.resume)
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
@@ -106,7 +111,9 @@ def prepare(
     source, scene_file, images = request.source, inputs.scene_file, request.images
     sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, inputs.weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
-    return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
+    return Job(
+        request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers, reading
+    )
 
 
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:

@@ -14,6 +14,7 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import kernel_rest_colours
+from sgsst_core.scene.stored_harmonics import held
 
 DEGREE = 3
 
@@ -64,7 +65,7 @@ def _operands(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
 
 def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
     """Of the kernel, which a GPU takes; in the interpreter it is asked for by name."""
-    sh_rest, means = scene.sh_rest.to(device()), scene.means.to(device())
+    sh_rest, means = held(scene.sh_rest).to(device()), scene.means.to(device())
     taken = seconds(lambda: kernel_rest_colours(sh_rest, means, camera, DEGREE), device(), repeats)
     found.add(f"{place}/seconds", taken)
     found.add(f"{place}/gigabytes_per_second", (sh_rest.nbytes + 2 * means.nbytes) / taken / 1e9)

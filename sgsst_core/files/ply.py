@@ -8,9 +8,11 @@ They may come in any order and numeric type, among any others.
 from __future__ import annotations
 
 import io
+import itertools
 import re
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,10 +27,16 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.ply_header import PlyHeader, element_offsets, read_header
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
 #: Rows handled at a time: 64k rows of 62 floats are 16 MB, so that memory stays small and the columns of a block are
 #: taken from the processor's cache instead of one pass over the file each.
 BLOCK_ROWS = 1 << 16
+
+#: Bytes that are read at a time: they stay in a core's second-level cache while their columns are taken apart.
+READ_BYTES = 1 << 20
+#: Spherical harmonics above degree 0 that are held in memory, in bytes: those of 1.4 million Gaussians of degree 3.
+HELD_BYTES = 1 << 28
 
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _BASE = {
@@ -37,6 +45,8 @@ _BASE = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "sh_dc": _DC,
 }
+#: As messages name them; f_rest_* follow.
+_ORDER = (*itertools.chain(*_BASE.values()), "opacity")
 _REST_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}
 
 
@@ -64,33 +74,58 @@ class SceneFile:
         return 0 if self.kept is None else int(len(self.kept) - self.kept.sum())
 
 
-def read_scene(path: Path, *, drop_invalid: bool = False) -> SceneFile:
+def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None) -> SceneFile:
     """Read a 3DGS PLY: SH degree 0 to 3, text or binary, any order and numeric type of the properties.
 
     Args:
         path: the file.
         drop_invalid: leave Gaussians with NaN or infinite values out, of the scene and later of the stylized file,
             instead of refusing the file. Properties that 3DGS does not use are not looked at.
+        held_bytes: spherical harmonics above degree 0 that take more stay in the file (`StoredHarmonics`), where it
+            has them as trainers write them: `stays_in_file`. None is `HELD_BYTES`.
 
     Raises:
-        SceneError: missing, truncated or lying file, not a 3DGS scene, no Gaussians, non-finite values.
+        SceneError: missing, truncated or lying file, not a 3DGS scene, no Gaussians, non-finite values, or the file was
+            changed while it was read.
     """
     header = read_header(path)
     degree = _check_properties(path, header)
-    element_offsets(path, header)
-    stamp = _stamp(path)
-    arrays, columns = _allocate(header.vertex.count, degree)
-    rows = _read_vertices(path, header)
-    with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite, and is counted below
+    offset = element_offsets(path, header).get("vertex", 0)
+    file = RowFile(path)
+    stamp = file.stamp
+    stored = _row_layout(path, header, stamp, offset) if stays_in_file(header, held_bytes) else None
+    into = _Columns(header, 0 if stored else degree, stored)
+    if header.text:
+        rows = _text_vertices(path, header)
         for start in range(0, len(rows), BLOCK_ROWS):
-            block = rows[start : start + BLOCK_ROWS]
-            for name, column in columns.items():
-                column[start : start + BLOCK_ROWS] = block[name]
-    kept = _finite_rows(path, arrays, columns, drop_invalid)
-    if kept is not None:
-        arrays = {name: array[kept] for name, array in arrays.items()}
-    scene = Scene(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-    return SceneFile(path, scene, header, kept, stamp)
+            into.take(start, rows[start : start + BLOCK_ROWS])
+    else:
+        _read_binary(file, header, offset, into)
+    file.check_unchanged(stamp)
+    kept = _finite_rows(path, header.vertex.count, into.flaws, drop_invalid)
+    arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in into.arrays.items()}
+    if stored:
+        arrays["sh_rest"] = StoredHarmonics(stored, file=file)
+    scene = Scene(**arrays)
+    return SceneFile(path, scene if kept is None else scene.subset(torch.from_numpy(kept)), header, kept, stamp)
+
+
+def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
+    """Whether a scene's spherical harmonics above degree 0 are not held in memory: they would take more than that.
+
+    They can stay where they lie in the file as in those of 3DGS trainers: little-endian, all float32, in their order.
+    """
+    names = [prop.name for prop in header.vertex.properties]
+    if header.text or header.byte_order != "<" or "f_rest_0" not in names:
+        return False
+    limit = HELD_BYTES if held_bytes is None else held_bytes
+    dtype = header.vertex.dtype("<")
+    count = sum(name.startswith("f_rest_") for name in names)
+    first = names.index("f_rest_0")
+    plain = names[first : first + count] == [f"f_rest_{i}" for i in range(count)]
+    plain &= all(dtype[name] == np.dtype("<f4") for name in names[first : first + count])
+    offset = dtype.fields["f_rest_0"][1] if dtype.fields else 0
+    return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * count * header.vertex.count > limit
 
 
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
@@ -112,10 +147,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
     if _stamp(source.path) != source.stamp:
-        raise SceneError(
-            f"{source.path}: was changed after it was read; the new colours may belong to other Gaussians. "
-            "Put the original file back and run again."
-        )
+        raise changed(source.path)
     colours = sh_dc.detach().to("cpu", torch.float32).contiguous().numpy()
     with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
         output.write(_header_for(source))
@@ -131,12 +163,13 @@ def write_scene(path: Path, scene: Scene) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    coefficients = int(scene.sh_rest.shape[1])
+    sh_rest = held(scene.sh_rest)
+    coefficients = int(sh_rest.shape[1])
     columns = {name: scene.means[:, i] for i, name in enumerate(_BASE["means"])}
     columns |= dict.fromkeys(("nx", "ny", "nz"), torch.zeros(len(scene)))
     columns |= {name: scene.sh_dc[:, i] for i, name in enumerate(_DC)}
     for i in range(3 * coefficients):
-        columns[f"f_rest_{i}"] = scene.sh_rest[:, i % coefficients, i // coefficients]
+        columns[f"f_rest_{i}"] = sh_rest[:, i % coefficients, i // coefficients]
     columns["opacity"] = scene.opacities
     columns |= {name: scene.scales[:, i] for i, name in enumerate(_BASE["scales"])}
     columns |= {name: scene.quats[:, i] for i, name in enumerate(_BASE["quats"])}
@@ -192,17 +225,104 @@ def _what_else(header: PlyHeader) -> str:
     return "something else" if vertex else "a PLY without vertices"
 
 
-def _allocate(count: int, degree: int) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
-    """The scene's arrays (float32, uninitialised), and per PLY property the view [count] that it fills."""
-    coefficients = (degree + 1) ** 2 - 1
-    arrays: dict[str, NDArray[Any]] = {name: np.empty((count, len(names)), np.float32) for name, names in _BASE.items()}
-    arrays["opacities"] = np.empty(count, np.float32)
-    arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
-    columns = {prop: arrays[name][:, i] for name, names in _BASE.items() for i, prop in enumerate(names)}
-    columns["opacity"] = arrays["opacities"]
-    for i in range(3 * coefficients):
-        columns[f"f_rest_{i}"] = arrays["sh_rest"][:, i % coefficients, i // coefficients]
-    return arrays, columns
+def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: int) -> RowLayout:
+    """Where a file of which `stays_in_file` is true has its spherical harmonics."""
+    fields = header.vertex.dtype(header.byte_order).fields
+    assert fields is not None
+    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in fields)
+    size = header.vertex.dtype(header.byte_order).itemsize
+    return RowLayout(path, stamp, offset, header.vertex.count, size, fields["f_rest_0"][1], count // 3)
+
+
+@dataclass(frozen=True)
+class _Flaws:
+    """Values that are no numbers in a block of rows.
+
+    Attributes:
+        start: the block's first row.
+        finite: [n] bool, rows without any.
+        counts: by property that has some: how many are NaN, and how many are infinite.
+    """
+
+    start: int
+    finite: NDArray[np.bool_]
+    counts: dict[str, tuple[int, int]]
+
+
+class _Columns:
+    """The scene's arrays, filled with blocks of the file's rows, and what is wrong with the values.
+
+    Args:
+        degree: of the spherical harmonics that are held.
+        stored: where others stay in the file, they are only looked at.
+
+    Attributes:
+        arrays: float32, by name of the scene's tensor.
+        flaws: of the blocks that have some.
+    """
+
+    def __init__(self, header: PlyHeader, degree: int, stored: RowLayout | None) -> None:
+        self._stored = stored
+        count = header.vertex.count
+        coefficients = (degree + 1) ** 2 - 1
+        self.arrays: dict[str, NDArray[Any]] = {
+            name: np.empty((count, len(names)), np.float32) for name, names in _BASE.items()
+        }
+        self.arrays["opacities"] = np.empty(count, np.float32)
+        self.arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
+        self._targets = {prop: self.arrays[name][:, i] for name, names in _BASE.items() for i, prop in enumerate(names)}
+        self._targets["opacity"] = self.arrays["opacities"]
+        for i in range(3 * coefficients):
+            self._targets[f"f_rest_{i}"] = self.arrays["sh_rest"][:, i % coefficients, i // coefficients]
+        self.flaws: list[_Flaws] = []
+
+    def take(self, start: int, rows: NDArray[Any]) -> None:
+        """Copy a structured block of rows that starts at some row of the file; several threads may."""
+        part = slice(start, start + len(rows))
+        with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite, and is counted
+            for name, target in self._targets.items():
+                target[part] = rows[name]
+        blocks = [array[part] for array in self.arrays.values()]
+        if self._stored is not None:
+            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
+            first = self._stored.column // 4
+            blocks.append(table[:, first : first + 3 * self._stored.coefficients])
+        if not all(bool(np.isfinite(block).all()) for block in blocks):
+            self.flaws.append(self._flaws_of(start, rows))
+
+    def _flaws_of(self, start: int, rows: NDArray[Any]) -> _Flaws:
+        finite, counts = np.ones(len(rows), np.bool_), {}
+        columns = {name: target[start : start + len(rows)] for name, target in self._targets.items()}
+        if self._stored is not None:
+            columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
+        for name, column in columns.items():
+            good = np.isfinite(column)
+            finite &= good
+            nans = int(np.isnan(column).sum())
+            if not good.all():
+                counts[name] = nans, int((~good).sum()) - nans
+        return _Flaws(start, finite, counts)
+
+
+def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: _Columns) -> None:
+    """Read element vertex block by block, on as many cores as PyTorch was told to use where there are many blocks."""
+    dtype, count = header.vertex.dtype(header.byte_order), header.vertex.count
+    step = max(1, READ_BYTES // dtype.itemsize)
+
+    def read(starts: range) -> None:
+        buffer = np.empty(min(step, count) * dtype.itemsize, np.uint8)
+        for start in starts:
+            part = buffer[: min(step, count - start) * dtype.itemsize]
+            file.read(offset + start * dtype.itemsize, part)
+            into.take(start, part.view(dtype))
+
+    threads = torch.get_num_threads()
+    if threads == 1 or count <= 4 * step:
+        read(range(0, count, step))
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="scene") as pool:
+        for done in [pool.submit(read, range(i * step, count, threads * step)) for i in range(threads)]:
+            done.result()
 
 
 class _AsciiHeader(io.BufferedReader):
@@ -217,8 +337,8 @@ class _AsciiHeader(io.BufferedReader):
         return re.sub(rb"[\x80-\xff]", b"?", data) if self.tell() <= self._header_bytes else data
 
 
-def _read_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
-    """[rows] structured array of element vertex, memory-mapped for binary files."""
+def _text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
+    """[rows] structured array of element vertex of a text file."""
     try:
         with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list in text
@@ -228,21 +348,23 @@ def _read_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
         raise SceneError(f"{path}: cannot be read as PLY: {error}. Export the scene again.") from error
 
 
-def _finite_rows(
-    path: Path, arrays: dict[str, NDArray[Any]], columns: dict[str, NDArray[Any]], drop_invalid: bool
-) -> NDArray[np.bool_] | None:
-    """Which rows to keep, None for all; raises unless the others may be dropped."""
-    if all(bool(np.isfinite(array).all()) for array in arrays.values()):
+def _finite_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool) -> NDArray[np.bool_] | None:
+    """Which of so many rows to keep, None for all; raises unless the others may be dropped."""
+    if not flaws:
         return None
-    kept = np.ones(len(arrays["opacities"]), dtype=np.bool_)
+    kept = np.ones(count, dtype=np.bool_)
+    totals: dict[str, list[int]] = {}
+    for flaw in flaws:
+        kept[flaw.start : flaw.start + len(flaw.finite)] = flaw.finite
+        for name, (nans, infinite) in flaw.counts.items():
+            total = totals.setdefault(name, [0, 0])
+            total[0] += nans
+            total[1] += infinite
+    rest = sorted((name for name in totals if name not in _ORDER), key=lambda name: int(name.removeprefix("f_rest_")))
     found = []
-    for name, column in columns.items():
-        finite = np.isfinite(column)
-        kept &= finite
-        if not finite.all():
-            nans = int(np.isnan(column).sum())
-            counts = {"NaN": nans, "infinite": int((~finite).sum()) - nans}
-            found.append(f"{name} ({', '.join(f'{count} {what}' for what, count in counts.items() if count)})")
+    for name in [*(name for name in _ORDER if name in totals), *rest]:
+        counts = dict(zip(("NaN", "infinite"), totals[name], strict=True))
+        found.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
     bad = int((~kept).sum())
     summary = f"{path}: {bad} of {len(kept)} Gaussians hold NaN or infinite values: {', '.join(found)}"
     if bad == len(kept):
@@ -281,18 +403,26 @@ def _blocks(source: SceneFile, colours: NDArray[Any]) -> Iterator[tuple[int, NDA
         position = following
 
 
-def _write_binary(source: SceneFile, colours: NDArray[Any], file: BinaryIO, output: BinaryIO) -> None:
+def _write_binary(source: SceneFile, colours: NDArray[Any], file: io.BufferedReader, output: BinaryIO) -> None:
     dtype = source.header.vertex.dtype(source.header.byte_order)
     before = element_offsets(source.path, source.header)["vertex"] - len(source.header.raw)
     file.seek(len(source.header.raw))
     _copy(file, output, before)
+    buffer = bytearray(min(BLOCK_ROWS, source.header.vertex.count) * dtype.itemsize)
     for count, kept, new in _blocks(source, colours):
-        rows = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype)[kept]
+        part = memoryview(buffer)[: count * dtype.itemsize]
+        if file.readinto(part) != len(part):
+            raise changed(source.path)
+        rows = np.frombuffer(part, dtype)
+        if len(new) < count:
+            rows = rows[kept]
         for name, column in zip(_DC, new.T, strict=True):
-            changed = rows[name].astype(np.float32) != column
-            rows[name][changed] = column[changed]
-        output.write(rows.tobytes())
+            different = rows[name].astype(np.float32) != column
+            rows[name][different] = column[different]
+        output.write(rows.view(np.uint8).data)
     _copy(file, output)
+    if _stamp(source.path) != source.stamp:
+        raise changed(source.path)
 
 
 def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:

@@ -264,7 +264,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)
     pruned = pruned_gaussians(looked, seen)
     error = pruned_image_error(~seen, cameras, distinct, workshop.rasterizer) if pruned.any() else None
-    used_degree = scene.subset(seen).without_zero_bands().sh_degree if scene.sh_degree else 0
+    used_degree = scene.used_degree(seen)
     return Probe(
         SceneFacts(len(scene), scene.sh_degree, used_degree),
         tuple((camera.height, camera.width) for camera in cameras),

@@ -23,6 +23,7 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
 #: Trained quaternions are of any length around 1; far beyond, training or export went wrong.
 QUATERNION_LENGTHS = (1e-3, 1e3)
@@ -187,8 +188,8 @@ class _Scene:
     def harmonics(self) -> list[Finding]:
         found = []
         for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
-            if values.numel():
-                size = values.abs().flatten(1).amax(1)
+            if values.shape[1]:
+                size = values.largest() if isinstance(values, StoredHarmonics) else values.abs().flatten(1).amax(1)
                 found += self.finding(
                     f"{name} SH coefficients above {LARGE_COEFFICIENT:g}",
                     size > LARGE_COEFFICIENT,

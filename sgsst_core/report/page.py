@@ -49,9 +49,10 @@ _PARTS = {
     "loss": "loss and pyramid",
     "checkpoint": "checkpoints",
     "measuring": "measuring, beside the steps",
+    "reading": "reading scene, cameras, style and photos",
 }
 #: Parts of the time that are not the steps'.
-_BESIDE = ("checkpoint", "measuring")
+_BESIDE = ("checkpoint", "measuring", "reading")
 _ENVIRONMENT = Environment(
     loader=PackageLoader("sgsst_core.report"),
     autoescape=True,  # names of scenes, views and files are whatever users wrote

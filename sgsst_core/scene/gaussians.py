@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-import torch
 from torch import Tensor
+
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
+
+#: Gaussians that are looked at together.
+_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
 class Scene:
     """A trained 3DGS scene. All tensors are float32 on the CPU and hold finite values only.
+
+    Of large scenes, `sh_rest` stays in the file that the scene was read from: see `StoredHarmonics`.
 
     Attributes:
         means: [N, 3], world units.
@@ -26,7 +32,7 @@ class Scene:
     scales: Tensor  # [N, 3]
     opacities: Tensor  # [N]
     sh_dc: Tensor  # [N, 3]
-    sh_rest: Tensor  # [N, K, 3]
+    sh_rest: Tensor | StoredHarmonics  # [N, K, 3]
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -40,9 +46,36 @@ class Scene:
         """The Gaussians of some rows ([N] bool, or indices)."""
         return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
 
+    def used_degree(self, rows: Tensor | None = None) -> int:
+        """The highest degree with a coefficient that is not 0, among some Gaussians ([N] bool) or all."""
+        if self.sh_degree == 0:
+            return 0
+        if isinstance(self.sh_rest, StoredHarmonics):
+            chosen = self.sh_rest if rows is None else self.sh_rest[rows]
+            used = chosen.used_coefficients() if isinstance(chosen, StoredHarmonics) else _used_coefficients(chosen)
+        else:
+            used = _used_coefficients(self.sh_rest, rows)
+        return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
+
     def without_zero_bands(self) -> Scene:
         """The same scene without the SH bands that are zero in all Gaussians; it looks the same from everywhere."""
-        used = self.sh_rest.abs().amax(dim=2).amax(dim=0) > 0 if len(self) else torch.zeros(self.sh_rest.shape[1])
-        highest = int(used.nonzero()[-1]) + 1 if used.any() else 0
-        coefficients = next(count for count in (0, 3, 8, 15) if count >= highest)
+        coefficients = (self.used_degree() + 1) ** 2 - 1
+        if coefficients == self.sh_rest.shape[1]:
+            return self
+        if isinstance(self.sh_rest, StoredHarmonics):
+            return replace(self, sh_rest=self.sh_rest.first(coefficients))
         return replace(self, sh_rest=self.sh_rest[:, :coefficients].contiguous())
+
+
+def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:
+    """How many of the first coefficients are not 0 in some Gaussians ([N] bool) together; by parts, without a copy."""
+    used = 0
+    for start in range(0, len(sh_rest), _CHUNK):
+        values = sh_rest[start : start + _CHUNK, used:]
+        if rows is not None:
+            values = values[rows[start : start + _CHUNK]]
+        found = (values != 0).any(dim=2).any(dim=0).nonzero()
+        used += int(found[-1]) + 1 if len(found) else 0
+        if used == sh_rest.shape[1]:
+            break
+    return used

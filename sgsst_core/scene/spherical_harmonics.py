@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
 #: Gaussians evaluated at a time: bounds the basis [chunk, 15] and the float64 copies to some tens of megabytes.
 _CHUNK = 1 << 17
@@ -71,7 +74,7 @@ def basis(
 
 
 def rest_colours(
-    sh_rest: Tensor,  # [N, K, 3], K = 0, 3, 8 or 15
+    sh_rest: Tensor | StoredHarmonics,  # [N, K, 3], K = 0, 3, 8 or 15
     means: Tensor,  # [N, 3]
     camera: Camera,
     *,
@@ -84,6 +87,7 @@ def rest_colours(
 
     Raises:
         ValueError: K is no number of coefficients of degree 0 to 3, or `degree` is higher than the file's.
+        SceneError: coefficients are in a file that was changed since it was first read.
     """
     stored = {0: 0, 3: 1, 8: 2, 15: 3}.get(int(sh_rest.shape[1]))
     if stored is None:
@@ -93,6 +97,8 @@ def rest_colours(
         raise ValueError(f"degree {degree} asked of spherical harmonics of degree {stored}")
     if degree == 0:
         return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
+    if isinstance(sh_rest, StoredHarmonics):
+        return _stored_rest_colours(sh_rest, means, camera, degree)
     if sh_rest.dtype == torch.float32 and sh_rest.device.type == "cpu":
         return _compiled_rest_colours(sh_rest, means, camera, degree)
     if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and triton_runs_on(sh_rest.device):
@@ -125,6 +131,21 @@ def _compiled_rest_colours(sh_rest: Tensor, means: Tensor, camera: Camera, degre
     values, points = (tensor.detach().cpu().contiguous().numpy() for tensor in (sh_rest, means))
     with kernel_threads():
         kernels.rest_colours(values, points, camera.centre.numpy(), degree, colours.numpy())
+    return colours
+
+
+def _stored_rest_colours(sh_rest: StoredHarmonics, means: Tensor, camera: Camera, degree: int) -> Tensor:
+    """The same, to the bit, of coefficients in a file: each block is used while it is in a core's cache."""
+    from sgsst_core.scene import spherical_harmonics_kernels as kernels
+
+    colours = torch.empty((len(sh_rest), 3))
+    points, centre, out = means.detach().cpu().contiguous().numpy(), camera.centre.numpy(), colours.numpy()
+
+    def add_up(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
+        part = slice(start, start + len(rows))
+        kernels.block_rest_colours(block, rows, points[part], centre, degree, out[part])
+
+    sh_rest.for_blocks(add_up)
     return colours
 
 

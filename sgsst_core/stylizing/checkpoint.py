@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -27,6 +28,7 @@ from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
@@ -139,7 +141,12 @@ def fingerprint(
     digest = hashlib.sha256(repr((weights, photos)).encode())
     for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
         digest.update(repr(tuple(tensor.shape)).encode())
-        digest.update(tensor.contiguous().numpy().data)
+        if isinstance(tensor, StoredHarmonics):
+            tensor.for_blocks(
+                lambda start, block, rows: digest.update(np.ascontiguousarray(block[rows]).data), threads=1
+            )
+        else:
+            digest.update(tensor.contiguous().numpy().data)
     for camera in cameras:
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)

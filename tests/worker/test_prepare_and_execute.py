@@ -165,3 +165,4 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
     report = json.loads(request_.out.with_name("s.report.json").read_text())
     assert report["workers"]["used"] == report["workers"]["asked"] == 1
     assert report["workers"]["attempts"] == []
+    assert report["seconds_by_part"]["reading"] > 0

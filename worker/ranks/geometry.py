@@ -3,13 +3,15 @@
 The lowest rank of a machine reads the PLY and lays the arrays into memory that has no name: a memory file, which the
 machine's other ranks open through the reader's process and map. Nobody can leave it behind, because the system frees it
 with the last process that uses it. Pages are mapped copy-on-write, so that ranks share them, and no rank can change
-what another one sees.
+what another one sees. Spherical harmonics of a large scene stay in its file, which each rank opens: the system keeps
+what is read of it once for all of them.
 """
 
 from __future__ import annotations
 
 import mmap
 import os
+import pickle
 import socket
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -21,11 +23,12 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneTooLargeError, SgsstError
-from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.files.ply import SceneFile, read_scene, stays_in_file
 from sgsst_core.files.ply_header import read_header
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMISER_BYTES
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home
 
 #: Bytes that a rank needs for each Gaussian beside the scene and the optimiser: its place in a view (centre, conic,
@@ -46,6 +49,7 @@ class _Shared:
     size: int
     layout: _Layout
     file: SceneFile  # without its arrays
+    harmonics: bytes | None  # those that stay in the file, pickled: ranks of other machines must not look for it
 
 
 def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: bool = False) -> tuple[SceneFile, bool]:
@@ -93,7 +97,9 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
 
 def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
     """Lay a scene into a memory file; returns the scene as it lies there, and where that is."""
-    arrays: dict[str, NDArray[Any]] = {name.name: getattr(file.scene, name.name).numpy() for name in fields(Scene)}
+    stored = file.scene.sh_rest if isinstance(file.scene.sh_rest, StoredHarmonics) else None
+    tensors = {name.name: getattr(file.scene, name.name) for name in fields(Scene)}
+    arrays: dict[str, NDArray[Any]] = {name: value.numpy() for name, value in tensors.items() if value is not stored}
     if file.kept is not None:
         arrays["kept"] = file.kept
     layout: _Layout = {}
@@ -108,7 +114,8 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
             data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
             memory[offset : offset + data.nbytes] = data.data
     empty = Scene(*(torch.empty(0) for _ in fields(Scene)))
-    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, kept=None))
+    in_file = None if stored is None else pickle.dumps(stored)
+    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, kept=None), in_file)
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
 
 
@@ -121,8 +128,10 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
         count = int(np.prod(shape))
         arrays[name] = np.frombuffer(memory, kind, count, offset).reshape(shape) if count else np.empty(shape, kind)
     kept = arrays.pop("kept", None)
-    scene = Scene(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-    return replace(shared.file, scene=scene, kept=kept)
+    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    if shared.harmonics is not None:
+        tensors["sh_rest"] = pickle.loads(shared.harmonics)
+    return replace(shared.file, scene=Scene(**tensors), kept=kept)
 
 
 def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
@@ -133,8 +142,7 @@ def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
     """
     problem: SgsstError | None = None
     try:
-        count, scene_bytes = _size_by_header(path)
-        problem = _lack(collectives.rank, sharing, count, scene_bytes)
+        problem = _lack(collectives.rank, sharing, *_size_by_header(path))
     except SgsstError as error:
         problem = error
     for found in collectives.all_gather(problem):
@@ -142,20 +150,25 @@ def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
             raise found
 
 
-def _size_by_header(path: Path) -> tuple[int, int]:
-    """Gaussians that a file declares, and their bytes in memory; (0, 0) for what `read_scene` will refuse."""
+def _size_by_header(path: Path) -> tuple[int, int, int]:
+    """Gaussians that a file declares, and their bytes in memory and on a GPU; zeros for what `read_scene` will refuse.
+
+    Memory does not hold what stays in the file.
+    """
     header = read_header(path)
     if "vertex" not in header.names:
-        return 0, 0
+        return 0, 0, 0
     # A header may declare anything: no more than what the file can hold is believed.
     count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))
     rest = sum(prop.name.startswith("f_rest_") for prop in header.vertex.properties)
-    return count, count * 4 * (14 + rest)
+    held = 0 if stays_in_file(header) else rest
+    return count, count * 4 * (14 + held), count * 4 * (14 + rest)
 
 
-def _lack(rank: int, sharing: int, count: int, scene_bytes: int) -> SceneTooLargeError | None:
+def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: int) -> SceneTooLargeError | None:
     """What is missing on this rank; None where there is room."""
-    each = scene_bytes + count * (OPTIMISER_BYTES + VIEW_BYTES)  # every rank has what the views show once for itself
+    own = count * (OPTIMISER_BYTES + VIEW_BYTES)
+    each = scene_bytes + own  # every rank has what the views show once for itself
     where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
     advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."
     needed, free = scene_bytes + sharing * each, available_memory()
@@ -166,9 +179,10 @@ def _lack(rank: int, sharing: int, count: int, scene_bytes: int) -> SceneTooLarg
         )
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()
-        if each > free:
+        needed = device_bytes + own
+        if needed > free:
             return SceneTooLargeError(
-                f"{where} {each / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
+                f"{where} {needed / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
                 f"{free / 1e9:.2f} GB are free. {advice}"
             )
     return None

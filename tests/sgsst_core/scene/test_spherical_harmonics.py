@@ -22,6 +22,7 @@ from sgsst_core.scene.spherical_harmonics import (
     view_colours_gradient,
     view_directions,
 )
+from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 
@@ -83,10 +84,10 @@ def test_basis_has_the_signs_and_the_order_of_3dgs_files() -> None:
 def test_rest_colours_of_a_degree_use_only_its_coefficients(degree: int) -> None:
     scene, view = cloud(50, degree=3), camera(pose=turned_pose())
     count = (degree + 1) ** 2 - 1
-    alone = rest_colours(scene.sh_rest[:, :count], scene.means, view)
+    alone = rest_colours(held(scene.sh_rest)[:, :count], scene.means, view)
     assert torch.equal(rest_colours(scene.sh_rest, scene.means, view, degree=degree), alone)
     values = basis(view_directions(scene.means, view.centre), degree)
-    expected = (values[:, :, None] * scene.sh_rest[:, :count].double()).sum(1)
+    expected = (values[:, :, None] * held(scene.sh_rest)[:, :count].double()).sum(1)
     assert alone.dtype == torch.float32
     assert torch.allclose(alone.double(), expected, atol=1e-6)
     assert degree > 0 or not alone.any()
@@ -128,7 +129,7 @@ def huge_coefficients() -> tuple[Scene, Camera]:
     """Some of them cancel."""
     scene = cloud(300, degree=3)
     sizes = torch.logspace(0, 36, 300)[:, None, None]
-    return replace(scene, sh_rest=scene.sh_rest * sizes), camera(pose=turned_pose())
+    return replace(scene, sh_rest=held(scene.sh_rest) * sizes), camera(pose=turned_pose())
 
 
 KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
@@ -146,11 +147,12 @@ def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
     """Of a file of that degree, and of one with higher bands that are left out."""
     pytest.importorskip("triton")
     scene, view = KERNEL_CASES[name]()
+    whole = held(scene.sh_rest)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     count = (degree + 1) ** 2 - 1
-    exact = reference_rest_colours(scene.sh_rest.double(), scene.means, view, degree)
-    sizes = scene.sh_rest[:, :count].abs().double().sum(1)
-    for sh_rest in (scene.sh_rest, scene.sh_rest[:, :count]):
+    exact = reference_rest_colours(whole.double(), scene.means, view, degree)
+    sizes = whole[:, :count].abs().double().sum(1)
+    for sh_rest in (whole, whole[:, :count]):
         found = kernel_rest_colours(sh_rest.to(device), scene.means.to(device), view, degree)
         assert found.dtype == torch.float32
         assert bool(((found.cpu().double() - exact).abs() <= 1e-6 * sizes).all())
@@ -160,10 +162,11 @@ def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
 @pytest.mark.parametrize("name", KERNEL_CASES)
 def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: int) -> None:
     scene, view = KERNEL_CASES[name]()
+    whole = held(scene.sh_rest)
     count = (degree + 1) ** 2 - 1
-    exact = reference_rest_colours(scene.sh_rest.double(), scene.means, view, degree)
-    sizes = scene.sh_rest[:, :count].abs().double().sum(1)
-    for sh_rest in (scene.sh_rest, scene.sh_rest[:, :count]):
+    exact = reference_rest_colours(whole.double(), scene.means, view, degree)
+    sizes = whole[:, :count].abs().double().sum(1)
+    for sh_rest in (whole, whole[:, :count]):
         found = rest_colours(sh_rest, scene.means, view, degree=degree)
         assert found.dtype == torch.float32
         assert bool(((found.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
@@ -173,7 +176,7 @@ def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: in
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
 def test_colours_on_a_gpu_are_those_of_the_kernel() -> None:
     scene, view = cloud(300, degree=3), camera(pose=turned_pose())
-    sh_rest, means = scene.sh_rest.cuda(), scene.means.cuda()
+    sh_rest, means = held(scene.sh_rest).cuda(), scene.means.cuda()
     found = rest_colours(sh_rest, means, view)
     assert torch.equal(found, kernel_rest_colours(sh_rest, means, view, 3))
     assert torch.allclose(found.cpu(), rest_colours(scene.sh_rest, scene.means, view), atol=1e-5)

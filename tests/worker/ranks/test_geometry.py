@@ -7,14 +7,20 @@ import hashlib
 import os
 from dataclasses import fields
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
+from torch import Tensor
 
 from sgsst_core.errors import SceneError, SceneTooLargeError
+from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.scene.camera import orbit
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
 from worker.ranks.geometry import read_shared_scene
@@ -59,6 +65,29 @@ def test_one_rank_reads_and_all_have_the_same(tmp_path: Path, drop: bool) -> Non
     assert [rank[2] for rank in found] == [int(drop)] * 3
     assert all(rank[3] >= 1 for rank in found), "not mapped"
     assert [rank[4] for rank in found] == [0, 0, 0], "left behind"
+
+
+def shared_colours(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
+    """Of a scene whose harmonics stay in the file: whether they do on a rank, what they are, and a view's colours."""
+    with patch.object(ply, "HELD_BYTES", 0):
+        scene = read_shared_scene(path, collectives, drop_invalid=drop)[0].scene
+    stored = isinstance(scene.sh_rest, StoredHarmonics)
+    return stored, held(scene.sh_rest), rest_colours(scene.sh_rest, scene.means, orbit(scene, 1)[0])
+
+
+@linux
+@pytest.mark.parametrize("drop", [False, True])
+def test_harmonics_in_the_file_are_read_there_by_every_rank(tmp_path: Path, drop: bool) -> None:
+    scene = wall(sh_degree=2)
+    if drop:
+        scene.opacities[7] = float("nan")
+    write_scene(tmp_path / "scene.ply", scene)
+    plain = read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene
+    colours = rest_colours(plain.sh_rest, plain.means, orbit(plain, 1)[0])
+    for stored, values, own in on_ranks(2, shared_colours, tmp_path / "scene.ply", drop):
+        assert stored
+        assert torch.equal(values, held(plain.sh_rest))
+        assert torch.equal(own, colours)
 
 
 def refused(collectives: Collectives, path: Path) -> str:
