@@ -24,6 +24,7 @@ from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.timing import Timer
 from worker.inputs import read_inputs
 from worker.request import Outputs, Resume, StylizeRequest, check_request
 
@@ -71,8 +72,10 @@ def prepare(
         InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
         RankLeftOut: the job goes on without this rank.
     """
+    timer = Timer()  # of the program: nothing here is left to run on a GPU
     outputs = collectives.broadcast(lambda: check_request(request))
-    inputs = read_inputs(request, collectives)
+    with timer("reading"):
+        inputs = read_inputs(request, collectives)
     settings = request.settings
     resume = resume or Resume(request.resume)
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
@@ -91,18 +94,21 @@ def prepare(
             looked=resumed.plan.survey if resumed else None,
             measured=True,
             show=show_planning,
+            timer=timer,
         )
-    stylizer = Stylizer(
-        plan,
-        inputs.scene_file.scene,
-        inputs.cameras,
-        inputs.style,
-        settings,
-        weights=inputs.weights,
-        photos=inputs.load_photo,
-        collectives=collectives,
-        workshop=workshop,
-    )
+    with timer("preparing"):
+        stylizer = Stylizer(
+            plan,
+            inputs.scene_file.scene,
+            inputs.cameras,
+            inputs.style,
+            settings,
+            weights=inputs.weights,
+            photos=inputs.load_photo,
+            collectives=collectives,
+            workshop=workshop,
+        )
+    stylizer.seconds_by_part.update(timer.seconds)
     source, scene_file, images = request.source, inputs.scene_file, request.images
     sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, inputs.weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
