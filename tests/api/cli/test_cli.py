@@ -300,23 +300,20 @@ def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, comm
         arguments, stdout=theirs, stderr=theirs, env=environment, cwd=files.ply.parent, start_new_session=True
     ) as process:
         os.close(theirs)
-        shown = _shown_until(ours, "Looking at the views")
+        shown = _shown_until(ours, rf"Looking at the views.* [1-9]\d*/{views}")
         process.send_signal(signal.SIGINT)
         shown += _shown_until(ours, None)
         assert process.wait(timeout=60) == 130, shown
     os.close(ours)
-    done = [int(count) for count in re.findall(rf"(\d+)/{views}", shown)]
-    assert done
-    assert max(done) < views
-    assert "Aborted." in shown
+    assert max(int(count) for count in re.findall(rf"(\d+)/{views}", shown)) < views
     assert "Traceback" not in shown
     assert not files.out.parent.exists() or not list(files.out.parent.iterdir())
 
 
-def _shown_until(terminal: int, text: str | None) -> str:
-    """What a program writes to its terminal until some text comes; until it ends with None."""
+def _shown_until(terminal: int, pattern: str | None) -> str:
+    """What a program writes to its terminal until a pattern comes; until it ends with None."""
     shown = ""
-    while text is None or text not in shown:
+    while pattern is None or not re.search(pattern, shown):
         try:
             found = os.read(terminal, 4096)
         except OSError:  # the other end is closed
