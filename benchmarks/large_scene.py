@@ -25,21 +25,29 @@ from scipy.spatial import cKDTree
 
 from benchmarks.machine import write_result
 from benchmarks.rasterizer import DATA, generated_scene, timed
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.planning.pictures import soft_picture
+from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.rasterizer.raster_lists import build_raster_lists, lists_of_subset
 from sgsst_core.scene.camera import Camera, orbit, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colours, rest_colours
 from sgsst_core.scene.stored_harmonics import held
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.unseen import NEIGHBOURS, neighbours_change
+from sgsst_core.timing import Timer
 
-PARTS = ("reading", "harmonics", "survey", "unseen")
+PARTS = ("reading", "harmonics", "survey", "first step", "unseen")
 _PLUSH = DATA / "snowmiku_plush"
 #: Gaussians on which the slow twin of spherical harmonics is timed.
 _HARMONICS_SAMPLE = 200_000
+#: Larger side of the views of a job.
+_RESOLUTION = 990
 
 
 def multiplied(scene: Scene, count: int) -> Scene:
@@ -88,10 +96,15 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     torch.set_num_threads(threads)
     lists = middle(lambda camera: build_raster_lists(scene, camera), cameras)
     rasterizer = CpuRasterizer(scene, max_list_bytes=0)  # the last view's lists alone
-    found: dict[str, list[float]] = {"render": [], "gradient": [], "plain": [], "survey": []}
+    places = torch.arange(len(scene), dtype=torch.int32)
+    places[::8] = -1  # about as many as views do not see
+    places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
+    lists_of_subset(build_raster_lists(scene.subset(torch.arange(1)), cameras[0]), places[1:2].numpy())  # compiles
+    found: dict[str, list[float]] = {"handed": [], "render": [], "gradient": [], "plain": [], "survey": []}
     colours = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
     for camera in cameras:
-        rasterizer.lists(camera)
+        whole = rasterizer.lists(camera)
+        found["handed"].append(timed(lambda whole=whole: lists_of_subset(whole, places.numpy())))  # type: ignore[misc]
         image = rasterizer.render(colours, camera)
         found["render"].append(timed(lambda camera=camera: rasterizer.render(colours, camera)))  # type: ignore[misc]
         gradient = timed(lambda image=image, camera=camera: rasterizer.colour_gradient(image, camera))  # type: ignore[misc]
@@ -102,6 +115,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     return {
         "lists_seconds": lists,
         "ratio_lists_one_thread_to_all": alone / lists,
+        "ratio_lists_to_handed": lists / seconds["handed_seconds"],
         **seconds,
         "ratio_plain_to_survey": seconds["plain_seconds"] / seconds["survey_seconds"],
     }
@@ -124,6 +138,18 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     return {"unseen": int((~seen).sum()), "unseen_seconds": fast, "ratio_plain_to_unseen": slow / fast}
 
 
+def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
+    """From a scene in memory to the end of the first step, in parts; the weights of a network are installed."""
+    settings = make_settings(max_resolution=_RESOLUTION)
+    timer, weights, style = Timer(), load_network_weights("auto"), soft_picture(512)
+    plan, workshop = make_plan(scene, cameras, settings, weights=weights, timer=timer)
+    with timer("preparing"):
+        stylizer = Stylizer(plan, scene, cameras, style, settings, weights=weights, workshop=workshop)
+    with timer("first_step"):
+        stylizer.run_step()
+    return {f"{name}_seconds_of_a_job": seconds for name, seconds in timer.seconds.items()}
+
+
 def measure(count: int, views: int, parts: list[str]) -> dict[str, float]:
     """All figures of one size; `parts`: of PARTS."""
     small, cameras, _ = small_scene()
@@ -139,6 +165,8 @@ def measure(count: int, views: int, parts: list[str]) -> dict[str, float]:
         figures |= measure_harmonics(scene, cameras)
     if "survey" in parts:
         figures |= measure_views(scene, cameras)
+    if "first step" in parts:
+        figures |= measure_first_step(scene, cameras)
     if "unseen" in parts:
         figures |= measure_unseen(scene, cameras)
     figures["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB

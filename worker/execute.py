@@ -76,8 +76,6 @@ def execute(
     before = job.resumed.before if job.resumed else measure.evaluate(unstylized=True)
     if job.resumed:
         stylizer.load_state(job.resumed.state)
-    parts = stylizer.seconds_by_part
-    parts["reading"] = parts.get("reading", 0.0) + job.reading
     if first:
         _make_room(job.outputs)
     stylizer.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.plan)))

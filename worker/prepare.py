@@ -6,7 +6,6 @@ Every rank goes through the same functions. Nothing is written and nothing is pr
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +24,7 @@ from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.timing import Timer
 from worker.inputs import read_inputs
 from worker.request import Outputs, Resume, StylizeRequest, check_request
 
@@ -39,7 +39,6 @@ class Job:
         resumed: checkpoint to go on from; None starts from the beginning.
         planned_ranks: that there were when the plan was made.
         workers: who takes part, and what happened to earlier attempts; for the report.
-        reading: seconds that reading and checking the inputs took.
     """
 
     request: StylizeRequest
@@ -51,7 +50,6 @@ class Job:
     resumed: Checkpoint | None
     planned_ranks: int
     workers: dict[str, Any]
-    reading: float
 
 
 def prepare(
@@ -74,10 +72,10 @@ def prepare(
         InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
         RankLeftOut: the job goes on without this rank.
     """
+    timer = Timer()  # of the program: nothing here is left to run on a GPU
     outputs = collectives.broadcast(lambda: check_request(request))
-    started = time.perf_counter()
-    inputs = read_inputs(request, collectives)
-    reading = time.perf_counter() - started
+    with timer("reading"):
+        inputs = read_inputs(request, collectives)
     settings = request.settings
     resume = resume or Resume(request.resume)
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
@@ -96,24 +94,25 @@ def prepare(
             looked=resumed.plan.survey if resumed else None,
             measured=True,
             show=show_planning,
+            timer=timer,
         )
-    stylizer = Stylizer(
-        plan,
-        inputs.scene_file.scene,
-        inputs.cameras,
-        inputs.style,
-        settings,
-        weights=inputs.weights,
-        photos=inputs.load_photo,
-        collectives=collectives,
-        workshop=workshop,
-    )
+    with timer("preparing"):
+        stylizer = Stylizer(
+            plan,
+            inputs.scene_file.scene,
+            inputs.cameras,
+            inputs.style,
+            settings,
+            weights=inputs.weights,
+            photos=inputs.load_photo,
+            collectives=collectives,
+            workshop=workshop,
+        )
+    stylizer.seconds_by_part.update(timer.seconds)
     source, scene_file, images = request.source, inputs.scene_file, request.images
     sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, inputs.weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
-    return Job(
-        request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers, reading
-    )
+    return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
 
 
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:

@@ -63,15 +63,16 @@ GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
 def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
     """What the rasterizer of a job that computes weights anew is made with, beside its scene.
 
-    Lists of a GPU are small beside its memory, and each view without one costs a sort and a wait: they have half as
-    much as kept weights, of what is left to buffers.
+    On the CPU lists share the memory of kept weights (`CachedRasterizer`). Lists of a GPU are small beside its memory,
+    and each view without one costs a sort and a wait: they have half as much as kept weights, of what is left to
+    buffers.
 
     Args:
         memory: bytes that the rank may plan with.
     """
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
-    if name == "triton":
-        options["max_list_bytes"] = int(memory * MEMORY_SHARES["rasterizer"]) // 2
+    if name in ("cpu", "triton"):
+        options["max_list_bytes"] = int(memory * MEMORY_SHARES["rasterizer"]) // (2 if name == "triton" else 1)
     return options
 
 

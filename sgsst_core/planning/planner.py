@@ -16,6 +16,7 @@ from sgsst_core.planning.survey import Survey, survey
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.timing import Timer
 
 
 def make_plan(
@@ -29,6 +30,7 @@ def make_plan(
     looked: Survey | None = None,
     measured: bool = False,
     show: ShowPlanning | None = None,
+    timer: Timer | None = None,
 ) -> tuple[Plan, Workshop]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
@@ -39,6 +41,7 @@ def make_plan(
         looked: the survey of an earlier plan of the same job; None looks at the views.
         measured: see `decide`.
         show: told how far the survey has come.
+        timer: counts the seconds of `survey`, and of all else as `planning`.
 
     Returns:
         The plan, and what was built to make it, for a `Stylizer` to go on with.
@@ -50,11 +53,14 @@ def make_plan(
     """
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
-    fitted = fit_cameras(cameras, settings)
-    workshop = equip(scene, fitted, settings, weights or load_network_weights("auto"), collectives, rasterizer)
-    if looked is None:
-        looked = survey(scene, fitted, workshop.rasterizer, collectives, show)
-    link = probe_link(collectives, workshop.network.device)
-    # Timings differ from rank to rank: one decides for all.
-    plan = collectives.broadcast(lambda: decide(measure(workshop, looked, link), settings, measured=measured))
+    timer = timer or Timer()
+    with timer("planning"):
+        fitted = fit_cameras(cameras, settings)
+        workshop = equip(scene, fitted, settings, weights or load_network_weights("auto"), collectives, rasterizer)
+        if looked is None:
+            with timer("survey"):
+                looked = survey(scene, fitted, workshop.rasterizer, collectives, show)
+        link = probe_link(collectives, workshop.network.device)
+        # Timings differ from rank to rank: one decides for all.
+        plan = collectives.broadcast(lambda: decide(measure(workshop, looked, link), settings, measured=measured))
     return plan, workshop

@@ -55,7 +55,9 @@ class CachedRasterizer:
         alpha_max: clamp of alpha.
         precision: of the kept weights. `half` takes half the memory; each weight then has a relative error of at most
             2^-11.
-        max_bytes: memory for weights; None is no limit.
+        max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `anew`, which keeps
+            those that weights leave room for, and lets go of a view's once its weights are kept.
+        least_list_bytes: memory for these lists beside it, however much is taken by weights.
         device: where weights are kept and applied, and where results lie.
         anew: computes weights, and what is not kept: of the same scene. Its lists, device, background, near plane and
             clamp of alpha take the place of those given here; None makes one.
@@ -77,12 +79,14 @@ class CachedRasterizer:
         alpha_max: float = ALPHA_MAX,
         precision: Precision = "float32",
         max_bytes: int | None = None,
+        least_list_bytes: int = 0,
         device: torch.device | str = "cpu",
         anew: CpuRasterizer | TritonRasterizer | None = None,
     ) -> None:
         self.scene = scene
         self.precision: Precision = precision
         self.max_bytes = max_bytes
+        self.least_list_bytes = least_list_bytes
         self.kept_bytes = 0
         if anew is None and torch.device(device).type == "cpu":
             anew = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
@@ -161,4 +165,6 @@ class CachedRasterizer:
             return None
         weights = counted.keep(self.precision)
         self.kept_bytes += weights.nbytes
+        if self.max_bytes is not None and isinstance(self.anew, CpuRasterizer):
+            self.anew.let_go_of_lists(camera, max(self.max_bytes - self.kept_bytes, self.least_list_bytes))
         return _Kept(band, weights)

@@ -17,7 +17,8 @@ from sgsst_core.rasterizer.arguments import (
     check_rows,
 )
 from sgsst_core.rasterizer.kept_lists import KeptLists
-from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
+from sgsst_core.rasterizer.projection import Shapes
+from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists, lists_of_subset
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -59,7 +60,29 @@ class CpuRasterizer:
         self.near = near
         self.alpha_max = alpha_max
         self.background: NDArray[np.float32] = np.asarray(background, dtype=np.float32)
-        self._lists = KeptLists(lambda camera: build_raster_lists(scene, camera, near=near), max_list_bytes)
+        self._shapes: Shapes | None = None
+        self._lists = KeptLists(self._build, max_list_bytes)
+
+    def of_subset(self, scene: Scene, rows: Tensor, *, max_list_bytes: int = DEFAULT_LIST_BYTES) -> CpuRasterizer:
+        """A rasterizer of some of the Gaussians. Lists kept here are handed on to it, cut down when a view comes.
+
+        Args:
+            scene: of these Gaussians, their geometry unchanged.
+            rows: [N] bool, which they are.
+        """
+        if len(scene) != int(rows.sum()) or len(rows) != len(self.scene):
+            raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
+        part = CpuRasterizer(scene, near=self.near, alpha_max=self.alpha_max, max_list_bytes=max_list_bytes)
+        part.background = self.background
+        places = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
+        part._lists = KeptLists(part._build, max_list_bytes, self._lists, lambda lists: lists_of_subset(lists, places))
+        self._shapes = None
+        return part
+
+    def _build(self, camera: Camera) -> RasterLists:
+        if self._shapes is None:
+            self._shapes = Shapes.of(self.scene)
+        return build_raster_lists(self.scene, camera, near=self.near, shapes=self._shapes)
 
     def lists(self, camera: Camera) -> RasterLists:
         """The view's Gaussians by raster tile, kept or new.
@@ -68,6 +91,15 @@ class CpuRasterizer:
             TooManyIntersectionsError: see `build_raster_lists`.
         """
         return self._lists.of(camera)
+
+    def has_lists(self, camera: Camera) -> bool:
+        """Whether the view's lists are kept, or handed on: no projection, no sorting."""
+        return self._lists.holds(camera)
+
+    def let_go_of_lists(self, camera: Camera, left: int) -> None:
+        """Keep the view's lists no longer, and no more than `left` bytes of all others from now on."""
+        self._lists.take(camera)
+        self._lists.limit(left)
 
     def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""

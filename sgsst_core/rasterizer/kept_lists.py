@@ -29,16 +29,32 @@ class KeptLists(Generic[L]):
 
     Args:
         build: makes the lists of a view.
-        max_bytes: of all that is kept.
+        max_bytes: of all that is kept, what is still to be taken over included.
+        before: lists of the same views, which are taken over, one view at a time when it first comes, in place of
+            building: they count among the bytes until then.
+        adapt: what becomes of lists that are taken over; it makes them no larger.
     """
 
-    def __init__(self, build: Callable[[Camera], L], max_bytes: int) -> None:
+    def __init__(
+        self,
+        build: Callable[[Camera], L],
+        max_bytes: int,
+        before: KeptLists[L] | None = None,
+        adapt: Callable[[L], L] = lambda lists: lists,
+    ) -> None:
         self._build = build
         self._max_bytes = max_bytes
+        self._before = before
+        self._adapt = adapt
         self._kept: dict[CameraKey, L] = {}
         self._latest: tuple[CameraKey, L] | None = None
         self._kept_bytes = 0
         self._lock = threading.Lock()
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of all that is kept, but for the last view beyond the limit."""
+        return self._kept_bytes + (self._before.kept_bytes if self._before else 0)
 
     def of(self, camera: Camera) -> L:
         """The view's lists, kept or new; raises what `build` raises."""
@@ -49,10 +65,38 @@ class KeptLists(Generic[L]):
             if self._latest is not None and self._latest[0] == key:
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is built
-            lists = self._build(camera)
-            if self._kept_bytes + lists.nbytes <= self._max_bytes:
+            given = self._before.take(camera) if self._before else None
+            lists = self._build(camera) if given is None else self._adapt(given)
+            if self.kept_bytes + lists.nbytes <= self._max_bytes:
                 self._kept[key] = lists
                 self._kept_bytes += lists.nbytes
             else:
                 self._latest = (key, lists)
             return lists
+
+    def holds(self, camera: Camera) -> bool:
+        """Whether the view's lists need not be built."""
+        key = camera_key(camera)
+        return key in self._kept or (self._before is not None and self._before.holds(camera))
+
+    def take(self, camera: Camera) -> L | None:
+        """The view's lists, which are no longer kept here; None where they are not. The latest ones are let go."""
+        with self._lock:
+            latest, self._latest = self._latest, None
+            key = camera_key(camera)
+            if latest is not None and latest[0] == key:
+                return latest[1]
+            lists = self._kept.pop(key, None)
+            if lists is not None:
+                self._kept_bytes -= lists.nbytes
+                return lists
+            return self._before.take(camera) if self._before else None
+
+    def limit(self, max_bytes: int) -> None:
+        """Keep no more than so many bytes from now on: views that came last are let go first."""
+        with self._lock:
+            self._max_bytes = max_bytes
+            if self._before is not None:
+                self._before.limit(max(max_bytes - self._kept_bytes, 0))
+            while self._kept_bytes > max_bytes:
+                self._kept_bytes -= self._kept.popitem()[1].nbytes

@@ -48,6 +48,9 @@ _PIXELS = RASTER_TILE**2
 _COLUMNS = 8
 #: Entries between asking for a Gaussian's values and reading them: some 100 ns of blending.
 _AHEAD = 8
+#: Tiles side by side that one thread takes, and a prime by which such blocks are scattered over the image, which has
+#: fewer of them.
+_BLOCK_TILES, _STRIDE = 8, 1_000_003
 
 
 @compiled()
@@ -130,6 +133,22 @@ def _store_pixels(pixels, transmittance, background, y, x, low, high, columns, i
             line[i, 2] = pixels[vector, 2, lane] + left[i] * blue
 
 
+@compiled()
+def _blocks(tiles):
+    """Blocks of tiles side by side that hold so many."""
+    return (tiles + _BLOCK_TILES - 1) // _BLOCK_TILES
+
+
+@compiled()
+def _scattered(step, tiles):
+    """The tile at a step of a parallel loop over `_blocks(tiles) * _BLOCK_TILES`; beyond `tiles` there is none.
+
+    Each thread gets a run of steps. Blocks that follow each other there lie all over the image, so that no thread has
+    the sky for itself and another the crowd; within a block tiles are neighbours, which share Gaussians.
+    """
+    return step // _BLOCK_TILES * _STRIDE % _blocks(tiles) * _BLOCK_TILES + step % _BLOCK_TILES
+
+
 @compiled(parallel=True)
 def render(entries, starts, values, gaussians, colours, background, first_row, alpha_max, image, transmittance):
     """Image [h, width, 3] and final transmittance [h, width] of the rows that begin at `first_row`."""
@@ -137,8 +156,12 @@ def render(entries, starts, values, gaussians, colours, background, first_row, a
     across = (width + _LAST) // _TILE
     first_tile = first_row // _TILE * across
     flat = values.reshape(values.size)
-    for step in numba.prange((last_row + _LAST) // _TILE * across - first_tile):
-        tile = first_tile + step
+    tiles = (last_row + _LAST) // _TILE * across - first_tile
+    for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
+        place = _scattered(step, tiles)
+        if place >= tiles:
+            continue
+        tile = first_tile + place
         x, y = tile % across * _TILE, tile // across * _TILE
         low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
@@ -168,7 +191,11 @@ def colour_gradient(entries, slots, starts, values, image_gradient, first_row, a
     width, last_row = image_gradient.shape[1], first_row + image_gradient.shape[0]
     across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
-    for tile in numba.prange(starts.size - 1):
+    tiles = starts.size - 1
+    for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
+        tile = _scattered(step, tiles)
+        if tile >= tiles:
+            continue
         x, y = tile % across * _TILE, tile // across * _TILE
         low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
@@ -212,7 +239,11 @@ def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittanc
     height, width = transmittance.shape
     across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
-    for tile in numba.prange(starts.size - 1):
+    tiles = starts.size - 1
+    for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
+        tile = _scattered(step, tiles)
+        if tile >= tiles:
+            continue
         x, y = tile % across * _TILE, tile // across * _TILE
         high, columns = min(height - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)

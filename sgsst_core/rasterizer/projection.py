@@ -34,6 +34,10 @@ from sgsst_core.scene.gaussians import Scene
 _LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 #: exp(-power) = 2^-(u'^2 + w'^2) when u and w are scaled by this: the kernels evaluate powers of two.
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
+#: More than float64 can be off in pixels of any image, and relative to an extent.
+_ROUNDING = 1e-6
+#: Parts of the scene that a thread projects, one after the other.
+_PARTS = 16
 
 
 class Column(IntEnum):
@@ -58,7 +62,7 @@ class Outcome(IntEnum):
     VISIBLE = 0
     #: Depth below the near plane; a Gaussian exactly on it is kept.
     NEAR = 1
-    #: Zero quaternion, or a value that overflows float64.
+    #: Zero quaternion, or a value that overflows float64, and the centre not far beside the image.
     INVALID = 2
     #: Opacity below ALPHA_MIN: contributes to no pixel.
     FAINT = 3
@@ -76,7 +80,7 @@ class Projection:
     Attributes:
         gaussians: [V] int32 indices into the scene, by depth along the viewing axis; equal depths by index.
         values: [V, 8] float64, see `Column`.
-        outcomes: how many Gaussians of the scene ended in which `Outcome`.
+        outcomes: how many Gaussians of the scene ended in which `Outcome`; of a subset's, the visible ones alone.
     """
 
     gaussians: NDArray[np.int32]
@@ -84,39 +88,73 @@ class Projection:
     outcomes: dict[Outcome, int]
 
 
-def project(scene: Scene, camera: Camera, *, near: float = NEAR) -> Projection:
+@dataclass(frozen=True)
+class Shapes:
+    """What projecting a scene computes of its Gaussians whatever the view, in float64.
+
+    Attributes:
+        deviations: [N, 3], standard deviations in world units.
+        log2_opacities: [N], of the opacity: -inf for logits under -709.
+    """
+
+    deviations: NDArray[np.float64]
+    log2_opacities: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Shapes:
+        """The shapes of a scene: 32 bytes for each Gaussian."""
+        shapes = cls(np.empty((len(scene), 3)), np.empty(len(scene)))
+        scales, logits = (np.ascontiguousarray(t.numpy()) for t in (scene.scales, scene.opacities))
+        with kernel_threads():
+            _find_shapes(scales, logits, shapes.deviations, shapes.log2_opacities)
+        return shapes
+
+
+def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None) -> Projection:
     """Project a scene (any N, also 0) onto a camera.
+
+    Args:
+        shapes: of the scene, from an earlier view.
 
     Raises:
         ValueError: `near` is not positive (depths of 0 and less have no projection).
     """
     if not near > 0:
         raise ValueError(f"near plane {near}: must be positive")
+    shapes = shapes or Shapes.of(scene)
     count = len(scene)
-    values = np.empty((count, len(Column)))
-    depths = np.empty(count)
-    outcomes = np.empty(count, dtype=np.uint8)
+    values, depths = np.empty((count, len(Column))), np.empty(count)
+    gaussians = np.empty(count, dtype=np.int32)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float64)
     with kernel_threads():
-        _project_all(
-            *(np.ascontiguousarray(t.numpy()) for t in (scene.means, scene.quats, scene.scales, scene.opacities)),
+        threads = numba.get_num_threads()
+        parts = np.linspace(0, count, threads * _PARTS + 1).astype(np.int64)
+        tallies = np.zeros((len(parts) - 1, len(Outcome)), dtype=np.int64)
+        _project_parts(
+            *(np.ascontiguousarray(t.numpy()) for t in (scene.means, scene.quats)),
+            shapes.deviations,
+            shapes.log2_opacities,
             np.ascontiguousarray(camera.world_to_camera.double().numpy()),
             intrinsics,
             near,
+            parts,
+            threads,
             values,
             depths,
-            outcomes,
+            gaussians,
+            tallies,
         )
-    order = depth_order(depths, np.flatnonzero(outcomes == Outcome.VISIBLE))
-    front_to_back = np.empty((len(order), len(Column)))
-    with kernel_threads():
-        _take_rows(values, order, front_to_back)
-    tally = np.bincount(outcomes, minlength=len(Outcome))
-    return Projection(
-        gaussians=order,
-        values=front_to_back,
-        outcomes={outcome: int(tally[outcome]) for outcome in Outcome},
-    )
+        ends = parts[:-1] + tallies[:, Outcome.VISIBLE]
+        packed = [np.arange(start, end) for start, end in zip(parts[:-1], ends, strict=True)]
+        order = depth_order(depths, np.concatenate(packed))
+        found = Projection(
+            gaussians=np.empty(len(order), dtype=np.int32),
+            values=np.empty((len(order), len(Column))),
+            outcomes={outcome: int(tallies[:, outcome].sum()) for outcome in Outcome},
+        )
+        take_places(gaussians, order, found.gaussians)
+        take_rows(values, order, found.values)
+    return found
 
 
 @compiled()
@@ -133,16 +171,37 @@ def _rotation(quat):
 
 
 @compiled()
-def _factor_row(focal, slope, axis, forward, rotation, scale):
-    """One row of M: focal / z times (camera axis - slope * viewing axis), turned into the Gaussian's own axes."""
+def _row(focal, slope, axis, forward):
+    """One row of J R_camera: focal / z times (camera axis - slope * viewing axis)."""
     a = focal * (axis[0] - slope * forward[0])
     b = focal * (axis[1] - slope * forward[1])
     c = focal * (axis[2] - slope * forward[2])
+    return a, b, c
+
+
+@compiled()
+def _factor_row(row, rotation, deviation):
+    """One row of M: turned into the Gaussian's own axes."""
+    a, b, c = row
     return (
-        (a * rotation[0][0] + b * rotation[1][0] + c * rotation[2][0]) * math.exp(np.float64(scale[0])),
-        (a * rotation[0][1] + b * rotation[1][1] + c * rotation[2][1]) * math.exp(np.float64(scale[1])),
-        (a * rotation[0][2] + b * rotation[1][2] + c * rotation[2][2]) * math.exp(np.float64(scale[2])),
+        (a * rotation[0][0] + b * rotation[1][0] + c * rotation[2][0]) * deviation[0],
+        (a * rotation[0][1] + b * rotation[1][1] + c * rotation[2][1]) * deviation[1],
+        (a * rotation[0][2] + b * rotation[1][2] + c * rotation[2][2]) * deviation[2],
     )
+
+
+@compiled()
+def _surely_outside(centre, size, row, deviation, support):
+    """Whether a Gaussian lies beside the image, whatever its orientation: no row of M is longer than that of a ball.
+
+    Beside by more than any rounding of the extents that it will be cut with, else False.
+    """
+    beside = max(0.5 - centre, centre - (size - 0.5)) - _ROUNDING
+    if not beside > 0:
+        return False
+    largest = max(deviation[0], deviation[1], deviation[2])
+    trace = (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) * largest * largest + EPS2D
+    return beside * beside * (_TO_POWER_OF_TWO * _TO_POWER_OF_TWO) > (1 + _ROUNDING) * support * trace
 
 
 @compiled()
@@ -159,7 +218,7 @@ def _covariance(m0, m1):
 
 
 @compiled()
-def _project_one(mean, quat, scale, logit, pose, intrinsics, near, value):
+def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
     """Fill one row of `Projection.values`; returns the outcome and the depth."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     width, height = intrinsics[4], intrinsics[5]
@@ -168,23 +227,24 @@ def _project_one(mean, quat, scale, logit, pose, intrinsics, near, value):
     z = pose[2, 0] * mean[0] + pose[2, 1] * mean[1] + pose[2, 2] * mean[2] + pose[2, 3]
     if z < near:
         return _NEAR, z
-    opacity = -math.log1p(math.exp(-np.float64(logit))) / math.log(
-        2.0
-    )  # log2 of the sigmoid, -inf for logits under -709
     support = opacity - _LOG2_ALPHA_MIN
     if support < 0:
         return _FAINT, z
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
     slope_x = min((width - cx) / fx + margin_x, max(-cx / fx - margin_x, x / z))
     slope_y = min((height - cy) / fy + margin_y, max(-cy / fy - margin_y, y / z))
+    row0 = _row(fx / z, slope_x, pose[0], pose[2])
+    row1 = _row(fy / z, slope_y, pose[1], pose[2])
+    u, v = fx * (x / z) + cx, fy * (y / z) + cy
+    if _surely_outside(u, width, row0, deviation, support) or _surely_outside(v, height, row1, deviation, support):
+        return _OUTSIDE, z
     rotation = _rotation(quat)
-    m0 = _factor_row(fx / z, slope_x, pose[0], pose[2], rotation, scale)
-    m1 = _factor_row(fy / z, slope_y, pose[1], pose[2], rotation, scale)
+    m0 = _factor_row(row0, rotation, deviation)
+    m1 = _factor_row(row1, rotation, deviation)
     p, q, r, det = _covariance(m0, m1)
     u_scale = _TO_POWER_OF_TWO * math.sqrt(r / det)
     reach = math.sqrt(support) / _TO_POWER_OF_TWO
     extent_x, extent_y = reach * math.sqrt(p), reach * math.sqrt(r)
-    u, v = fx * (x / z) + cx, fy * (y / z) + cy
     if not math.isfinite(u + v + q / r + u_scale + extent_x + extent_y + det):
         return _INVALID, z
     if np.ceil(u - extent_x - 0.5) > min(np.floor(u + extent_x - 0.5), width - 1) or u + extent_x < 0.5:
@@ -197,16 +257,42 @@ def _project_one(mean, quat, scale, logit, pose, intrinsics, near, value):
 
 
 @compiled(parallel=True)
-def _project_all(means, quats, scales, logits, pose, intrinsics, near, values, depths, outcomes):
-    for i in numba.prange(means.shape[0]):
-        outcomes[i], depths[i] = _project_one(
-            means[i], quats[i], scales[i], logits[i], pose, intrinsics, near, values[i]
-        )
+def _find_shapes(scales, logits, deviations, log2_opacities):
+    """See `Shapes`, of [N, 3] and [N] as files store them."""
+    for i in numba.prange(logits.size):
+        for axis in range(3):
+            deviations[i, axis] = math.exp(np.float64(scales[i, axis]))
+        log2_opacities[i] = -math.log1p(math.exp(-np.float64(logits[i]))) / math.log(2.0)  # log2 of the sigmoid
 
 
 @compiled(parallel=True)
-def _take_rows(values, order, out):
-    """values[order], on all cores."""
-    for rank in numba.prange(order.size):
+def _project_parts(
+    means, quats, deviations, opacities, pose, intrinsics, near, parts, threads, values, depths, gaussians, tallies
+):
+    """What is visible of each part, packed from its start on; how many of it ended in which outcome."""
+    for step in numba.prange(parts.size - 1):
+        part = step % _PARTS * threads + step // _PARTS  # so that every thread gets parts from all over the scene
+        place = parts[part]
+        for i in range(parts[part], parts[part + 1]):
+            outcome, depth = _project_one(
+                means[i], quats[i], deviations[i], opacities[i], pose, intrinsics, near, values[place]
+            )
+            tallies[part, outcome] += 1
+            if outcome == _VISIBLE:
+                depths[place], gaussians[place] = depth, i
+                place += 1
+
+
+@compiled(parallel=True)
+def take_rows(values, places, out) -> None:
+    """values[places] of [N, C] values, on all cores."""
+    for i in numba.prange(places.size):
         for column in range(values.shape[1]):
-            out[rank, column] = values[order[rank], column]
+            out[i, column] = values[places[i], column]
+
+
+@compiled(parallel=True)
+def take_places(values, places, out) -> None:
+    """values[places] of [N] values, on all cores."""
+    for i in numba.prange(places.size):
+        out[i] = values[places[i]]

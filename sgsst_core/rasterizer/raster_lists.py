@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import ALPHA_MIN, NEAR, RASTER_TILE
 from sgsst_core.errors import TooManyIntersectionsError
-from sgsst_core.rasterizer.projection import Projection, project
+from sgsst_core.rasterizer.projection import Outcome, Projection, Shapes, project, take_places, take_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -70,14 +70,19 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
     return -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
 
 
-def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> RasterLists:
+def build_raster_lists(
+    scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None
+) -> RasterLists:
     """Project, sort by depth, and list the Gaussians of every raster tile.
+
+    Args:
+        shapes: of the scene, from an earlier view.
 
     Raises:
         TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address or the free memory
             can hold; counted before anything of that size is allocated.
     """
-    projection = project(scene, camera, near=near)
+    projection = project(scene, camera, near=near, shapes=shapes)
     values, size = projection.values, (camera.width, camera.height)
     across, down = tile_grid(camera)
     counts = np.empty(len(values), dtype=np.int64)
@@ -97,6 +102,32 @@ def build_raster_lists(scene: Scene, camera: Camera, *, near: float = NEAR) -> R
     with kernel_threads():
         _fill_tiles(values, *size, parts, threads, first_slots, places, ranks, slots)
     return RasterLists(projection, starts, ranks, slots, first_slots)
+
+
+def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterLists:
+    """The lists of some of a scene's Gaussians, from those of all: the same arrays as `build_raster_lists` makes.
+
+    Args:
+        places: [N] int32, each Gaussian's index among them; -1 for the others. They keep their order.
+    """
+    projection = lists.projection
+    with kernel_threads():
+        gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
+        take_places(places, projection.gaussians, gaussians)
+        kept = gaussians >= 0
+        # Of every rank: its new one, -1 where it goes, and by how much its slots move.
+        ranks = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
+        first_slots = _starts(np.where(kept, np.diff(lists.first_slots), 0))
+        moves = (lists.first_slots - first_slots)[:-1]
+        counts = np.empty(len(lists.starts) - 1, dtype=np.int64)
+        _count_kept(lists.ranks, lists.starts, ranks, counts)
+        starts = _starts(counts)
+        values = np.empty((int(kept.sum()), projection.values.shape[1]))
+        take_rows(projection.values, np.flatnonzero(kept), values)
+        own_ranks, own_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
+        _take_kept(lists.ranks, lists.slots, lists.starts, ranks, moves, starts, own_ranks, own_slots)
+    own = Projection(gaussians[kept], values, {Outcome.VISIBLE: len(values)})
+    return RasterLists(own, starts, own_ranks, own_slots, np.append(first_slots[:-1][kept], first_slots[-1]))
 
 
 def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -201,3 +232,25 @@ def _fill_tiles(values, width, height, parts, threads, first_slots, places, rank
                     ranks[place], slots[place] = rank, slot
                     places[part, tile] = place + 1
                     slot += 1
+
+
+@compiled(parallel=True)
+def _count_kept(ranks, starts, new_ranks, counts):
+    """How many entries each tile keeps."""
+    for tile in numba.prange(starts.size - 1):
+        total = 0
+        for position in range(starts[tile], starts[tile + 1]):
+            total += new_ranks[ranks[position]] >= 0
+        counts[tile] = total
+
+
+@compiled(parallel=True)
+def _take_kept(ranks, slots, starts, new_ranks, moves, new_starts, out_ranks, out_slots):
+    """The entries that each tile keeps, with their new ranks and slots."""
+    for tile in numba.prange(starts.size - 1):
+        place = new_starts[tile]
+        for position in range(starts[tile], starts[tile + 1]):
+            rank = ranks[position]
+            if new_ranks[rank] >= 0:
+                out_ranks[place], out_slots[place] = new_ranks[rank], slots[position] - moves[rank]
+                place += 1

@@ -25,6 +25,7 @@ from sgsst_core.report.tables import (
     prediction_table,
 )
 from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
+from sgsst_core.stylizing.state import BEFORE_STEPS
 
 #: Members of a list that the folded part shows; the rest is counted.
 _LIST = 40
@@ -49,10 +50,13 @@ _PARTS = {
     "loss": "loss and pyramid",
     "checkpoint": "checkpoints",
     "measuring": "measuring, beside the steps",
-    "reading": "reading scene, cameras, style and photos",
+    "reading": "reading, before the steps",
+    "survey": "survey of the views, before the steps",
+    "planning": "planning, before the steps",
+    "preparing": "preparing the job, before the steps",
 }
 #: Parts of the time that are not the steps'.
-_BESIDE = ("checkpoint", "measuring", "reading")
+_BESIDE = ("checkpoint", "measuring", *BEFORE_STEPS)
 _ENVIRONMENT = Environment(
     loader=PackageLoader("sgsst_core.report"),
     autoescape=True,  # names of scenes, views and files are whatever users wrote

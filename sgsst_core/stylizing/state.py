@@ -9,6 +9,10 @@ from torch import Tensor
 
 from sgsst_core.loss.terms import LossTerms
 
+#: Parts of a job's time before its first step, as `seconds_by_part` names them: inputs, the look at every view, what
+#: else the plan is made from, and what is built for the steps.
+BEFORE_STEPS = ("reading", "survey", "planning", "preparing")
+
 
 @dataclass(frozen=True)
 class StepRecord:

@@ -14,7 +14,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES, device_peak, forget_device_peak
+from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.graphs import LossGraphs
@@ -41,7 +41,7 @@ from sgsst_core.stylizing.evaluation import (
 )
 from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
-from sgsst_core.stylizing.state import StepRecord, StylizerState
+from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import Views
@@ -176,22 +176,24 @@ class Stylizer:
     def _rasterizers(self, seen: Scene, workshop: Workshop | None) -> tuple[Rasterizer, CoarseRasterizer | None]:
         """The rasterizer that the plan names, and the one that keeps weights of the coarsest scale for phase 1."""
         plan, settings = self.plan, self.settings
-        # What was prepared for the whole scene names its Gaussians by their place in it.
-        whole = workshop.rasterizer if workshop and plan.seen.all() else None
-        if whole is not None and whole.name == plan.rasterizer:
-            return whole, None
+        name = plan.anew if plan.rasterizer == "cached" else plan.rasterizer
+        options = rasterizer_options(name, settings, self.memory)
+        whole = workshop.rasterizer if workshop else None
+        if whole is not None and whole.name == name and plan.seen.all():
+            anew = whole
+        elif isinstance(whole, CpuRasterizer) and whole.name == name:
+            anew = whole.of_subset(seen, plan.seen, max_list_bytes=options["max_list_bytes"])
+        else:  # what a GPU's prepared for the whole scene names its Gaussians by their place in it
+            anew = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
-            return make_rasterizer(
-                plan.rasterizer, seen, **rasterizer_options(plan.rasterizer, settings, self.memory)
-            ), None
-        options = rasterizer_options(plan.anew, settings, self.memory)
-        anew = whole if whole and whole.name == plan.anew else make_rasterizer(plan.anew, seen, **options)
+            return anew, None
         budget = int(self.memory * MEMORY_SHARES["rasterizer"])
         share = budget // 4 if plan.coarse_weights else 0
         cached = make_rasterizer(
             "cached",
             seen,
             max_bytes=budget - share,
+            least_list_bytes=self._least_list_bytes,
             precision="half" if plan.kept_weights == "half" else "float32",
             anew=anew,
         )
@@ -199,6 +201,12 @@ class Stylizer:
         if plan.coarse_weights and isinstance(anew, CpuRasterizer):
             coarse = CoarseRasterizer(anew, max_bytes=share)
         return cached, coarse
+
+    @property
+    def _least_list_bytes(self) -> int:
+        """For raster lists beside kept weights, of the memory for views."""
+        on_cpu = self.plan.rasterizer == "cached" and self.plan.anew == "cpu"
+        return self.memory // LISTS_BESIDE_WEIGHTS if on_cpu else 0
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
         plan, settings = self.plan, self.settings
@@ -210,7 +218,7 @@ class Stylizer:
             covered=list(plan.covered),
             weighted=plan.weighted,
             photos=self.photos,
-            memory=int(self.memory * MEMORY_SHARES["views"]),
+            memory=int(self.memory * MEMORY_SHARES["views"]) - self._least_list_bytes,
             keep_content="content" not in settings.keep,
             revive=settings.revive,
             regions=plan.survey.regions if plan.weighted else None,
@@ -477,5 +485,7 @@ class Stylizer:
         self._generator.set_state(state.generator)
         self._queue = list(state.queue)
         self.history = list(state.history)
-        self.seconds_by_part = dict(state.seconds_by_part)
+        own = {name: self.seconds_by_part[name] for name in BEFORE_STEPS if name in self.seconds_by_part}
+        earlier = state.seconds_by_part
+        self.seconds_by_part = {**earlier, **{name: earlier.get(name, 0.0) + own[name] for name in own}}
         self.measured = list(state.measured)

@@ -106,6 +106,23 @@ def test_planning_is_shown(request_: StylizeRequest) -> None:
     assert [progress.done for progress in told] == list(range(views + 1))
 
 
+def test_the_report_tells_the_parts_before_the_first_step(request_: StylizeRequest) -> None:
+    names = ("reading", "survey", "planning", "preparing")
+    first = prepare(request_)
+    before = dict(first.stylizer.seconds_by_part)
+    assert sorted(before) == sorted(names)
+    assert all(before[name] > 0 for name in names)
+    assert go_on(first, steps=3).stopped == "interrupted"
+    second = prepare(request_, resume=Resume(True))
+    own = dict(second.stylizer.seconds_by_part)
+    assert sorted(own) == ["preparing", "reading"], "the plan is the checkpoint's"
+    assert go_on(second).stopped == "finished"
+    report = json.loads(Path(request_.out).with_name("s.report.json").read_text())
+    for name in names:
+        assert report["seconds_by_part"][name] == pytest.approx(before[name] + own.get(name, 0.0), abs=0.002)
+    assert "survey of the views, before the steps" in Path(request_.out).with_name("s.report.html").read_text()
+
+
 def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: StylizeRequest) -> None:
     job = prepare(request_)
     go_on(job, steps=4, checkpoint_seconds=0)

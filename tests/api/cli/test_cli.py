@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import pty
+import re
 import shlex
 import shutil
 import signal
@@ -284,6 +286,42 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
     resumed = files.out.read_bytes()
     assert main(options) == 0
     assert files.out.read_bytes() == resumed
+
+
+@pytest.mark.parametrize("command", ["plan", "stylize"])
+def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, command: str) -> None:
+    """On a terminal, whose bar tells when the views are looked at; of so many that the signal comes in between."""
+    views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")
+    inputs = [str(files.ply), "--style", str(files.style), "--orbit", str(views), "--backbone", "vgg16"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
+    ours, theirs = pty.openpty()
+    arguments = [sys.executable, "-m", "api.cli", command, *inputs, "--out", str(out)]
+    with subprocess.Popen(
+        arguments, stdout=theirs, stderr=theirs, env=environment, cwd=files.ply.parent, start_new_session=True
+    ) as process:
+        os.close(theirs)
+        shown = _shown_until(ours, rf"Looking at the views.* [1-9]\d*/{views}")
+        process.send_signal(signal.SIGINT)
+        shown += _shown_until(ours, None)
+        assert process.wait(timeout=60) == 130, shown
+    os.close(ours)
+    assert max(int(count) for count in re.findall(rf"(\d+)/{views}", shown)) < views
+    assert "Traceback" not in shown
+    assert not files.out.parent.exists() or not list(files.out.parent.iterdir())
+
+
+def _shown_until(terminal: int, pattern: str | None) -> str:
+    """What a program writes to its terminal until a pattern comes; until it ends with None."""
+    shown = ""
+    while pattern is None or not re.search(pattern, shown):
+        try:
+            found = os.read(terminal, 4096)
+        except OSError:  # the other end is closed
+            break
+        if not found:
+            break
+        shown += found.decode(errors="replace")
+    return shown
 
 
 def test_time_budget_writes_the_result_and_keeps_the_checkpoint(

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from sgsst_core.bench.error_time import choose_variants
-from sgsst_core.bench.quality import TRANSFER, UNSTYLIZED, Quality, compare_quality, write_plot, write_sheet
+from sgsst_core.bench.quality import TRANSFER, UNSTYLIZED, Outcome, Quality, compare_quality, write_plot, write_sheet
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from tests.small_scenes import cameras, style, wall
@@ -46,7 +46,7 @@ def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> N
 
 
 def test_the_front_holds_what_nothing_beats_in_style_and_content(quality: Quality) -> None:
-    def outcome(name: str, style: float, content: float) -> object:
+    def outcome(name: str, style: float, content: float) -> Outcome:
         judgement = replace(quality.outcomes[0].judgement, style=style, content=content)
         return replace(quality.outcomes[0], name=name, judgement=judgement)
 

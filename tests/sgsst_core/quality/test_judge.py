@@ -20,6 +20,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colours
+from sgsst_core.scene.stored_harmonics import held
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,7 +46,7 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple
     """Style on black and on white, palette, content and features of one view, by loops over layers and positions."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
-    rest = reference_rest_colours(scene.sh_rest, scene.means, camera, scene.sh_degree).double()
+    rest = reference_rest_colours(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
     coverage = rasterizer.coverage(camera).double()
     styles, palettes, contents, turns = [], [], [], []
     for behind in (0.0, 1.0):

@@ -9,12 +9,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.depth_order import depth_order
 from sgsst_core.rasterizer.projection import project
-from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
+from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists, lists_of_subset
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from tests.sgsst_core.splat_scenes import camera, cloud
+from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 _RANDOM = np.random.default_rng(0)
 DEPTHS: dict[str, NDArray[np.float64]] = {
@@ -86,3 +87,53 @@ def test_lists_are_those_of_one_gaussian_after_the_other(count: int, threads: No
     assert np.array_equal(np.diff(lists.starts), [len(tile) for tile in expected])
     assert lists.ranks.tolist() == [rank for tile in expected for rank in tile]
     check_slots(lists)
+
+
+def check_same(found: RasterLists, expected: RasterLists) -> None:
+    """The same bits in every array."""
+    for name in ("starts", "ranks", "slots", "first_slots"):
+        own, other = getattr(found, name), getattr(expected, name)
+        assert own.dtype == other.dtype
+        assert np.array_equal(own, other), name
+    assert np.array_equal(found.projection.gaussians, expected.projection.gaussians)
+    assert np.array_equal(found.projection.values, expected.projection.values)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.6, 1.0])
+def test_lists_of_some_gaussians_are_those_that_would_be_built(share: float, threads: None) -> None:
+    scene, view = cloud(900, seed=33), camera(97, 61)
+    scene.scales[:10] += 4
+    chosen = torch.rand(900, generator=torch.Generator().manual_seed(1)) < share
+    places = torch.where(chosen, chosen.cumsum(0) - 1, -1).to(torch.int32).numpy()
+    found = lists_of_subset(build_raster_lists(scene, view), places)
+    check_same(found, build_raster_lists(scene.subset(chosen), view))
+
+
+def test_lists_are_handed_on_once_and_stay_within_the_budget() -> None:
+    scene = cloud(600, seed=34)
+    views = [camera(97, 61, pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
+    chosen = torch.arange(600) % 4 > 0
+    sizes = [build_raster_lists(scene, view).nbytes for view in views]
+    whole = CpuRasterizer(scene, max_list_bytes=sum(sizes[:3]))
+    for view in views:
+        whole.lists(view)
+    budget = sum(sizes[:3])
+    part = whole.of_subset(scene.subset(chosen), chosen, max_list_bytes=budget)
+    assert [part.has_lists(view) for view in views] == [True, True, True, False]
+    for done, view in enumerate(views):
+        check_same(part.lists(view), build_raster_lists(scene.subset(chosen), view))
+        assert part._lists.kept_bytes <= budget
+        assert not whole.has_lists(view)
+        assert [whole.has_lists(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
+    assert part.lists(views[1]) is part.lists(views[1])
+    with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
+        whole.of_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool))
+
+
+def test_lists_beyond_a_new_limit_are_let_go_the_last_ones_first() -> None:
+    scene = cloud(300, seed=35)
+    views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    cpu = CpuRasterizer(scene)
+    sizes = [cpu.lists(view).nbytes for view in views]
+    cpu.let_go_of_lists(views[0], sizes[1])
+    assert [cpu.has_lists(view) for view in views] == [False, True, False]

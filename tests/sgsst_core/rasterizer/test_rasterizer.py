@@ -361,6 +361,23 @@ def test_lists_beyond_the_budget_are_held_one_at_a_time() -> None:
     assert cpu.lists(views[1]) is not kept[1]
 
 
+def test_weights_and_lists_share_a_budget() -> None:
+    scene = cloud(800, seed=20)
+    views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
+    colours = colours_of(scene)
+    weights = [CachedRasterizer(scene).operator_bytes(view) for view in views]
+    lists = [CpuRasterizer(scene).lists(view).nbytes for view in views]
+    cpu = CpuRasterizer(scene, max_list_bytes=sum(weights[:2]) + lists[2])
+    kept = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + lists[2], anew=cpu)
+    for view in views:
+        cpu.lists(view)
+    for view in views:
+        kept.render(colours, view)
+    assert [kept.is_kept(view) for view in views] == [True, True, False, False]
+    assert [cpu.has_lists(view) for view in views] == [False, False, True, False]
+    assert kept.kept_bytes + cpu._lists.kept_bytes <= sum(weights[:2]) + lists[2]
+
+
 def test_arguments_are_checked_before_any_work() -> None:
     scene, view = cloud(10), camera()
     for name in ("reference", *FAST):

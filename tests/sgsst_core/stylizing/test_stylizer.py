@@ -13,7 +13,9 @@ import torch
 from sgsst_core import stylize
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.scene.camera import fit_cameras, resized
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
+from sgsst_core.scene.camera import Camera, fit_cameras, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
@@ -48,6 +50,33 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
     assert torch.equal(first.sh_dc, second.sh_dc)
     assert [record.loss for record in first.history] == [record.loss for record in second.history]
     assert not torch.equal(first.sh_dc, other.sh_dc)
+
+
+@pytest.mark.parametrize("kept_weights", ["none", "float32"])
+def test_raster_lists_of_the_survey_are_not_built_again(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, kept_weights: str
+) -> None:
+    """They are cut down to what the views see, with the same bits as lists that are built for it."""
+    built: list[int] = []
+
+    def build(scene: Scene, camera: Camera, **options: Any) -> RasterLists:
+        built.append(len(scene))
+        return build_raster_lists(scene, camera, **options)
+
+    monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_raster_lists", build)
+    scene, views = ball(), cameras(3)
+    scene.means[-10:, 2] *= -1  # behind the cameras
+    settings = make_settings(steps_sos=6, kept_weights=kept_weights)
+    plan, workshop = make_plan(scene, views, settings, weights=tiny_weights)
+    assert not plan.seen.all()
+    assert plan.kept_weights == kept_weights
+    results = []
+    for given in (workshop, None):
+        stylizer = Stylizer(plan, scene, views, style(), settings, weights=tiny_weights, workshop=given)
+        run(stylizer)
+        results.append(stylizer.stylized())
+    assert built == [len(scene)] * 3 + [int(plan.seen.sum())] * 3
+    assert torch.equal(*results)
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
