@@ -2,8 +2,8 @@
 
 python -m benchmarks.large_views SCENE.ply CAMERAS STYLE [--sizes 5187x3361 8192x5460] [--steps 10] [--memory 10]
 
-CAMERAS is a camera file, or orbit:N. Each size runs in a process of its own, so that peaks do not mix. A size whose steps
-do not end in time (--seconds) counts with those that did; what it has is stored after every step.
+CAMERAS is a camera file, or orbit:N. Each size runs in a process of its own, so that peaks do not mix. Of a size whose
+steps do not end in time (--seconds), those that did count.
 """
 
 from __future__ import annotations

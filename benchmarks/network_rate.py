@@ -12,6 +12,7 @@ import argparse
 import resource
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -39,7 +40,10 @@ def main() -> None:
     results = {name: _measure(weights, name, arguments.size, arguments.repeats) for name in arguments.precisions}
     for name, row in results.items():
         alone, network = row["convolutions_gflops"], row["network_gflops"]
-        print(f"{name}: {network:.0f} of {alone:.0f} GFLOP/s ({row['share']:.0%}), {row['page_faults']} page faults;", end=" ")
+        print(
+            f"{name}: {network:.0f} of {alone:.0f} GFLOP/s ({row['share']:.0%}), {row['page_faults']} page faults;",
+            end=" ",
+        )
         print(", ".join(f"{part} {seconds:.3f} s" for part, seconds in row["seconds"].items()))
     write_result("network_rate", {"size": arguments.size, "backbone": weights.name, "precisions": results})
 
@@ -79,8 +83,8 @@ def _convolutions_alone(weights: BackboneWeights, dtype: torch.dtype, size: int,
         forward = weight.to(dtype).contiguous(memory_format=torch.channels_last)
         backward = weight.to(dtype).transpose(0, 1).flip(2, 3).contiguous(memory_format=torch.channels_last)
         x, gradient = _random(into, side, dtype), _random(out, side, dtype)
-        seconds += _best(lambda x=x, w=forward, b=bias.to(dtype): F.conv2d(x, w, b, padding=1), repeats)  # type: ignore[misc]
-        seconds += _best(lambda g=gradient, w=backward: F.conv2d(g, w, padding=1), repeats)  # type: ignore[misc]
+        seconds += _best(partial(F.conv2d, x, forward, bias.to(dtype), padding=1), repeats)
+        seconds += _best(partial(F.conv2d, gradient, backward, padding=1), repeats)
         operations += 2 * 2 * 9 * into * out * side**2
         if name == _DEEPEST:
             break

@@ -132,7 +132,7 @@ def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
 
     Exactly the value of a channel that is constant.
     """
-    height, width, channels = features.shape
+    height, width = features.shape[:2]
     positions = height * width
     count = min(positions, _SHIFT_POSITIONS)
     # Spread evenly along the rows' order, so that their columns differ whatever the width.
