@@ -19,7 +19,8 @@ _INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 def max_pool(source: Tensor) -> Tensor:
     """Maxima [1, c, h // 2, w // 2] of 2x2 windows of a ReLU's output [1, c, h, w], both channels last."""
     if not _is_compiled_for(source):
-        return F.max_pool2d(source, 2, return_indices=True)[0]
+        pooled: Tensor = F.max_pool2d(source, 2, return_indices=True)[0]
+        return pooled
     from sgsst_core.compiled import kernel_threads
     from sgsst_core.features import pooling_kernels as kernels
 
@@ -59,7 +60,8 @@ def max_pool_backward_reference(gradient: Tensor, source: Tensor) -> Tensor:
 
 def max_positions(source: Tensor) -> Tensor:
     """Place of the first of each window's maxima in its plane, [1, c, h // 2, w // 2] int64."""
-    return F.max_pool2d(source, 2, return_indices=True)[1]
+    positions: Tensor = F.max_pool2d(source, 2, return_indices=True)[1]
+    return positions
 
 
 def relu_backward(gradient: Tensor, output: Tensor) -> Tensor:
