@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,10 @@ if TYPE_CHECKING:
     from sgsst_core.settings import Settings, make_settings
     from sgsst_core.stylizing.loop import Callbacks, Progress, run, stylize
     from sgsst_core.stylizing.stylizer import Stylizer
+
+# PyTorch looks at it once, before its first tensor: memory of two megabytes and more in pages of that size, of which a
+# step on a CPU then takes a few thousand and not millions. Linux grants them where it can; elsewhere it does nothing.
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 __all__ = ["Callbacks", "Camera", "Progress", "Scene", "Settings", "Stylizer", "make_settings", "run", "stylize"]
 

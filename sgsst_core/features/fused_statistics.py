@@ -12,7 +12,7 @@ from torch import Tensor
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.scene.spherical_harmonics import triton_runs_on
 
-#: Entries that are summed in float32 before float64 takes over, for each channel: as `statistics.CHUNK_VALUES`.
+#: Entries that are summed in float32 before float64 takes over, for each channel.
 SPAN_VALUES = 1 << 20
 #: Rows of features that the shift is the mean of, at least.
 _SHIFT_ROWS = 64

@@ -4,22 +4,30 @@ A layer's features F [n, c] are summarised by (count, mean, C) with C = sum_p a_
 Gram matrix and standard deviation both follow from it: G = C / n + mean mean^T, sigma = sqrt(diag(C) / n).
 The reverse, sigma^2 = diag(G) - mean^2, cancels: at a mean-to-sigma ratio of a few thousand no digit is left in
 float32 and the root is taken of a negative number. Features are centred before they are multiplied (in their own
-precision, chunk by chunk) and everything is merged in float64 by the pairwise update of Chan, Golub and LeVeque,
+precision, block by block) and everything is merged in float64 by the pairwise update of Chan, Golub and LeVeque,
 "Updating Formulae and a Pairwise Algorithm for Computing Sample Variances" (1979).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 
 import torch
 from torch import Tensor
 
-#: Entries multiplied in one GEMM: small enough that a centred chunk of 64..512 channels stays in cache and that
-#: a float32 sum over it keeps six digits whatever the size of the tile.
-CHUNK_VALUES = 1 << 21
+#: Values of a block: what is centred stays in a processor's cache until it has been multiplied.
+BLOCK_VALUES = 1 << 18
+#: Positions that are summed in the features' precision before float64 takes over: a float32 sum over so few keeps six
+#: digits whatever the size of the tile.
+SPAN_POSITIONS = 1 << 12
+#: Values of a block on a GPU, which has no such cache, and does better with few launches.
+_GPU_BLOCK_VALUES = 1 << 21
+#: Positions that the shift is the mean of, at least, where there are as many.
+_SHIFT_POSITIONS = 1024
+#: How many standard deviations a channel's mean may lie from the shift: the square of it is what cancels.
+_FAR = 8.0
 
 
 @dataclass(frozen=True)
@@ -87,47 +95,133 @@ def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
 def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """Statistics of features [h, w, c], with optional position weights [h, w] >= 0.
 
-    The GEMM runs in the features' precision (float32 for half-precision features) on centred chunks; sums over
-    chunks are kept in float64.
+    Products run in the features' precision (float32 for half-precision features) on centred blocks; sums over spans of
+    blocks are kept in float64. Blocks are centred at the mean of some positions. Should it turn out to lie far from
+    that of all of them, which on a GPU would be waited for, they are gone through again with the right one.
     """
     height, width, channels = features.shape
     if height * width == 0:
         return LayerStatistics.zero(channels, features.device)
     precision = torch.promote_types(features.dtype, torch.float32)
-    shift = features.to(precision).mean(dim=(0, 1)) if features.dtype != precision else features.mean(dim=(0, 1))
-    total = _ShiftedSums(channels, features.device)
-    rows = max(1, CHUNK_VALUES // (width * channels))
-    for top in range(0, height, rows):
-        centred = (features[top : top + rows].to(precision) - shift).reshape(-1, channels)
-        chunk = None if position_weights is None else position_weights[top : top + rows].reshape(-1).to(precision)
-        total.add(centred, chunk)
-    return total.statistics(shift.double())
+    on_cpu = features.device.type == "cpu"
+    shift = _shift(features, position_weights) if on_cpu else features.to(precision).mean(dim=(0, 1))
+    found = _statistics_about(shift, features, position_weights)
+    if on_cpu and _is_far(shift, found):
+        found = _statistics_about(found.mean.to(precision), features, position_weights)
+    return found
+
+
+def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """Rows of features [h, w, c] that make a block, and a buffer [rows, w, c] for them in float32 at least.
+
+    The buffer is the same for all blocks.
+    """
+    height, width, channels = features.shape
+    on_cpu = features.device.type == "cpu"
+    values = min(BLOCK_VALUES, SPAN_POSITIONS * channels) if on_cpu else _GPU_BLOCK_VALUES
+    rows = min(max(1, values // max(width * channels, 1)), height)
+    precision = torch.promote_types(features.dtype, torch.float32)
+    buffer = torch.empty((rows, width, channels), dtype=precision, device=features.device)
+    for top in range(0, height, max(rows, 1)):
+        part = slice(top, min(top + rows, height))
+        yield part, buffer[: part.stop - top]
+
+
+def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
+    """Near the mean [c], in float32 at least: that of some positions, or of those of them that have a weight.
+
+    Exactly the value of a channel that is constant.
+    """
+    height, width = features.shape[:2]
+    positions = height * width
+    count = min(positions, _SHIFT_POSITIONS)
+    # Spread evenly along the rows' order, so that their columns differ whatever the width.
+    places = torch.arange(count) * positions // count
+    row, column = places // width, places % width
+    some = features[row, column]
+    if position_weights is not None:
+        weighted = position_weights[row, column] > 0
+        if weighted.any():
+            some = some[weighted]
+    return some.mean(dim=0, dtype=torch.float64).to(torch.promote_types(features.dtype, torch.float32))
+
+
+def _is_far(shift: Tensor, found: LayerStatistics) -> bool:
+    """Whether digits cancelled as the shift was taken out of sums about it. Waits for the device."""
+    offset = (found.mean - shift).abs()
+    rounding = torch.finfo(shift.dtype).eps * shift.abs()
+    return bool(((offset > _FAR * found.std()) & (offset > _FAR * rounding)).any())
+
+
+def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor | None) -> LayerStatistics:
+    """Statistics from sums about a shift [c]."""
+    channels = features.shape[-1]
+    total = _ShiftedSums(channels, shift)
+    for rows, block in blocks_of(features):
+        centred = centre(features[rows], shift, block).reshape(-1, channels)
+        weights = None if position_weights is None else position_weights[rows].reshape(-1).to(shift.dtype)
+        total.add(centred, weights)
+    return total.statistics()
+
+
+def centre(features: Tensor, mean: Tensor, out: Tensor) -> Tensor:
+    """Features [n, w, c] less a mean [c], in the precision of `out` [n, w, c], which is returned."""
+    if features.dtype == out.dtype:
+        return torch.sub(features, mean, out=out)
+    return out.copy_(features).sub_(mean)
 
 
 class _ShiftedSums:
-    """Float64 sums about a shift that lies near the mean, so that taking the mean out afterwards cancels nothing."""
+    """Sums about a shift that lies near the mean, so that taking the mean out afterwards cancels nothing.
 
-    def __init__(self, channels: int, device: torch.device) -> None:
-        self.count = torch.zeros((), dtype=torch.float64, device=device)
-        self.first = torch.zeros(channels, dtype=torch.float64, device=device)
-        self.second = torch.zeros((channels, channels), dtype=torch.float64, device=device)
+    They are added up in the shift's precision over a span, and in float64 over spans.
+    """
+
+    def __init__(self, channels: int, shift: Tensor) -> None:
+        self.shift = shift
+        self.total = LayerStatistics.zero(channels, shift.device)
+        self._first = torch.zeros_like(shift)
+        self._second = shift.new_zeros((channels, channels))
+        #: Channels whose products with themselves and all later ones are computed at a time. What lies below the
+        #: diagonal is left out, but for the blocks on it.
+        self._strip = max(32, channels // 8) if shift.device.type == "cpu" else channels
+        self._positions = 0
 
     def add(self, centred: Tensor, position_weights: Tensor | None) -> None:
-        """Add positions centred [n, c] with their weights [n]."""
+        """Add positions centred [n, c], which are overwritten, with their weights [n]."""
         if position_weights is None:
-            self.count += centred.shape[0]
-            weighted = centred
+            self.total.count.add_(centred.shape[0])
+            roots = centred.new_ones(centred.shape[0])
         else:
-            self.count += position_weights.double().sum()
-            weighted = centred * position_weights[:, None]
-        self.first += weighted.sum(dim=0, dtype=torch.float64)
-        self.second += weighted.T @ centred
+            self.total.count.add_(position_weights.sum(dtype=torch.float64))
+            # With the roots of the weights in both factors, the product is symmetric, and half of it is enough.
+            roots = position_weights.sqrt()
+            centred *= roots[:, None]
+        self._first.addmv_(centred.T, roots)
+        for left in range(0, centred.shape[1], self._strip):
+            strip = slice(left, left + self._strip)
+            self._second[strip, left:].addmm_(centred[:, strip].T, centred[:, left:])
+        self._positions += len(centred)
+        if self._positions >= SPAN_POSITIONS:
+            self._end_span()
 
-    def statistics(self, shift: Tensor) -> LayerStatistics:
-        some = self.count > 0
-        offset = self.first / torch.where(some, self.count, 1.0)
-        mean = torch.where(some, shift + offset, 0.0)
-        return LayerStatistics(self.count, mean, self.second - torch.outer(offset, offset) * self.count)
+    def _end_span(self) -> None:
+        self.total.mean.add_(self._first)
+        self.total.centred.add_(self._second)
+        self._first.zero_()
+        self._second.zero_()
+        self._positions = 0
+
+    def statistics(self) -> LayerStatistics:
+        """Of everything that was added."""
+        self._end_span()
+        count, first = self.total.count, self.total.mean
+        some = count > 0
+        offset = first / torch.where(some, count, 1.0)
+        mean = torch.where(some, self.shift.double() + offset, 0.0)
+        upper = self.total.centred.triu()
+        second = upper + upper.triu(1).T
+        return LayerStatistics(count, mean, second - torch.outer(offset, offset) * count)
 
 
 def layer_statistics_reference(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
 
 #: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
@@ -72,14 +74,19 @@ class Activations:
 
     Attributes:
         features: layer name to [h, w, c] in the network's dtype (a view in NHWC order).
-        outputs: for each step, the ReLU's output, or the positions of a pool's maxima, [1, c, h, w]; nothing, [0],
-            for a pool whose positions are found again.
+        outputs: for each step, the ReLU's output [1, c, h, w]; nothing, [0], for a pool, the positions of whose maxima
+            are found again.
         size: (height, width) of the pixels that went in.
     """
 
     features: dict[str, Tensor]
     outputs: list[Tensor] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
+
+    def decisions(self) -> list[Tensor]:
+        """What the backward pass takes from each step: where a ReLU lets through, where a pool's maxima are."""
+        pairs = pairwise([*self.outputs[:1], *self.outputs])
+        return [output > 0 if output.numel() else max_positions(source) for source, output in pairs]
 
 
 def use_whole_float32() -> None:
@@ -157,8 +164,6 @@ class FeatureNetwork:
         self.precision = "tf32" if tf32 else str(dtype).removeprefix("torch.")
         self.search = False
         self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
-        #: A CPU takes longer to find positions of maxima again than to keep them; a GPU has less memory than speed.
-        self._keeps_positions = self.device.type == "cpu"
         self.halo = HALO[weights.name]
         # The normalisation stays in at least float32: in bfloat16, 255 grey levels would lose their last bits twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
@@ -235,9 +240,9 @@ class FeatureNetwork:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
                     break
-                x, positions = F.max_pool2d(x, 2, return_indices=True)
+                x = max_pool(x)
                 if keep:
-                    kept.outputs.append(positions if self._keeps_positions else positions.new_empty(0))
+                    kept.outputs.append(x.new_empty(0))
                 continue
             x = self._convolve(x, step)
             if keep:
@@ -276,48 +281,36 @@ class FeatureNetwork:
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
         """Gradient [1, 3, h, w] with respect to what went into the first step; None where no layer has one."""
         gradient: Tensor | None = None  # [1, c, h, w]
+        masked = False  # 0 already where the ReLU's output is
         steps = self._steps[: len(kept.outputs)]
         for step in reversed(steps):
             output = kept.outputs.pop()
             if isinstance(step, _Pool):
-                gradient = self._pool_backward(gradient, output, kept)
+                if gradient is not None:
+                    gradient, masked = max_pool_backward(gradient, kept.outputs[-1]), True
                 continue
             features = kept.features.pop(step.layer, None)
             if features is not None and features.numel():
                 gradient = torch.zeros_like(output) if gradient is None else gradient
                 feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0))
+                masked = False
             if gradient is not None:
-                gradient = torch.ops.aten.threshold_backward(gradient, output, 0)
-                gradient = self._convolve_back(gradient, step)
+                gradient = gradient if masked else relu_backward(gradient, output)
+                gradient, masked = self._convolve_back(gradient, step), False
         return gradient
-
-    @staticmethod
-    def _pool_backward(gradient: Tensor | None, positions: Tensor, kept: Activations) -> Tensor | None:
-        if gradient is None:
-            return None
-        source = kept.outputs[-1]  # the ReLU output that was pooled
-        if not positions.numel():
-            positions = F.max_pool2d(source, 2, return_indices=True)[1]
-        spread: Tensor = torch.ops.aten.max_pool2d_with_indices_backward(
-            gradient, source, [2, 2], [2, 2], [0, 0], [1, 1], False, positions
-        )
-        return spread
 
     def held_bytes_per_pixel(self) -> float:
         """Bytes that a forward pass keeps for each pixel until `backward` has used them.
 
-        Counted from the layers: a ReLU output of c channels at stride k holds c/k^2 values a pixel, a pool on a CPU one
-        int64 position for each of its outputs.
+        Counted from the layers: a ReLU output of c channels at stride k holds c/k^2 values a pixel.
         """
         size = torch.finfo(self.dtype).bits // 8
-        held, stride, channels = 0.0, 1, 3
+        held, stride = 0.0, 1
         for step in self._steps:
             if isinstance(step, _Pool):
                 stride *= 2
-                held += 8 * channels / stride**2 if self._keeps_positions else 0
             else:
-                channels = int(step.weight.shape[0])
-                held += size * channels / stride**2
+                held += size * int(step.weight.shape[0]) / stride**2
         return held
 
     def working_bytes_per_pixel(self) -> float:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.fused_statistics import can_be_fused, has_kernels
-from sgsst_core.features.statistics import CHUNK_VALUES, LayerStatistics
+from sgsst_core.features.statistics import LayerStatistics, blocks_of, centre
 from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 
 #: What the loss of a scale is the sum of: names, as files and reports have them, to what people read. The order is that
@@ -116,20 +116,22 @@ class StyleGradient:
         return result
 
     def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
-        """Add `apply` to a gradient [h, w, c] in place, chunk by chunk: nothing as large as the features is made."""
+        """Add `apply` to a gradient [h, w, c] in place, block by block: nothing as large as the features is made."""
         if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
             fused_add_style_gradient(gradient, features, self.matrix, self.mean, self.offset, position_weights)
             return
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
-        height, width, channels = features.shape
-        rows = max(1, CHUNK_VALUES // max(width * channels, 1))
-        for top in range(0, height, rows):
-            centred = features[top : top + rows].to(precision) - mean
-            part = torch.addmm(offset, centred.reshape(-1, channels), matrix).view(centred.shape)
+        for rows, block in blocks_of(features):
+            centred, target = centre(features[rows], mean, block).view(-1, len(mean)), gradient[rows]
+            weights = centred.new_ones(1) if position_weights is None else position_weights[rows].reshape(-1)
+            weights = weights.to(precision).expand(len(centred))
             if position_weights is not None:
-                part = part.mul_(position_weights[top : top + rows, :, None].to(precision))
-            gradient[top : top + rows] += part
+                centred *= weights[:, None]
+            if target.dtype == precision and target.is_contiguous():
+                target.view(centred.shape).addmm_(centred, matrix).addr_(weights, offset)
+            else:
+                target += torch.addr(centred @ matrix, weights, offset).view(target.shape)
 
 
 def style_loss(

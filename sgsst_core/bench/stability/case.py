@@ -225,10 +225,9 @@ class DecisionsOf(FeatureNetwork):
         """As `FeatureNetwork.forward`, with the other network's decisions kept for `backward`."""
         own = super().forward(rgb, keep=keep)
         theirs = self.other.forward(rgb, keep=keep)
-        for mine, other in zip(own.outputs, theirs.outputs, strict=True):
-            same = mine == other if mine.dtype == torch.int64 else (mine > 0) == (other > 0)
-            self.flips += int((~same).sum())
-        own.outputs = [output if output.dtype == torch.int64 else output.double() for output in theirs.outputs]
+        for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
+            self.flips += int((mine != other).sum())
+        own.outputs = [output.double() for output in theirs.outputs]
         return own
 
 

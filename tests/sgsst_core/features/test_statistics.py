@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 
 from sgsst_core.features.statistics import (
     LayerStatistics,
+    _is_far,
+    _shift,
     layer_statistics,
     layer_statistics_reference,
     merge,
@@ -79,3 +81,56 @@ def test_no_positions_and_no_weight_are_the_neutral_element():
 def test_half_precision_features_are_summed_in_float32():
     x = features(200, 200, 8, ratio=3).to(torch.bfloat16)
     assert_equal(layer_statistics(x), layer_statistics_reference(x), 1e-5)
+
+
+def test_a_shift_that_lies_far_from_the_mean_is_replaced():
+    """Every place that the sample looks at is an outlier: about it, three digits of the variance would cancel."""
+    x = features(1024, 1000, 2, dtype=torch.float32)
+    x[:, 0] = 1e3
+    shift = _shift(x, None)
+    assert shift.tolist() == [1e3, 1e3]
+    assert _is_far(shift, layer_statistics(x))
+    assert_equal(layer_statistics(x), layer_statistics_reference(x), 1e-5)
+
+
+@pytest.mark.parametrize("height", [40, 700])
+def test_shift_of_a_small_covered_part(height):
+    """Uncovered features far away from covered ones, which a sample of all positions would hardly hold."""
+    x = features(height, 50, 8, dtype=torch.float32)
+    covered = torch.zeros(x.shape[:2])
+    covered[7:9, 11:14] = 0.5
+    x[covered == 0] += 1e5
+    found, expected = layer_statistics(x, covered), layer_statistics_reference(x, covered)
+    assert_equal(found, expected, 1e-5)
+
+
+def test_constant_channels_of_any_value_and_weight():
+    generator = torch.Generator().manual_seed(2)
+    x = (torch.rand((1, 1, 64), generator=generator) * 10 ** torch.arange(-20, 12, 0.5)).expand(130, 70, 64)
+    some = torch.rand((130, 70), generator=generator)
+    for weights in (None, some, (some > 0.99).float()):
+        found = layer_statistics(x, weights)
+        assert not found.std().any()
+        torch.testing.assert_close(found.mean, x[0, 0].double(), rtol=0, atol=0)
+
+
+def test_tiny_weights_do_not_vanish():
+    x = features(dtype=torch.float32)
+    whole, tiny = layer_statistics(x), layer_statistics(x, torch.full(x.shape[:2], 1e-35))
+    torch.testing.assert_close(tiny.std(), whole.std(), rtol=1e-5, atol=0)
+    torch.testing.assert_close(tiny.mean, whole.mean, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 31, 33, 100, 512])
+@pytest.mark.parametrize("width", [1, 7, 4099])
+def test_blocks_and_strips_of_any_shape(channels, width):
+    x = features(3 if width > 7 else 70, width, channels, dtype=torch.float32)
+    a = torch.rand(x.shape[:2], generator=torch.Generator().manual_seed(1))
+    assert_equal(layer_statistics(x, a), layer_statistics_reference(x, a), 2e-5)
+
+
+def test_statistics_of_a_slice_are_those_of_a_copy():
+    x = features(60, 70, 24, dtype=torch.float32)[5:50, 3:40]
+    found, expected = layer_statistics(x), layer_statistics(x.clone())
+    assert torch.equal(found.centred, expected.centred)
+    assert torch.equal(found.mean, expected.mean)

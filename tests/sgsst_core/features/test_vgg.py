@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sgsst_core.features import vgg
+from sgsst_core.features import pooling, vgg
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
 
@@ -67,20 +67,6 @@ def test_every_convolution_has_channels_last(tiny_weights: BackboneWeights, dtyp
     count = sum(isinstance(step, vgg._Convolution) for step in network._steps)
     assert len(network.layouts) == 6 * count
     assert all(network.layouts)
-
-
-def test_positions_that_are_found_again_are_those_that_were_kept(tiny_weights: BackboneWeights) -> None:
-    """As on a GPU; a picture of few grey levels has equal maxima."""
-    kept, again = FeatureNetwork(tiny_weights), FeatureNetwork(tiny_weights)
-    again._keeps_positions = False
-    for image in (picture(), picture().mul(2).round()):
-        gradients = []
-        for network in (kept, again):
-            activations = network.forward(image)
-            assert any(not output.numel() for output in activations.outputs) is (network is again)
-            gradients.append(network.backward(activations, add))
-        assert torch.equal(*gradients)
-    assert again.held_bytes_per_pixel() < kept.held_bytes_per_pixel()
 
 
 # --- what holds around the passes on a GPU -------------------------------------------------------------------------
@@ -259,10 +245,10 @@ class Launches(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights) -> None:
+def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     """One for a convolution with its ReLU, one for a pool; backward two for each."""
     network = FeatureNetwork(tiny_weights, tf32=True)
-    network._keeps_positions = False
+    monkeypatch.setattr(pooling, "_is_compiled_for", lambda values: False)
     pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
     convolved, image = len(network._steps) - pools, picture()
     with operator_on_cpu(fused):

@@ -93,11 +93,10 @@ class DecisionsOf(FeatureNetwork):
     def forward(self, rgb, *, keep=True) -> Activations:
         own = super().forward(rgb, keep=keep)
         theirs = self.other.forward(rgb.float(), keep=keep)
-        for mine, other in zip(own.outputs, theirs.outputs, strict=True):
-            same = mine == other if mine.dtype == torch.int64 else (mine > 0) == (other > 0)
-            self.flips += int((~same).sum())
-            self.decisions += same.numel()
-        own.outputs = [output if output.dtype == torch.int64 else output.double() for output in theirs.outputs]
+        for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
+            self.flips += int((mine != other).sum())
+            self.decisions += mine.numel()
+        own.outputs = [output.double() for output in theirs.outputs]
         return own
 
 

@@ -11,6 +11,7 @@ from sgsst_core.loss.terms import (
     ContentDifference,
     LayerTarget,
     LossTerms,
+    StyleGradient,
     style_loss,
 )
 from tests.sgsst_core.pictures import relative_error
@@ -122,3 +123,23 @@ def test_a_term_that_is_not_declared_is_refused():
         LossTerms(colour=1.0)
     with pytest.raises(KeyError):
         LossTerms()["colour"]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("columns", [slice(None), slice(3, 120)])
+def test_style_gradient_is_added_block_by_block(dtype, weighted, columns):
+    """To whole rows, or to those of a partition tile's middle, beside which nothing is touched."""
+    x = make_features(90, 130, 40, 1).to(dtype)
+    a = torch.rand((90, 130), generator=torch.Generator().manual_seed(3)) if weighted else None
+    random = torch.randn((42, 40), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    gradient = StyleGradient(random[:40], 3 * random[40], random[41])
+    before = make_features(90, 130, 40, 2).to(dtype)
+    found, expected, own = before.clone(), before.double(), (slice(5, 80), columns)
+    gradient.add_to(found[own], x[own], None if a is None else a[own])
+    weights = 1 if a is None else a[own][:, :, None].double()
+    expected[own] += weights * ((x[own].double() - gradient.mean) @ gradient.matrix + gradient.offset)
+    tolerance = {torch.float64: 1e-13, torch.float32: 1e-6, torch.bfloat16: 4e-3}[dtype]
+    assert relative_error(found, expected) < tolerance
+    assert torch.equal(found[:5], before[:5])
+    assert torch.equal(found[80:], before[80:])

@@ -1,0 +1,137 @@
+"""Steps of very large views under a memory limit: seconds and peak memory beside the plan's.
+
+python -m benchmarks.large_views SCENE.ply CAMERAS STYLE [--sizes 5187x3361 8192x5460] [--steps 10] [--memory 10]
+
+CAMERAS is a camera file, or orbit:N. Each size runs in a process of its own, so that peaks do not mix. Of a size whose
+steps do not end in time (--seconds), those that did count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cameras import read_views
+from benchmarks.machine import RESULTS, write_result
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.report.machine import peak_memory
+from sgsst_core.scene.camera import Camera
+
+
+def main() -> None:
+    """Measure, print and store; or, with --size, measure one size and print it as JSON after every step."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("cameras")
+    parser.add_argument("style", type=Path)
+    parser.add_argument("--sizes", nargs="+", default=["5187x3361", "8192x5460"], metavar="WIDTHxHEIGHT")
+    parser.add_argument("--steps", type=int, default=10)
+    parser.add_argument("--memory", type=float, default=10.0, help="GB to plan with")
+    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
+    parser.add_argument("--seconds", type=float, default=None, help="for each size; no limit unless given")
+    parser.add_argument("--size", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.size:
+        _measure(arguments)
+        return
+    for size in arguments.sizes:
+        for row in _in_a_process(size, arguments.seconds):
+            _print(row)
+            rows = [other for other in _stored() if _key(other) != _key(row)]
+            write_result("large_views", {"sizes": [*rows, row]})
+
+
+def _stored() -> list[dict[str, Any]]:
+    """Of earlier runs: sizes may be measured one at a time."""
+    path = RESULTS / "large_views.json"
+    return list(json.loads(path.read_text(encoding="utf-8"))["sizes"]) if path.exists() else []
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["width"], row["height"], row["precision"]
+
+
+def _in_a_process(size: str, limit: float | None) -> list[dict[str, Any]]:
+    """What was measured of a size, as far as it came: one row, or none."""
+    command = [sys.executable, "-m", "benchmarks.large_views", *sys.argv[1:], "--size", size]
+    try:
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=limit)
+        lines = done.stdout.splitlines()
+    except subprocess.TimeoutExpired as ended:
+        lines = (ended.stdout or b"").decode().splitlines()
+    return [json.loads(line) for line in lines[-1:]]
+
+
+def _measure(arguments: argparse.Namespace) -> None:
+    """Steps on one view, whose first prepares it."""
+    width, height = (int(side) for side in arguments.size.split("x"))
+    scene = read_scene(arguments.scene).scene
+    view = _of_size(read_views(arguments.cameras, scene, 1, width)[0], width, height)
+    settings = make_settings(
+        "standard",
+        steps_coarse=0,
+        steps_sos=arguments.steps,
+        early_stop=False,
+        memory_limit=int(arguments.memory * 1e9),
+        precision=arguments.precision,
+    )
+    started = time.perf_counter()
+    stylizer = Stylizer.planned(scene, [view], load_image(arguments.style), settings)
+    planning = time.perf_counter() - started
+    prediction = stylizer.plan.prediction
+    assert prediction is not None
+    seconds: list[float] = []
+    for _ in range(arguments.steps):
+        started = time.perf_counter()
+        stylizer.run_step()
+        seconds.append(time.perf_counter() - started)
+        row = {
+            "width": width,
+            "height": height,
+            "precision": arguments.precision,
+            "memory_gb": arguments.memory,
+            "planning_seconds": planning,
+            "first_step_seconds": seconds[0],
+            "step_seconds": seconds[1:],
+            "parts": stylizer.history[-1].parts,
+            "peak_gb": peak_memory() / 1e9,
+            "planned_first_visit_seconds": prediction.first_visit,
+            "planned_step_seconds": prediction.seconds,
+            "planned_peak_gb": prediction.peak_bytes / 1e9,
+            "losses": [record.loss for record in stylizer.history],
+        }
+        print(json.dumps(row), flush=True)
+
+
+def _of_size(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with the same focal length at its width, and its principal point in the middle."""
+    factor = width / camera.width
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=width / 2,
+        cy=height / 2,
+    )
+
+
+def _print(row: dict[str, Any]) -> None:
+    planned = row["planned_step_seconds"] + row["planned_first_visit_seconds"]
+    later = ", ".join(f"{seconds:.1f}" for seconds in row["step_seconds"]) or "none"
+    print(f"{row['width']}x{row['height']}, {row['precision']}: first step {row['first_step_seconds']:.1f} s", end=" ")
+    print(f"(planned {planned:.1f}), later ones {later} s (planned {row['planned_step_seconds']:.1f});", end=" ")
+    print(f"peak {row['peak_gb']:.2f} GB (planned {row['planned_peak_gb']:.2f})", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Compiled kernels of `pooling` on CPUs: one pass over what is pooled, on all cores.
+
+Values are ReLU outputs, seen as integers of the same bits: those of numbers that are not negative come in the same
+order, and integers are compared and chosen many at a time whatever the format, bfloat16 included.
+"""
+
+# The types of compiled functions are those of their arguments.
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numba
+
+from sgsst_core.compiled import compiled
+
+
+@compiled(parallel=True)
+def max_pool(source, out):
+    """Maxima [h // 2, w // 2, c] of 2x2 windows of source [h, w, c]."""
+    rows, columns, channels = out.shape
+    for i in numba.prange(rows):
+        for j in range(columns):
+            a, b = source[2 * i, 2 * j], source[2 * i, 2 * j + 1]
+            c, d = source[2 * i + 1, 2 * j], source[2 * i + 1, 2 * j + 1]
+            result = out[i, j]
+            for k in range(channels):
+                result[k] = max(max(a[k], b[k]), max(c[k], d[k]))
+
+
+@compiled(parallel=True)
+def max_pool_backward(gradient, source, nothing, out):
+    """Gradient [h, w, c] of what went into the ReLU, from that of the maxima [h // 2, w // 2, c]: all of `out`.
+
+    It goes to the first of equal maxima, and nowhere if they are not above 0. `nothing` is the type's 0.
+    """
+    rows, columns, channels = gradient.shape
+    height, width = out.shape[0], out.shape[1]
+    for i in numba.prange((height + 1) // 2):
+        if i == rows:  # the last of an odd number
+            out[2 * i] = nothing
+            continue
+        if width % 2:
+            out[2 * i, width - 1] = nothing
+            out[2 * i + 1, width - 1] = nothing
+        for j in range(columns):
+            a, b = source[2 * i, 2 * j], source[2 * i, 2 * j + 1]
+            c, d = source[2 * i + 1, 2 * j], source[2 * i + 1, 2 * j + 1]
+            to_a, to_b = out[2 * i, 2 * j], out[2 * i, 2 * j + 1]
+            to_c, to_d = out[2 * i + 1, 2 * j], out[2 * i + 1, 2 * j + 1]
+            slope = gradient[i, j]
+            for k in range(channels):
+                most = max(max(a[k], b[k]), max(c[k], d[k]))
+                g = slope[k] if most > nothing else nothing
+                is_a, is_b, is_c = a[k] == most, b[k] == most, c[k] == most
+                to_a[k] = g if is_a else nothing
+                to_b[k] = g if is_b and not is_a else nothing
+                to_c[k] = g if is_c and not (is_a or is_b) else nothing
+                to_d[k] = nothing if is_a or is_b or is_c else g
