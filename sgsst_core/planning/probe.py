@@ -42,10 +42,12 @@ from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.kept_weights import Precision as WeightPrecision
+from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours
 from sgsst_core.settings import Precision, Settings
 from sgsst_core.timing import Timer
 
@@ -361,25 +363,53 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     mean = sum(seconds) / count
     # The least: one of them may have compiled something, or waited for memory.
     more = max(min(first - later for first, later in timed), 0.0)
+    middle = count // 2
+    lists_bytes = 0
+    if isinstance(rasterizer, CpuRasterizer):  # the survey has made the lists that were timed
+        more, lists_bytes = _lists_cost(scene, sample[middle], workshop.settings.near)
+    known = {
+        "first_seconds": more,
+        "lists_bytes": lists_bytes,
+        "colours_seconds": _colours_seconds(scene, sample[middle], rasterizer.device),
+    }
     if rasterizer.name == "cuda":
-        return RasterCost(mean, first_seconds=more)
+        return RasterCost(mean, **known)
     anew = rasterizer
     if not isinstance(anew, CpuRasterizer | TritonRasterizer):
         anew = CpuRasterizer(scene, near=workshop.settings.near)
     cached = CachedRasterizer(scene, anew=anew)
     sizes = [[counted.nbytes(form) for form in _FORMS] for counted in map(cached.count, sample)]
     total, half = (sum(column) * len(cameras) // count for column in zip(*sizes, strict=True))
-    middle = count // 2
     fitting = [form for form, size in zip(_FORMS, sizes[middle], strict=True) if size <= budget]
     if not fitting:
-        return RasterCost(mean, None, total, half, first_seconds=more)
+        return RasterCost(mean, None, total, half, **known)
     keeping = None
     if isinstance(anew, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
         keeping = _keeping_seconds(cached, sample[middle], fitting[0])
     cached = CachedRasterizer(scene, precision=fitting[0], anew=anew)
     kept = _raster_seconds(cached, len(scene), sample[middle])[1]
     # Of the mean view, as the seconds it is compared with.
-    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, more)
+    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, **known)
+
+
+def _lists_cost(scene: Scene, camera: Camera, near: float) -> tuple[float, int]:
+    """Seconds and bytes of a view's lists, made once more."""
+    started = time.perf_counter()
+    lists = build_raster_lists(scene, camera, near=near)
+    return time.perf_counter() - started, lists.nbytes
+
+
+def _colours_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
+    """Of what spherical harmonics add to a view's colours, for the second time: the first one compiles."""
+    seconds = 0.0
+    if scene.sh_degree:
+        sh_rest, means = scene.sh_rest.to(device), scene.means.to(device)
+        for _ in range(2):
+            started = time.perf_counter()
+            rest_colours(sh_rest, means, camera)
+            _wait_for(device)
+            seconds = time.perf_counter() - started
+    return seconds
 
 
 def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPrecision) -> float:

@@ -58,7 +58,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
     for _ in range(4):
         stopped.run_step()
     assert stopped.state().queue
-    kept = Checkpoint(stopped.state(), stopped.plan, 1, stopped.start(), "run", versions())
+    kept = Checkpoint(stopped.state(), stopped.plan, 1, "run", versions())
     save_checkpoint(tmp_path / "c.safetensors", kept, "job")
     resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
