@@ -16,6 +16,8 @@ from sgsst_core.planning.plan import Prediction
 #: So many seconds are always allowed, so that short jobs are measured too: of those whose steps take less than five
 #: minutes, they may be more than a tenth.
 LEAST_ALLOWED = 30.0
+#: Prices are right within a fifth or so: what is planned takes no more than this share of what is allowed.
+_PLANNED = 0.8
 #: Views on which the loss is taken before and after: the most of these that half of the allowed seconds pay for. One is
 #: taken whatever it costs, because a job that cannot say what it has reached is worth little.
 LOSS_VIEWS = (4, 2, 1)
@@ -94,7 +96,7 @@ def held_out_seconds(share: float, expected: Prediction) -> float:
     """Seconds that held-out views may take: what the loss before and after leaves; none without a share."""
     if not share:
         return 0.0
-    return max(allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)
+    return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)
 
 
 def choose_loss_views(share: float, steps: float, price: float, views: int) -> int:
@@ -103,7 +105,7 @@ def choose_loss_views(share: float, steps: float, price: float, views: int) -> i
     Args:
         price: seconds of both losses of a view.
     """
-    half = allowed_seconds(share, steps) / 2
+    half = _PLANNED * allowed_seconds(share, steps) / 2
     return min(next((count for count in LOSS_VIEWS if min(count, views) * price <= half), LOSS_VIEWS[-1]), views)
 
 

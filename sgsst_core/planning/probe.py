@@ -59,6 +59,8 @@ LEAST_GRAPH_VISITS = 20
 #: Views whose blend weights are counted and timed; the others are taken to be like them.
 SAMPLED_VIEWS = 3
 
+#: Runs of the network, of which the fastest counts.
+_RATE_RUNS = 2
 #: Of kept blend weights, the exact one first.
 _FORMS: tuple[WeightPrecision, ...] = ("float32", "half")
 
@@ -338,16 +340,22 @@ def _side(workshop: Workshop, loss: SosLoss) -> int:
 
 
 def measure_rate(loss: SosLoss, side: int) -> Rate:
-    """Time the feature network on a small picture of side x side pixels; the second of two runs counts."""
+    """Time the feature network on a small picture of side x side pixels.
+
+    The first run prepares, the fastest of the others counts: what disturbs one of them is no property of the network.
+    """
     image = soft_picture(side).to(loss.network.device)
     style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
-    seconds = []
-    for gradient in (True, True, False):
+
+    def seconds(gradient: bool) -> float:
         timer = Timer(loss.network.device)
         with timer("evaluation"):
             loss.evaluate(image, style, view, [0], gradient=gradient)
-        seconds.append(timer.read()["evaluation"])
-    return Rate(forward=seconds[2] / side**2, both=seconds[1] / side**2)
+        return timer.read()["evaluation"] / side**2
+
+    seconds(True)
+    both = min(seconds(True) for _ in range(_RATE_RUNS))
+    return Rate(forward=min(seconds(False) for _ in range(_RATE_RUNS)), both=both)
 
 
 # --- the rasterizer ------------------------------------------------------------------------------------------------
@@ -366,7 +374,7 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     middle = count // 2
     lists_bytes = 0
     if isinstance(rasterizer, CpuRasterizer):  # the survey has made the lists that were timed
-        more, lists_bytes = _lists_cost(scene, sample[middle], workshop.settings.near)
+        more, lists_bytes = _lists_cost(scene, sample, workshop.settings.near)
     known = {
         "first_seconds": more,
         "lists_bytes": lists_bytes,
@@ -392,11 +400,14 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, **known)
 
 
-def _lists_cost(scene: Scene, camera: Camera, near: float) -> tuple[float, int]:
-    """Seconds and bytes of a view's lists, made once more."""
-    started = time.perf_counter()
-    lists = build_raster_lists(scene, camera, near=near)
-    return time.perf_counter() - started, lists.nbytes
+def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
+    """Seconds and bytes of a view's lists, made once more; mean over some views."""
+    seconds, size = 0.0, 0
+    for camera in cameras:
+        started = time.perf_counter()
+        size += build_raster_lists(scene, camera, near=near).nbytes
+        seconds += time.perf_counter() - started
+    return seconds / len(cameras), size // len(cameras)
 
 
 def _colours_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:

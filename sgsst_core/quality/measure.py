@@ -109,6 +109,8 @@ class Measurements:
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Measure now; the start too, where it is to be and has not been."""
+        if stylizer.step == stylizer.total:
+            stylizer.stylized()  # the result, which is not made for measuring
         with stylizer.measuring():
             self._measure_start()
             if self.due(stylizer.step):  # as the first view's price has it

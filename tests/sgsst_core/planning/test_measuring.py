@@ -64,17 +64,17 @@ def test_the_first_level_that_is_allowed_is_taken() -> None:
 
 def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() -> None:
     steps = Prediction(1.0, 1.0, 0, losses=3.0, measuring=50.0, job=1050.0)
-    assert held_out_seconds(0.1, steps) == 100.0 - 3.0
-    assert held_out_seconds(0.001, steps) == LEAST_ALLOWED - 3.0
+    assert held_out_seconds(0.1, steps) == 80.0 - 3.0
+    assert held_out_seconds(0.001, steps) == 0.8 * LEAST_ALLOWED - 3.0
     assert held_out_seconds(0.001, replace(steps, losses=32.0)) == 0.0
     assert held_out_seconds(0.0, steps) == 0.0
 
 
 def test_the_loss_has_half_of_what_is_allowed_and_one_view_at_least() -> None:
-    for steps, price, found in ((0.0, 3.75, 4), (0.0, 3.76, 2), (0.0, 7.5, 2), (0.0, 7.6, 1), (0.0, 1e9, 1)):
+    for steps, price, found in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
         assert choose_loss_views(0.1, steps, price, 97) == found
-    assert choose_loss_views(0.1, 3000.0, 7.6, 97) == 4
-    assert choose_loss_views(0.1, 0.0, 5.0, 3) == 3  # there are no more
+    assert choose_loss_views(0.1, 3000.0, 6.01, 97) == 4
+    assert choose_loss_views(0.1, 0.0, 4.0, 3) == 3  # there are no more
     assert choose_loss_views(0.0, 3000.0, 3.0, 97) == 4
 
 
