@@ -49,7 +49,12 @@ def whole_job(
         work: of an iteration on all scales.
         visits: what views cost beside it.
     """
-    expected = replace(expected, first_visit=visits.first(coarse=False), first_visit_coarse=visits.first(coarse=True))
+    expected = replace(
+        expected,
+        first_visit=visits.first(coarse=False),
+        first_visit_coarse=visits.first(coarse=True),
+        style=work.without_region * probe.network.rate.forward,
+    )
     steps = _steps_seconds(expected, plan, settings)
     expected = replace(expected, job=steps)
     views = len(plan.covered)
@@ -70,13 +75,13 @@ def whole_job(
 
 
 def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> float:
-    """Of all steps with their first visits."""
+    """Of all steps with their first visits and the style."""
     phases = (
         (plan.steps_coarse, expected.seconds_coarse, expected.first_visit_coarse),
         (settings.steps_sos, expected.seconds, expected.first_visit),
     )
     views = len(plan.covered)
-    steps = sum(
+    steps = expected.style + sum(
         count * seconds + min(count * settings.views_per_step, views) * first for count, seconds, first in phases
     )
     return min(steps, settings.max_seconds or steps)

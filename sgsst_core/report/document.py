@@ -170,8 +170,9 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
 def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float | None]:
     """Of a step of a phase whose view had been visited, median; and what a first visit takes beside them, mean.
 
-    Where no view came again, or a step takes several, of which its record names one, what is known to be preparation is
-    left out of all steps, and nothing is said of first visits.
+    The job's first step is left out where there are other first visits: it prepares the style, too. Where no view came
+    again, or a step takes several, of which its record names one, what is known to be preparation is left out of all
+    steps, and nothing is said of first visits.
     """
     again, first, bare = [], [], []
     visited: set[int] = set()
@@ -186,6 +187,7 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
     if stylizer.settings.views_per_step > 1 or not again:
         return (median(bare) if bare else None), None
     known = median(again)
+    first = first[1:] if stylizer.history[0].stage == stage and len(first) > 1 else first
     return known, max(mean(first) - known, 0.0)
 
 

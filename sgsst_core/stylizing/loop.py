@@ -162,10 +162,11 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
 
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
-    """Make a step and count what it took."""
-    before = stylizer.seconds
+    """Make a step and count what it took, but for the style, which comes once."""
+    before = stylizer.seconds - stylizer.style_seconds
     record = stylizer.run_step()
-    pace.add_step(record.stage, stylizer.latest, stylizer.seconds - before, record.parts.get("prepare", 0.0))
+    seconds = stylizer.seconds - stylizer.style_seconds - before
+    pace.add_step(record.stage, stylizer.latest, seconds, record.parts.get("prepare", 0.0))
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:

@@ -95,6 +95,8 @@ class Stylizer:
         self.history: list[StepRecord] = []
         #: What was measured between steps (`loop.Callbacks.measure`): values for JSON, kept through a resume.
         self.measured: list[dict[str, Any]] = []
+        #: That the style's statistics have taken, in the steps that needed them first.
+        self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
         self.weights = weights
@@ -261,7 +263,9 @@ class Stylizer:
         """The style's statistics for views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
+            started = time.perf_counter()
             self._style_targets[size] = self.loss.style_targets(self._style, size)
+            self.style_seconds += time.perf_counter() - started
         return self._style_targets[size]
 
     def run_step(self) -> StepRecord:

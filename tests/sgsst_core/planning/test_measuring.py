@@ -113,7 +113,7 @@ def test_nothing_is_measured_without_a_share() -> None:
 def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
     """Four views, all of them visited in either phase; lists and kept weights come with the first one."""
     found = expected(plan_of(SLOW))
-    steps = 8 * found.seconds_coarse + 16 * found.seconds
+    steps = 8 * found.seconds_coarse + 16 * found.seconds + found.style
     assert found.job == pytest.approx(steps + 4 * (found.first_visit_coarse + found.first_visit) + found.measuring)
     assert found.first_visit_coarse > SLOW.first_seconds + SLOW.seconds
     assert 0 < found.first_visit < SLOW.first_seconds
