@@ -94,14 +94,16 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     scene, resolution, *steps = case.split(":")
     coarse, sos = map(int, steps or _STEPS)
     chosen = {"memory_limit": arguments.memory_limit} if arguments.memory_limit else {}
-    options = StylizeOptions(
-        views=arguments.views,
-        resolution=int(resolution),
-        steps_coarse=coarse,
-        steps_sos=sos,
-        early_stop=False,
-        measure=arguments.measure,
-        **chosen,
+    options = StylizeOptions.model_validate(
+        {
+            "views": arguments.views,
+            "resolution": int(resolution),
+            "steps_coarse": coarse,
+            "steps_sos": sos,
+            "early_stop": False,
+            "measure": arguments.measure,
+            **chosen,
+        }
     )
     promises: list[tuple[str, int, float, float, float]] = []  # stage, step, seconds of steps, clock, seconds left
     with tempfile.TemporaryDirectory() as folder:

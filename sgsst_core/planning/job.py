@@ -26,6 +26,8 @@ from sgsst_core.settings import Settings
 #: neighbours are searched and which is written (measured at 4 million on two cores; a guess elsewhere).
 ENDING_SECONDS = 1.5
 ENDING_SECONDS_A_GAUSSIAN = 4e-6
+#: Of them the search, which every moment takes where some Gaussians are unseen.
+_NEIGHBOURS_SECONDS_A_GAUSSIAN = 1.5e-6
 #: Renders that the depth of a held-out view takes.
 _DEPTH_RENDERS = 2
 
@@ -68,7 +70,7 @@ def whole_job(
     loss_views = min(LOSS_VIEWS[0], views) if settings.target_loss else choose_loss_views(share, steps, price, views)
     ending = ENDING_SECONDS + ENDING_SECONDS_A_GAUSSIAN * probe.scene.gaussians
     expected = replace(expected, evaluation=loss_views * once, losses=loss_views * price, ending=ending)
-    prices, total = _prices(expected, plan, probe, work), plan.steps_coarse + settings.steps_sos
+    prices, total = _prices(expected, plan, probe, settings, work), plan.steps_coarse + settings.steps_sos
     level = choose_level(prices, held_out_seconds(share, expected), total)
     measuring = expected.losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
     return replace(expected, measuring=measuring, job=steps + measuring), Measured(level, loss_views)
@@ -87,16 +89,18 @@ def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> floa
     return min(steps, settings.max_seconds or steps)
 
 
-def _prices(expected: Prediction, plan: Plan, probe: Probe, work: Work) -> Prices:
+def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, work: Work) -> Prices:
     """What held-out views are expected to cost; they lie between the job's, and are taken to be like them."""
     raster, forward = probe.raster, work.pixels * probe.network.rate.forward
     render = RENDER * raster.seconds
     pruned = bool(pruned_gaussians(plan.survey, plan.seen).any())
     approximated = plan.precision != "float32" or plan.kept_weights == "half" or pruned
+    unseen = settings.unseen == "neighbours" and not bool(plan.seen.all())
+    neighbours = _NEIGHBOURS_SECONDS_A_GAUSSIAN * probe.scene.gaussians if unseen else 0.0
     return Prices(
         setup=RENDERED * (raster.first_seconds + raster.colours_seconds + _DEPTH_RENDERS * render),
         view=RENDERED * render + forward,
-        moment=2 * expected.seconds if approximated else 0.0,
+        moment=neighbours + (2 * expected.seconds if approximated else 0.0),
     )
 
 

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import psutil
 import torch
@@ -375,7 +376,7 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     lists_bytes = 0
     if isinstance(rasterizer, CpuRasterizer):  # the survey has made the lists that were timed
         more, lists_bytes = _lists_cost(scene, sample, workshop.settings.near)
-    known = {
+    known: dict[str, Any] = {
         "first_seconds": more,
         "lists_bytes": lists_bytes,
         "colours_seconds": _colours_seconds(scene, sample[middle], rasterizer.device),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from dataclasses import replace
 from statistics import median
@@ -23,6 +22,7 @@ from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
 
@@ -45,7 +45,7 @@ class Measurements:
         self.approximated = approximations(stylizer)
         self._exact: ExactTwin | None = None
         self._held_out: HeldOut | None = None
-        self._rasterizer: Rasterizer | None = None
+        self._seen_by: tuple[Scene, Rasterizer] | None = None
 
     @property
     def exact(self) -> ExactTwin:
@@ -196,20 +196,25 @@ class Measurements:
     def _make(self, views: int, lpips: Lpips | None = None) -> HeldOut:
         """Held-out views, at most so many."""
         stylizer = self._stylizer
-        scene = stylizer.scene.without_zero_bands()
         settings = stylizer.settings
         options: dict[str, Any] = {"background": settings.background, "near": settings.near}
         if stylizer.plan.anew == "cpu":
             options["max_list_bytes"] = held_out_list_bytes(stylizer.memory)
-        rasterizer_of = functools.partial(make_rasterizer, stylizer.plan.anew, **options)
-        self._rasterizer = self._rasterizer or rasterizer_of(scene)
+
+        def rasterizer_of(part: Scene) -> Rasterizer:
+            return make_rasterizer(stylizer.plan.anew, part, **options)
+
+        if self._seen_by is None:
+            scene = stylizer.scene.without_zero_bands()
+            self._seen_by = scene, rasterizer_of(scene)
+        scene, rasterizer = self._seen_by
         source = self.exact if stylizer.network.precision != "float32" else stylizer
         first = stylizer.measured[0]["held_out"] if stylizer.measured else None
         return HeldOut(
             stylizer.views.cameras,
             stylizer.views.covered,
             scene,
-            self._rasterizer,
+            rasterizer,
             source.loss,
             source.style_targets,
             weighted=stylizer.plan.weighted,

@@ -174,7 +174,9 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
     again, or a step takes several, of which its record names one, what is known to be preparation is left out of all
     steps, and nothing is said of first visits.
     """
-    again, first, bare = [], [], []
+    again: list[float] = []
+    first: list[float] = []
+    bare: list[float] = []
     visited: set[int] = set()
     before = 0.0
     for record in stylizer.history:
