@@ -104,12 +104,8 @@ def prediction_table(report: dict[str, Any]) -> Table:
     ]
     if predicted.get("measuring") and measured.get("measuring") is not None:
         rows.append(_beside("measuring, in all", predicted["measuring"], measured["measuring"], duration))
-        steps = predicted["job"] - predicted["measuring"], report["seconds"]
-        shares = [
-            value / of if of else None
-            for value, of in zip((predicted["measuring"], measured["measuring"]), steps, strict=True)
-        ]
-        rows.append(_beside("of the steps' time", *shares, percent))
+        planned = _share(predicted["measuring"], predicted["job"] - predicted["measuring"])
+        rows.append(_beside("of the steps' time", planned, _share(measured["measuring"], report["seconds"]), percent))
     on_device = predicted.get("device_bytes"), measured.get("device_bytes")
     if any(value is not None for value in on_device):
         rows.append(_beside("peak memory of the GPU", *on_device, byte_count))
@@ -120,6 +116,11 @@ def prediction_table(report: dict[str, Any]) -> Table:
         rows.append(_beside("speed-up over one rank", one_rank / seconds, measured.get("speed_up"), number))
     columns = [Column(""), Column("predicted", True), Column("measured", True), Column("measured / predicted", True)]
     return Table(columns, rows)
+
+
+def _share(part: float, whole: float) -> float | None:
+    """A part's share; None of nothing."""
+    return part / whole if whole else None
 
 
 def _beside(name: str, before: float | None, after: float | None, text: Callable[[float | None], str]) -> list[str]:
