@@ -90,6 +90,8 @@ class _Deciding:
         expected, measured = whole_job(
             expected, self.base, self.probe, self.settings, work=self.work, visits=self.visits
         )
+        peak = expected.peak_bytes + self._held_out_bytes(measured.level)
+        expected = replace(expected, peak_bytes=peak)
         plan = replace(
             self.base,
             ranks=ranks,
@@ -207,7 +209,7 @@ class _Deciding:
         computing += min(int(visits.content.bytes) // ranks, int(visits.content.room))
         computing += min(int(weights) // ranks, self.budget)
         gaussians = int(self.base.seen.sum())
-        measuring = (MEASURING_BYTES if self.measured else 0) + self._held_out_bytes()
+        measuring = MEASURING_BYTES if self.measured else 0
         if probe.machine.device != "cpu":
             return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMISER_BYTES
         lists = visits.lists.kept_bytes - visits.surveyed.kept_bytes if visits.handed == 0 else 0
@@ -215,9 +217,9 @@ class _Deciding:
         optimising = gaussians * (OPTIMISER_BYTES + STEP_BYTES) + visits.colours.kept_bytes
         return probe.process_bytes + scene + lists + optimising + computing + measuring, None
 
-    def _held_out_bytes(self) -> int:
-        """Lists that held-out views keep."""
-        views = RENDERED * LEVELS[-1 if not self.measured else 0].views
+    def _held_out_bytes(self, level: int) -> int:
+        """Lists that the held-out views of a level keep."""
+        views = RENDERED * LEVELS[level].views if self.measured else 0
         return int(min(views * self.probe.raster.lists_bytes, held_out_list_bytes(self.probe.machine.memory)))
 
     def _one_rank(self) -> tuple[Prediction, int, None]:

@@ -9,7 +9,7 @@ import pytest
 
 from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, RasterCost, gaussian_bytes
 from sgsst_core.planning.decide import MEASURING_BYTES, decide
-from sgsst_core.planning.measuring import held_out_list_bytes
+from sgsst_core.planning.measuring import LEVELS, held_out_list_bytes
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.visits import Made
 from sgsst_core.rasterizer.cpu import DEFAULT_LIST_BYTES
@@ -84,11 +84,14 @@ def test_weights_that_do_not_fit_save_nothing() -> None:
 def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
     """Five of six Gaussians are rendered, as a copy of the scene of degree 3; its lists take those of the survey's."""
     lists = 10**8
-    plain, measured = (expected(LARGE, measured=flag).peak_bytes for flag in (False, True))
+    plain = expected(LARGE).peak_bytes
     whole = expected(LARGE, keep=("unseen",)).peak_bytes
     own = OPTIMISER_BYTES + STEP_BYTES + 12 * VIEWS
     assert plain - whole == 5 * (own + gaussian_bytes(3)) - 6 * own
     assert gaussian_bytes(3) == 4 * 59
-    held_out = min(16 * lists, held_out_list_bytes(10 * GIGABYTE))
-    assert measured - plain == MEASURING_BYTES + held_out
+    for steps in (1, 40, 4000):  # nothing, some and all of it
+        plan = plan_of(LARGE, measured=True, steps_sos=steps)
+        held_out = min(4 * LEVELS[plan.measuring].views * lists, held_out_list_bytes(10 * GIGABYTE))
+        assert plan.prediction is not None
+        assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + held_out
     assert expected(HUGE).peak_bytes == plain, "what does not fit is not kept, and the survey had kept as much"
