@@ -36,7 +36,7 @@ class Result:
     Attributes:
         stopped: see `run`; where it is "interrupted", only the checkpoint was written.
         step, total: that were done, and planned.
-        before, after: loss on the evaluation views; `after` is empty where the job was interrupted.
+        before, after: loss on the evaluation views; both are empty where the job was interrupted.
         bought: what error the time bought (`report.bought`).
         report_error: why report, contact sheet or curves are missing; None if they are not.
     """
@@ -73,13 +73,12 @@ def execute(
     stylizer = job.stylizer
     first = stylizer.collectives.rank == 0
     measure = Measurements(stylizer)
-    before = job.resumed.before if job.resumed else measure.evaluate(unstylized=True)
     if job.resumed:
         stylizer.load_state(job.resumed.state)
     if first:
         _make_room(job.outputs)
     stylizer.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.plan)))
-    checkpoint = _CheckpointWriter(job, before, run_id or secrets.token_hex(8), saved, warn)
+    checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
     callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds)
     if first:
         callbacks.progress, callbacks.stop = progress, stop
@@ -89,8 +88,8 @@ def execute(
     if stopped == "interrupted":
         if checkpoint.error is not None:
             raise checkpoint.error
-        return Result(stopped, stylizer.step, stylizer.total, before, {})
-    return _finish(job, stopped, before, measure)
+        return Result(stopped, stylizer.step, stylizer.total, {}, {})
+    return _finish(job, stopped, measure)
 
 
 def _make_room(outputs: Outputs) -> None:
@@ -107,8 +106,8 @@ class _CheckpointWriter:
         error: why the last one could not be written; None where it was.
     """
 
-    def __init__(self, job: Job, before: Evaluation, run_id: str, saved: Callable[[int], None], warn: Warn) -> None:
-        self._job, self._before, self._run_id = job, before, run_id
+    def __init__(self, job: Job, run_id: str, saved: Callable[[int], None], warn: Warn) -> None:
+        self._job, self._run_id = job, run_id
         self._saved, self._warn = saved, warn
         self.error: OutputError | None = None
 
@@ -116,9 +115,7 @@ class _CheckpointWriter:
         """Write one, or warn."""
         job = self._job
         self.error = None
-        checkpoint = Checkpoint(
-            stylizer.state(), stylizer.plan, job.planned_ranks, self._before, self._run_id, versions()
-        )
+        checkpoint = Checkpoint(stylizer.state(), stylizer.plan, job.planned_ranks, self._run_id, versions())
         try:
             job.outputs.checkpoints.save(checkpoint, job.fingerprint)
             self._saved(stylizer.step)
@@ -127,7 +124,7 @@ class _CheckpointWriter:
             self._warn(f"No checkpoint could be written: {error}")
 
 
-def _finish(job: Job, stopped: Stopped, before: Evaluation, measure: Measurements) -> Result:
+def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     """Write the PLY, then everything beside it. Every rank calls this."""
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.collectives.rank == 0
@@ -135,7 +132,8 @@ def _finish(job: Job, stopped: Stopped, before: Evaluation, measure: Measurement
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     measure.at_the_end()
-    after = measure.evaluate()
+    # Now that the views are prepared; before the first step it would have been waited for.
+    before, after = measure.evaluate(unstylized=True), measure.evaluate()
     error = _write_reports(job, stopped, before, after) if first else None
     found = bought(stylizer, before)
     return Result(stopped, stylizer.step, stylizer.total, before, after, found, str(error) if error else None)
@@ -145,8 +143,8 @@ def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evalua
     """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
-        near = stylizer.settings.near
-        findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near)
+        near, looked = stylizer.settings.near, stylizer.plan.survey
+        findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near, looked=looked)
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         sent = sent_json(stylizer.history)

@@ -15,11 +15,21 @@ from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
 from sgsst_core.planning.choices import GPU_RASTERIZERS, optimised_gaussians, precision_of, rendered_gaussians
-from sgsst_core.planning.cost import OPTIMISER_BYTES, Work, content_bytes, image_bytes, pieces_of
+from sgsst_core.planning.cost import (
+    OPTIMISER_BYTES,
+    STEP_BYTES,
+    Work,
+    content_bytes,
+    gaussian_bytes,
+    image_bytes,
+    pieces_of,
+)
 from sgsst_core.planning.job import of_measuring, whole_job
+from sgsst_core.planning.measuring import LEVELS, RENDERED, held_out_list_bytes
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
+from sgsst_core.planning.visits import Visits
 from sgsst_core.settings import KeptWeights, Settings
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
@@ -29,9 +39,8 @@ UNCOVERED_SHARE = 0.01
 LEAST_VISITS = 5
 #: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few per cent.
 LEAST_PASSES = 200
-#: What measuring between steps and the report take beside the iterations: libraries, LPIPS, another set of raster lists
-#: (measured on jobs of 10 to 100 small views).
-MEASURING_BYTES = 400 << 20
+#: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.
+MEASURING_BYTES = 200 << 20
 
 
 def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
@@ -71,15 +80,27 @@ class _Deciding:
         if leave_out:
             self.regions = [probe.survey.regions[index] for index in self.base.covered]
         self.work = Work.of(self.sizes, self.tiling, self.regions)
+        self.coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
+        content = self._content_bytes(self.base.covered)
+        self.visits = Visits.of(self.base, probe, settings, self.work, self.coarse, content)
 
     def plan(self) -> Plan:
         """Decisions and prediction."""
         expected, ranks, line = self._one_rank() if self.probe.machine.ranks == 1 else self._several_ranks()
-        coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
-        expected, measuring = whole_job(expected, self.base, self.probe, self.settings, work=self.work, coarse=coarse)
-        plan = replace(self.base, ranks=ranks, measuring=measuring, prediction=expected)
-        measured = [of_measuring(plan, expected, self.settings)] if self.measured else []
-        return replace(plan, decisions=(*self._decisions(line), *measured))
+        expected, measured = whole_job(
+            expected, self.base, self.probe, self.settings, work=self.work, visits=self.visits
+        )
+        peak = expected.peak_bytes + self._held_out_bytes(measured.level)
+        expected = replace(expected, peak_bytes=peak)
+        plan = replace(
+            self.base,
+            ranks=ranks,
+            measuring=measured.level,
+            loss_views=measured.loss_views,
+            prediction=expected,
+        )
+        lines = [of_measuring(plan, expected, self.settings)] if self.measured else []
+        return replace(plan, decisions=(*self._decisions(line), *lines))
 
     def _without_decisions(self) -> Plan:
         probe, settings = self.probe, self.settings
@@ -176,32 +197,40 @@ class _Deciding:
         sizes = [self.probe.sizes[index] for index in views]
         return content_bytes(sizes, self.tiling, self.probe.network.content_bytes)
 
-    @property
-    def _raster_seconds(self) -> float:
-        raster = self.probe.raster
-        return raster.kept_seconds if self.base.kept_weights != "none" and raster.kept_seconds else raster.seconds
-
     def _peak_bytes(self, activations: int) -> tuple[int, int | None]:
-        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes."""
-        probe, raster = self.probe, self.probe.raster
-        memory, ranks = probe.machine.memory, probe.machine.ranks
-        kept = {"none": 0, "float32": raster.bytes, "half": raster.half_bytes}[self.base.kept_weights] or 0
-        content = 0 if "content" in self.settings.keep else self._content_bytes(self.base.covered)
-        process = probe.process_bytes + (MEASURING_BYTES if self.measured else 0)
+        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes.
+
+        What grows with the Gaussians is counted where a CPU computes; a GPU's share of it is small beside its tensors.
+        """
+        probe, visits, ranks = self.probe, self.visits, self.probe.machine.ranks
         # What a graph computes with is its own: the same work without it has a place beside it.
         computing = image_bytes(probe.sizes) + activations * (2 if self.base.graphs else 1)
-        computing += min(content // ranks, int(memory * MEMORY_SHARES["views"]) // 2) + min(kept // ranks, self.budget)
-        if probe.machine.device == "cpu":
-            return process + computing, None
-        return process, probe.device_bytes + computing + int(self.base.seen.sum()) * OPTIMISER_BYTES
+        weights = visits.weights.bytes if visits.weights else 0.0
+        computing += min(int(visits.content.bytes) // ranks, int(visits.content.room))
+        computing += min(int(weights) // ranks, self.budget)
+        gaussians = int(self.base.seen.sum())
+        measuring = MEASURING_BYTES if self.measured else 0
+        if probe.machine.device != "cpu":
+            return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMISER_BYTES
+        lists = max(visits.lists.kept_bytes - visits.surveyed.kept_bytes, 0)
+        scene = 0 if bool(self.base.seen.all()) else gaussians * gaussian_bytes(probe.scene.held_degree)
+        optimising = gaussians * (OPTIMISER_BYTES + STEP_BYTES) + visits.colours.kept_bytes
+        return probe.process_bytes + scene + lists + optimising + computing + measuring, None
+
+    def _held_out_bytes(self, level: int) -> int:
+        """Lists that the held-out views of a level keep."""
+        views = RENDERED * LEVELS[level].views if self.measured else 0
+        return int(min(views * self.probe.raster.lists_bytes, held_out_list_bytes(self.probe.machine.memory)))
 
     def _one_rank(self) -> tuple[Prediction, int, None]:
-        network, raster = self.probe.network, self._raster_seconds
-        coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
-        peak, on_device = self._peak_bytes(int(self.work.peak * network.held_bytes))
+        rate, visits = self.probe.network.rate, self.visits
+        peak, on_device = self._peak_bytes(int(self.work.peak * self.probe.network.held_bytes))
         turns = self.settings.views_per_step
-        seconds = (turns * (self.work.seconds(network.rate) + raster), turns * (coarse.seconds(network.rate) + raster))
-        return Prediction(*seconds, peak, device_bytes=on_device), 1, None
+        seconds, seconds_coarse = (
+            turns * (work.seconds(rate) + visits.rasterized() + visits.later(coarse=work is self.coarse))
+            for work in (self.work, self.coarse)
+        )
+        return Prediction(seconds, seconds_coarse, peak, device_bytes=on_device), 1, None
 
     def _several_ranks(self) -> tuple[Prediction, int, Decision]:
         """What is expected of the ranks that take part, how many that are, and why."""
@@ -250,7 +279,7 @@ class _Deciding:
                     pieces,
                     network.halo,
                     network.rate.both,
-                    self._raster_seconds,
+                    self.visits.rasterized(),
                     network.fixed * len(pieces),
                     int(self.base.seen.sum()),
                     whole_image=not (coarsest and self.base.coarse_weights),

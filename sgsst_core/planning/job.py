@@ -2,97 +2,127 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from sgsst_core.planning.choices import pruned_gaussians
 from sgsst_core.planning.cost import Work
-from sgsst_core.planning.measuring import LEVELS, RENDERED, Prices, choose_level, held_out_seconds
+from sgsst_core.planning.measuring import (
+    LEAST_ALLOWED,
+    LEVELS,
+    LOSS_VIEWS,
+    RENDERED,
+    Prices,
+    allowed_seconds,
+    choose_level,
+    choose_loss_views,
+    held_out_seconds,
+)
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import Probe
+from sgsst_core.planning.visits import RENDER, Visits
 from sgsst_core.settings import Settings
 
-#: Views on which a job is evaluated before and after.
-EVALUATION_VIEWS = 4
-#: Making a view's kept weights on the CPU, in renders with gradient.
-KEEPING_RENDERS = 3
-#: A render without its gradient, in renders with it.
-_RENDER = 0.5
-#: Small renders by which a held-out view is judged: coverage and depth, of itself and two neighbours.
-_OUTLOOKS = 6
+#: From the last step to the last file: seconds in any case, for pictures and report, and for each Gaussian, whose
+#: neighbours are searched and which is written (measured at 4 million on two cores; a guess elsewhere).
+ENDING_SECONDS = 1.5
+ENDING_SECONDS_A_GAUSSIAN = 4e-6
+#: Of them the search, which every moment takes where some Gaussians are unseen.
+_NEIGHBOURS_SECONDS_A_GAUSSIAN = 1.5e-6
+#: Renders that the depth of a held-out view takes.
+_DEPTH_RENDERS = 2
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is measured beside the steps: `Plan.measuring` and `Plan.loss_views`."""
+
+    level: int
+    loss_views: int
 
 
 def whole_job(
-    expected: Prediction, plan: Plan, probe: Probe, settings: Settings, *, work: Work, coarse: Work
-) -> tuple[Prediction, int]:
-    """The prediction with what the whole job takes, and what is measured in it (`Plan.measuring`).
+    expected: Prediction, plan: Plan, probe: Probe, settings: Settings, *, work: Work, visits: Visits
+) -> tuple[Prediction, Measured]:
+    """The prediction with what the whole job takes, and what is measured in it.
 
     Args:
         expected: of the steps.
         plan: but for prediction and measuring.
-        work: of an iteration on all scales, and `coarse` on the coarsest alone.
+        work: of an iteration on all scales.
+        visits: what views cost beside it.
     """
-    raster, forward = probe.raster, probe.network.rate.forward
-    rendered = _RENDER * raster.seconds if settings.content_weight else 0.0
-    rate = forward if settings.content_weight else 0.0
-    lists = raster.first_seconds + _keeping_seconds(plan, probe)
-    in_coarse = plan.steps_coarse > 0
-    views = len(plan.covered)
     expected = replace(
         expected,
-        first_visit=rendered + work.pixels * rate + (0.0 if in_coarse and not plan.coarse_weights else lists),
-        first_visit_coarse=rendered + coarse.pixels * rate + (raster.first_seconds if plan.coarse_weights else lists),
-        evaluation=min(views, EVALUATION_VIEWS) * (_RENDER * raster.seconds + work.pixels * forward),
+        first_visit=visits.first(coarse=False),
+        first_visit_coarse=visits.first(coarse=True),
+        style=work.without_region * probe.network.rate.forward,
     )
+    steps = _steps_seconds(expected, plan, settings)
+    expected = replace(expected, job=steps)
+    views = len(plan.covered)
+    if not plan.measured:
+        return expected, Measured(plan.measuring, min(LOSS_VIEWS[0], views))
+    once = RENDER * visits.rasterized() + visits.later(coarse=False) + work.pixels * probe.network.rate.forward
+    unvisited = max(1 - settings.steps_sos * settings.views_per_step / views, 0.0)
+    price = 2 * once + unvisited * expected.first_visit
+    # A target is a share of the loss before: how long that takes must not decide where the job ends.
+    share = settings.measure
+    loss_views = min(LOSS_VIEWS[0], views) if settings.target_loss else choose_loss_views(share, steps, price, views)
+    ending = ENDING_SECONDS + ENDING_SECONDS_A_GAUSSIAN * probe.scene.gaussians
+    expected = replace(expected, evaluation=loss_views * once, losses=loss_views * price, ending=ending)
+    prices, total = _prices(expected, plan, probe, settings, work), plan.steps_coarse + settings.steps_sos
+    level = choose_level(prices, held_out_seconds(share, expected), total)
+    measuring = expected.losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
+    return replace(expected, measuring=measuring, job=steps + measuring), Measured(level, loss_views)
+
+
+def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> float:
+    """Of all steps with their first visits and the style."""
     phases = (
         (plan.steps_coarse, expected.seconds_coarse, expected.first_visit_coarse),
         (settings.steps_sos, expected.seconds, expected.first_visit),
     )
-    steps = sum(
+    views = len(plan.covered)
+    steps = expected.style + sum(
         count * seconds + min(count * settings.views_per_step, views) * first for count, seconds, first in phases
     )
-    expected = replace(expected, job=min(steps, settings.max_seconds or steps))
-    if not plan.measured:
-        return expected, 0
-    prices, total = _prices(expected, plan, probe, work), plan.steps_coarse + settings.steps_sos
-    place = choose_level(prices, held_out_seconds(settings.measure, expected), total)
-    held_out = prices.of(LEVELS[place], len(LEVELS[place].moments(total))) if settings.measure else 0.0
-    measuring = 2 * expected.evaluation + held_out
-    return replace(expected, measuring=measuring, job=expected.job + measuring), place
+    return min(steps, settings.max_seconds or steps)
 
 
-def _keeping_seconds(plan: Plan, probe: Probe) -> float:
-    """Of making a view's kept weights."""
-    if plan.kept_weights == "none":
-        return 0.0
-    seconds = probe.raster.keeping_seconds
-    return KEEPING_RENDERS * probe.raster.seconds if seconds is None else seconds
-
-
-def _prices(expected: Prediction, plan: Plan, probe: Probe, work: Work) -> Prices:
+def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, work: Work) -> Prices:
     """What held-out views are expected to cost; they lie between the job's, and are taken to be like them."""
-    raster = probe.raster
-    render = raster.first_seconds + _RENDER * raster.seconds
+    raster, forward = probe.raster, work.pixels * probe.network.rate.forward
+    render = RENDER * raster.seconds
     pruned = bool(pruned_gaussians(plan.survey, plan.seen).any())
     approximated = plan.precision != "float32" or plan.kept_weights == "half" or pruned
+    unseen = settings.unseen == "neighbours" and not bool(plan.seen.all())
+    neighbours = _NEIGHBOURS_SECONDS_A_GAUSSIAN * probe.scene.gaussians if unseen else 0.0
     return Prices(
-        setup=RENDERED * (_OUTLOOKS * raster.first_seconds + render),
-        view=RENDERED * render + work.pixels * probe.network.rate.forward,
-        moment=2 * expected.seconds if approximated else 0.0,
+        setup=RENDERED * (raster.first_seconds + raster.colours_seconds + _DEPTH_RENDERS * render),
+        view=RENDERED * render + forward,
+        moment=neighbours + (2 * expected.seconds if approximated else 0.0),
     )
 
 
 def of_measuring(plan: Plan, expected: Prediction, settings: Settings) -> Decision:
     """The line that says what is measured beside the steps, and what it costs."""
-    cost = f"about {expected.measuring:.2g} s beside {expected.job - expected.measuring:.3g} s of steps"
+    steps = expected.job - expected.measuring
+    cost = f"about {expected.measuring:.2g} s beside {steps:.3g} s of steps"
+    losses = f"the loss before and after on {_count(plan.loss_views, 'view')}"
     if not settings.measure:
-        return Decision("measuring", "the loss before and after alone", f"asked for; {cost}")
+        return Decision("measuring", f"{losses} alone", f"asked for; {cost}")
     level = LEVELS[plan.measuring]
     moments = level.moments(plan.steps_coarse + settings.steps_sos)
     when = f"at {len(moments)} moments" if len(moments) > 1 else "at the end"
-    views = f"{level.views} view{'s' if level.views > 1 else ''}"
+    found = f", and {when} up to {_count(level.views, 'view')} between the cameras" if moments else " alone"
+    allowed = f"{allowed_seconds(settings.measure, steps):.3g} s are allowed, {settings.measure:.0%} of the steps' time"
     return Decision(
         "measuring",
-        f"the loss before and after, and {when} up to {views} between the cameras",
-        f"{cost}; {settings.measure:.0%} of the steps' time is allowed, or 30 s, and less is measured where the first "
-        "view between the cameras takes longer",
+        f"{losses}{found}",
+        f"{cost}; {allowed} or {LEAST_ALLOWED:.0f} s, and less is measured where the first view between the cameras "
+        "takes longer",
     )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -1,8 +1,10 @@
 """What a job measures beside its steps, so that it takes no more than a share of the job's time.
 
-Held-out views are measured at moments of a run. Both become fewer from level to level (`LEVELS`). The plan takes the
-first level whose expected seconds are allowed; the first view that is really measured says whether a later level is
-needed (`quality.measure`). No level changes a colour.
+The loss before and after is taken on some of the job's views; held-out views are measured at moments of a run. Half of
+what is allowed goes to the loss at most, and its views are fewer where they would take more. What it leaves is for
+held-out views: they and their moments become fewer from level to level (`LEVELS`). The plan takes the first level whose
+expected seconds are allowed; the first view that is really measured says whether a later level is needed
+(`quality.measure`). Nothing is measured before the first step, and nothing changes a colour.
 """
 
 from __future__ import annotations
@@ -11,8 +13,14 @@ from dataclasses import dataclass
 
 from sgsst_core.planning.plan import Prediction
 
-#: So many seconds are always allowed: small jobs are measured in full.
+#: So many seconds are always allowed, so that short jobs are measured too: of those whose steps take less than five
+#: minutes, they may be more than a tenth.
 LEAST_ALLOWED = 30.0
+#: Prices are right within a fifth or so: what is planned takes no more than this share of what is allowed.
+_PLANNED = 0.8
+#: Views on which the loss is taken before and after: the most of these that half of the allowed seconds pay for. One is
+#: taken whatever it costs, because a job that cannot say what it has reached is worth little.
+LOSS_VIEWS = (4, 2, 1)
 #: Held-out views of a `Level.views` that are rendered: one for the Gram distance, the others of its pairs.
 RENDERED = 4
 
@@ -24,7 +32,7 @@ class Level:
     Attributes:
         views: whose Gram distance is measured, and pairs of each range that are compared, at most.
         halvings: h for each moment, after total / 2^h steps; 0 is the end.
-        start: the unstylized scene is measured too.
+        start: the unstylized scene is measured too, when the first of the other moments comes.
     """
 
     views: int
@@ -33,10 +41,11 @@ class Level:
 
     def moments(self, total: int) -> list[int]:
         """Steps after which a run of `total` is measured."""
-        return sorted({*([0] if self.start else []), *(total >> halvings for halvings in self.halvings)})
+        later = {total >> halvings for halvings in self.halvings if total >> halvings}
+        return sorted({0, *later} if self.start else later)
 
 
-#: From all to the least: the end alone.
+#: From all to nothing; the last but one is the end alone.
 LEVELS = (
     Level(4, (0, 1, 2, 3, 4, 5)),
     Level(4, (0, 2, 4)),
@@ -44,7 +53,15 @@ LEVELS = (
     Level(2, (0,)),
     Level(1, (0,)),
     Level(1, (0,), start=False),
+    Level(0, (), start=False),
 )
+#: Place of the level without any held-out view.
+NOTHING = len(LEVELS) - 1
+
+
+def held_out_list_bytes(memory: int) -> int:
+    """Bytes that lists of Gaussians of held-out views may keep, of what a rank may plan with."""
+    return memory // 16
 
 
 @dataclass(frozen=True)
@@ -70,21 +87,35 @@ class Prices:
         return level.views * self.setup + moments * self.again(level)
 
 
+def allowed_seconds(share: float, steps: float) -> float:
+    """Seconds that all measuring may take beside so many seconds of steps."""
+    return max(LEAST_ALLOWED, share * steps)
+
+
 def held_out_seconds(share: float, expected: Prediction) -> float:
-    """Seconds that held-out views may take: what the loss before and after leaves of a share of the steps' time."""
+    """Seconds that held-out views may take: what the loss before and after leaves; none without a share."""
     if not share:
         return 0.0
-    steps = expected.job - expected.measuring
-    return max(max(LEAST_ALLOWED, share * steps) - 2 * expected.evaluation, 0.0)
+    return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)
+
+
+def choose_loss_views(share: float, steps: float, price: float, views: int) -> int:
+    """On how many of a job's `views` the loss is taken before and after, beside so many seconds of steps.
+
+    Args:
+        price: seconds of both losses of a view.
+    """
+    half = _PLANNED * allowed_seconds(share, steps) / 2
+    return min(next((count for count in LOSS_VIEWS if min(count, views) * price <= half), LOSS_VIEWS[-1]), views)
 
 
 def choose_level(prices: Prices, allowed: float, total: int, first: int = 0) -> int:
-    """Place in `LEVELS`, from `first` on, of the first one that takes no more than `allowed` seconds; else the last.
+    """Place in `LEVELS`, from `first` on, of the first one that takes no more than `allowed` seconds.
 
     Args:
         total: steps of the run.
     """
-    for place in range(first, len(LEVELS)):
+    for place in range(first, NOTHING):
         if prices.of(LEVELS[place], len(LEVELS[place].moments(total))) <= allowed:
             return place
-    return len(LEVELS) - 1
+    return NOTHING

@@ -48,9 +48,12 @@ class Prediction:
         device_bytes: of a GPU's memory, at any time; None where a CPU computes.
         first_visit: seconds that a view's first visit in phase 2 takes beside those of an iteration.
         first_visit_coarse: the same in phase 1.
+        style: seconds that the style's statistics take in the first step; the style is taken to be as large as a view.
         evaluation: seconds of the loss on the evaluation views, once they have been visited.
+        losses: seconds of the loss before and after, with first visits of views that no step has visited.
         measuring: seconds of all that is measured beside the steps.
-        job: seconds of all steps, with first visits, and of measuring.
+        job: seconds of all steps, with first visits and the style, and of measuring.
+        ending: seconds from the last step to the last file, beside measuring.
     """
 
     seconds: float
@@ -61,9 +64,12 @@ class Prediction:
     device_bytes: int | None = None
     first_visit: float = 0.0
     first_visit_coarse: float = 0.0
+    style: float = 0.0
     evaluation: float = 0.0
+    losses: float = 0.0
     measuring: float = 0.0
     job: float = 0.0
+    ending: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -88,6 +94,7 @@ class Plan:
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         measured: the prediction counts what measuring between steps and the report take.
         measuring: what is measured between steps, at most: place in `measuring.LEVELS`.
+        loss_views: on how many views the loss is taken before and after.
         ranks: how many take part.
         decisions: for people.
         prediction: for comparison with what happens.
@@ -110,6 +117,7 @@ class Plan:
     coarse_weights: bool = False
     measured: bool = False
     measuring: int = 0
+    loss_views: int = 4
     ranks: int = 1
     decisions: tuple[Decision, ...] = ()
     prediction: Prediction | None = None

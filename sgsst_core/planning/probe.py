@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import psutil
 import torch
@@ -42,10 +43,14 @@ from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.kept_weights import Precision as WeightPrecision
+from sgsst_core.rasterizer.projection import Shapes
+from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours
+from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Precision, Settings
 from sgsst_core.timing import Timer, wait_for
 
@@ -57,6 +62,8 @@ LEAST_GRAPH_VISITS = 20
 #: Views whose blend weights are counted and timed; the others are taken to be like them.
 SAMPLED_VIEWS = 3
 
+#: Runs of the network, of which the fastest counts.
+_RATE_RUNS = 2
 #: Of kept blend weights, the exact one first.
 _FORMS: tuple[WeightPrecision, ...] = ("float32", "half")
 
@@ -69,11 +76,13 @@ class SceneFacts:
         gaussians: N.
         sh_degree: of its file.
         used_degree: highest SH degree with a coefficient that is not 0, among the Gaussians that are rendered.
+        held_degree: of what is in memory; 0 where coefficients stay in the file.
     """
 
     gaussians: int
     sh_degree: int
     used_degree: int
+    held_degree: int
 
 
 @dataclass(frozen=True)
@@ -265,8 +274,9 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     pruned = pruned_gaussians(looked, seen)
     error = pruned_image_error(~seen, cameras, distinct, workshop.rasterizer) if pruned.any() else None
     used_degree = scene.used_degree(seen)
+    held_degree = 0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree
     return Probe(
-        SceneFacts(len(scene), scene.sh_degree, used_degree),
+        SceneFacts(len(scene), scene.sh_degree, used_degree, held_degree),
         tuple((camera.height, camera.width) for camera in cameras),
         looked,
         tuple(distinct),
@@ -336,16 +346,22 @@ def _side(workshop: Workshop, loss: SosLoss) -> int:
 
 
 def measure_rate(loss: SosLoss, side: int) -> Rate:
-    """Time the feature network on a small picture of side x side pixels; the second of two runs counts."""
+    """Time the feature network on a small picture of side x side pixels.
+
+    The first run prepares, the fastest of the others counts: what disturbs one of them is no property of the network.
+    """
     image = soft_picture(side).to(loss.network.device)
     style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
-    seconds = []
-    for gradient in (True, True, False):
+
+    def seconds(gradient: bool) -> float:
         timer = Timer(loss.network.device)
         with timer("evaluation"):
             loss.evaluate(image, style, view, [0], gradient=gradient)
-        seconds.append(timer.read()["evaluation"])
-    return Rate(forward=seconds[2] / side**2, both=seconds[1] / side**2)
+        return timer.read()["evaluation"] / side**2
+
+    seconds(True)
+    both = min(seconds(True) for _ in range(_RATE_RUNS))
+    return Rate(forward=min(seconds(False) for _ in range(_RATE_RUNS)), both=both)
 
 
 # --- the rasterizer ------------------------------------------------------------------------------------------------
@@ -361,25 +377,56 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     mean = sum(seconds) / count
     # The least: one of them may have compiled something, or waited for memory.
     more = max(min(first - later for first, later in timed), 0.0)
+    middle = count // 2
+    lists_bytes = 0
+    if isinstance(rasterizer, CpuRasterizer):  # the survey has made the lists that were timed
+        more, lists_bytes = _lists_cost(scene, sample, workshop.settings.near)
+    known: dict[str, Any] = {
+        "first_seconds": more,
+        "lists_bytes": lists_bytes,
+        "colours_seconds": _colours_seconds(scene, sample[middle], rasterizer.device),
+    }
     if rasterizer.name == "cuda":
-        return RasterCost(mean, first_seconds=more)
+        return RasterCost(mean, **known)
     anew = rasterizer
     if not isinstance(anew, CpuRasterizer | TritonRasterizer):
         anew = CpuRasterizer(scene, near=workshop.settings.near)
     cached = CachedRasterizer(scene, anew=anew)
     sizes = [[counted.nbytes(form) for form in _FORMS] for counted in map(cached.count, sample)]
     total, half = (sum(column) * len(cameras) // count for column in zip(*sizes, strict=True))
-    middle = count // 2
     fitting = [form for form, size in zip(_FORMS, sizes[middle], strict=True) if size <= budget]
     if not fitting:
-        return RasterCost(mean, None, total, half, first_seconds=more)
+        return RasterCost(mean, None, total, half, **known)
     keeping = None
     if isinstance(anew, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
         keeping = _keeping_seconds(cached, sample[middle], fitting[0])
     cached = CachedRasterizer(scene, precision=fitting[0], anew=anew)
     kept = _raster_seconds(cached, len(scene), sample[middle])[1]
     # Of the mean view, as the seconds it is compared with.
-    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, more)
+    return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, **known)
+
+
+def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
+    """Seconds and bytes of a view's lists, made once more; mean over some views."""
+    seconds, size, shapes = 0.0, 0, Shapes.of(scene)
+    for camera in cameras:
+        started = time.perf_counter()
+        size += build_raster_lists(scene, camera, near=near, shapes=shapes).nbytes
+        seconds += time.perf_counter() - started
+    return seconds / len(cameras), size // len(cameras)
+
+
+def _colours_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
+    """Of what spherical harmonics add to a view's colours, for the second time: the first one compiles."""
+    seconds = 0.0
+    if scene.sh_degree:
+        sh_rest, means = scene.sh_rest.to(device), scene.means.to(device)
+        for _ in range(2):
+            started = time.perf_counter()
+            rest_colours(sh_rest, means, camera)
+            wait_for(device)
+            seconds = time.perf_counter() - started
+    return seconds
 
 
 def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPrecision) -> float:

@@ -48,6 +48,8 @@ class Survey:
         regions: for each view, the rectangle that holds every covered pixel.
         uncovered_share: share of uncovered pixels in the views that see anything.
         shown: Gaussians that such a view shows, their mean; None in surveys that did not count them.
+        uncovered: for each view, its share of uncovered pixels, 1 where nothing is seen; None in surveys that did not
+            tell them apart.
     """
 
     total_blend_weights: Tensor
@@ -55,6 +57,7 @@ class Survey:
     regions: list[Rectangle]
     uncovered_share: float
     shown: float | None = None
+    uncovered: list[float] | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,9 @@ def survey(
     uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
     regions = [looks[index].region for index in range(len(cameras))]
     shown = sum(looks[index].shown for index in covered) / len(covered)
-    return Survey(weights, covered, regions, uncovered_share, shown)
+    ordered = [looks[index] for index in range(len(cameras))]
+    uncovered = [look.uncovered / look.pixels if look.covered else 1.0 for look in ordered]
+    return Survey(weights, covered, regions, uncovered_share, shown, uncovered)
 
 
 def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:

@@ -7,6 +7,7 @@ the float64 reference: tests/sgsst_core/test_sos.py.)
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -119,17 +120,26 @@ class ExactTwin:
         gradient[self.shown] = self.views.gradient(index, pixels.to(image.device), colours).cpu()
         return gradient, time.perf_counter() - started
 
-    def gradient_error(self) -> GradientError:
-        """Compare the job's gradient of its latest view with the exact one, at the job's present colours."""
+    def gradient_error(self, *, start: bool = False) -> GradientError:
+        """Compare the job's gradient of its latest view with the exact one, at the job's present colours.
+
+        Args:
+            start: compare that of the first view at the unstylized colours, whatever the present ones are.
+        """
         stylizer = self._stylizer
-        index = stylizer.history[-1].view if stylizer.history else stylizer.views.covered[0]
-        scales = stylizer.phase.scales(stylizer.scale_count(index))
-        approximate, seconds = stylizer.gradient(index, scales)
-        exact, seconds_exact = self.gradient(index, stylizer.stylized(), scales)
+        if start or not stylizer.history:
+            index, phase = stylizer.views.covered[0], stylizer.schedule[0]
+        else:
+            index, phase = stylizer.history[-1].view, stylizer.phase
+        scales = phase.scales(stylizer.scale_count(index))
+        colours = stylizer.scene.sh_dc if start else stylizer.stylized()
+        with stylizer.with_colours(colours) if start else nullcontext():
+            approximate, seconds = stylizer.gradient(index, scales)
+        exact, seconds_exact = self.gradient(index, colours, scales)
         seen = stylizer.plan.seen
         difference = Difference.of(approximate, exact[seen])
         return GradientError(
-            stylizer.step,
+            0 if start else stylizer.step,
             stylizer.views.cameras[index].name,
             difference.relative_error,
             difference.cosine,

@@ -18,7 +18,7 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.ply import SceneFile
-from sgsst_core.planning.survey import sees_something
+from sgsst_core.planning.survey import Survey, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -73,10 +73,16 @@ class Finding:
     done: str
 
 
-def findings_of(file: SceneFile, cameras: Sequence[Camera], style: Tensor | None, *, near: float) -> list[Finding]:
-    """What is extreme in a scene that was read with `drop_invalid`, its views, and a style image [H, W, 3] if given."""
-    rasterizer = make_rasterizer("cpu", file.scene, near=near)
-    found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near)]
+def findings_of(
+    file: SceneFile, cameras: Sequence[Camera], style: Tensor | None, *, near: float, looked: Survey | None = None
+) -> list[Finding]:
+    """What is extreme in a scene that was read with `drop_invalid`, its views, and a style image [H, W, 3] if given.
+
+    Args:
+        looked: a survey of the cameras, which need not be looked at again then.
+    """
+    rasterizer = make_rasterizer("cpu", file.scene, near=near)  # builds nothing yet
+    found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, looked=looked)]
     return found if style is None else [*found, *style_findings(style, cameras)]
 
 
@@ -189,7 +195,7 @@ class _Scene:
         found = []
         for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
             if values.shape[1]:
-                size = values.largest() if isinstance(values, StoredHarmonics) else values.abs().flatten(1).amax(1)
+                size = values.largest() if isinstance(values, StoredHarmonics) else _largest(values)
                 found += self.finding(
                     f"{name} SH coefficients above {LARGE_COEFFICIENT:g}",
                     size > LARGE_COEFFICIENT,
@@ -219,9 +225,19 @@ def scene_extent(scene: Scene) -> tuple[Tensor, float]:
     return centre, extent or 1.0
 
 
-def view_findings(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float) -> list[Finding]:
-    """What is extreme in the views, and which Gaussians they do not show; each is rendered once, forwards and back."""
-    return [*_lenses(cameras), *_near(file.scene, cameras, near), *_shown(file, cameras, rasterizer)]
+def view_findings(
+    file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float, looked: Survey | None = None
+) -> list[Finding]:
+    """What is extreme in the views, and which Gaussians they do not show.
+
+    Args:
+        looked: a survey of the cameras; without one each of them is rendered, forwards and back.
+    """
+    if looked is not None and looked.uncovered is not None:
+        shown = [*_uncovered(looked.uncovered, cameras), *_seldom_seen(file, looked.total_blend_weights)]
+    else:
+        shown = _shown(file, cameras, rasterizer)
+    return [*_lenses(cameras), *_near(file.scene, cameras, near), *shown]
 
 
 def _of_views(
@@ -309,21 +325,28 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
         if refused
         else []
     )
-    found += _of_views(
-        "see no Gaussian",
-        uncovered,
-        [share == 1 for share in uncovered],
-        cameras,
-        "left out; a job needs one that does",
-    )
-    found += _of_views(
-        f"more than {UNCOVERED:.0%} uncovered (value: share)",
-        uncovered,
-        [UNCOVERED < share < 1 for share in uncovered],
-        cameras,
-        "statistics are weighted by coverage where the views' mean is above 1 % (--position-weights auto)",
-    )
+    found += _uncovered(uncovered, cameras)
     return found if refused else [*found, *_seldom_seen(file, blend_weights)]
+
+
+def _uncovered(shares: list[float], cameras: Sequence[Camera]) -> list[Finding]:
+    """Views that see nothing, or not everywhere, from each one's share of uncovered pixels."""
+    return [
+        *_of_views(
+            "see no Gaussian",
+            shares,
+            [share == 1 for share in shares],
+            cameras,
+            "left out; a job needs one that does",
+        ),
+        *_of_views(
+            f"more than {UNCOVERED:.0%} uncovered (value: share)",
+            shares,
+            [UNCOVERED < share < 1 for share in shares],
+            cameras,
+            "statistics are weighted by coverage where the views' mean is above 1 % (--position-weights auto)",
+        ),
+    ]
 
 
 def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
@@ -370,3 +393,9 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
             Finding("style", "too small for the deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
         )
     return found
+
+
+def _largest(values: Tensor) -> Tensor:
+    """Largest absolute value of each row of values [N, ...], [N]; without a copy of all of them."""
+    lowest, highest = values.flatten(1).aminmax(dim=1)
+    return torch.maximum(-lowest, highest)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -33,6 +33,7 @@ from sgsst_core.quality.consistency import (
 )
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.arguments import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
@@ -50,6 +51,8 @@ LARGEST_TURN = math.radians(60)
 LIKENESS = 2.0
 #: Longer side in pixels at which that is looked at.
 _OUTLOOK_SIDE = 160
+#: Gaussians that are looked at there: of larger scenes evenly chosen ones, so much larger that they cover as much.
+_OUTLOOK_GAUSSIANS = 250_000
 #: cos(60 degrees) of a camera file has been rounded.
 _COSINE_ROUNDING = 1e-6
 
@@ -144,6 +147,8 @@ class HeldOut:
         first: `HeldOutMoment.gram` of the run's first measurement, where a session before this one has made it.
         most: views whose Gram distance is measured, and pairs of each range that are compared, at most.
         memory: bytes that coverage, colours, warps and pictures may take; what does not fit is computed again.
+        rasterizer_of: makes one of a part of the scene, for a first look at the views of a large one; None looks at
+            all of it.
 
     Attributes:
         cameras: all held-out views.
@@ -166,6 +171,7 @@ class HeldOut:
         first: dict[int, float] | None = None,
         most: int = MOST_VIEWS,
         memory: int = 1 << 29,
+        rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
     ) -> None:
         self.scene = scene
         self.rasterizer = rasterizer
@@ -173,6 +179,7 @@ class HeldOut:
         self.weighted = weighted
         self.first = first
         self._style_targets = style_targets
+        self._rasterizer_of = rasterizer_of
         self._loss = SosLoss(
             loss.network,
             content_weight=0.0,
@@ -200,28 +207,33 @@ class HeldOut:
         # the first views of the short pairs: they have to be rendered anyway, and are as even
         views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(min(count, most)))
         used = {*views, *(index for chosen in pairs.values() for pair in chosen for index in pair)}
-        clear = {index for index in used if self._is_clear(self.cameras[index], parents[index])}
+        rough, rasterizer = self.scene, self.rasterizer
+        if self._rasterizer_of is not None and len(rough) > _OUTLOOK_GAUSSIANS:
+            rough = sampled(rough, _OUTLOOK_GAUSSIANS)
+            rasterizer = self._rasterizer_of(rough)
+        looks: dict[CameraKey, tuple[float, float | None]] = {}  # a camera is the neighbour of two
+
+        def outlook(view: Camera) -> tuple[float, float | None]:
+            key = camera_key(view)
+            if key not in looks:
+                looks[key] = _outlook(view, rough, rasterizer)
+            return looks[key]
+
+        clear = {index for index in used if self._is_clear(self.cameras[index], parents[index], outlook)}
         return [index for index in views if index in clear], {
             gap: [pair for pair in chosen if clear.issuperset(pair)] for gap, chosen in pairs.items()
         }
 
-    def _is_clear(self, camera: Camera, parents: tuple[Camera, Camera]) -> bool:
+    def _is_clear(
+        self, camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], tuple[float, float | None]]
+    ) -> bool:
         """Whether a held-out camera sees much the same as its neighbours do, rather than the inside of something."""
-        (covered, depth), *others = (self._outlook(view) for view in (camera, *parents))
+        (covered, depth), *others = (outlook(view) for view in (camera, *parents))
         return (
             covered > 0
             and _alike(covered, [other[0] for other in others])
             and (depth is None or _alike(depth, [other[1] for other in others if other[1] is not None]))
         )
-
-    def _outlook(self, camera: Camera) -> tuple[float, float | None]:
-        """Mean coverage of a view, 0 if nothing can be seen, and median depth where it is known."""
-        small = resized(camera, min(_OUTLOOK_SIDE, max(camera.width, camera.height)))
-        coverage = self.rasterizer.coverage(small)
-        seen = sees_something(coverage)
-        depth = expected_depth(self.scene, small, self.rasterizer)
-        known = depth.depth[depth.known]
-        return float(coverage.mean()) if seen else 0.0, float(known.median()) if len(known) else None
 
     @torch.no_grad()
     def measure(self, sh_dc: Tensor) -> HeldOutMoment:
@@ -281,6 +293,29 @@ class HeldOut:
         """How view j's picture is brought into view i."""
         depth, other = (expected_depth(self.scene, self.cameras[k], self.rasterizer) for k in (i, j))
         return find_warp(other, self.cameras[j], depth, self.cameras[i])
+
+
+def sampled(scene: Scene, count: int) -> Scene:
+    """At most `count` Gaussians of a scene, one of each so many, enlarged by the root of how many it stands for.
+
+    Which one is chance, seeded: files may hold Gaussians in an order that every so-manyth would keep to. The area that
+    a Gaussian covers grows with the square of its size, so that together they cover about as much.
+    """
+    step = -(-len(scene) // count)
+    first = torch.arange(0, len(scene), step)
+    chosen = first + torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
+    part = scene.subset(chosen.clamp_max(len(scene) - 1))
+    return replace(part, scales=part.scales + math.log(step) / 2)
+
+
+def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[float, float | None]:
+    """Mean coverage of a view, 0 if nothing can be seen, and median depth where it is known."""
+    small = resized(camera, min(_OUTLOOK_SIDE, max(camera.width, camera.height)))
+    coverage = rasterizer.coverage(small)
+    seen = sees_something(coverage)
+    depth = expected_depth(scene, small, rasterizer)
+    known = depth.depth[depth.known]
+    return float(coverage.mean()) if seen else 0.0, float(known.median()) if len(known) else None
 
 
 def _alike(value: float, others: list[float]) -> bool:

@@ -3,42 +3,38 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
 from torch import Tensor
 
-from sgsst_core.planning.measuring import LEVELS, Level, Prices, choose_level, held_out_seconds
+from sgsst_core.planning.measuring import (
+    LEVELS,
+    NOTHING,
+    Level,
+    Prices,
+    choose_level,
+    held_out_list_bytes,
+    held_out_seconds,
+)
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
-
-#: Seconds that compiling kernels may take on a machine where nothing has been compiled yet.
-_COMPILING = 60.0
-
-
-@dataclass(frozen=True)
-class _Affordable:
-    """What prices allow: place in `LEVELS`, seconds of a moment after the first; whether prices may have been wrong."""
-
-    place: int
-    again: float
-    once_more: bool
 
 
 class Measurements:
     """Measures a job; pass an object of this as `loop.Callbacks.measure`.
 
     Everything is built at first use. Results go to `Stylizer.measured`, one entry a moment, ready for JSON: "step",
-    "held_out" and "approximation" (None where there is nothing to measure), the "seconds" it took. How much is measured
-    is the plan's, or less where the first view takes longer than it thought: decided once, by the first rank, and kept
-    in the first entry with what a moment takes after it ("level", "again").
+    "held_out" and "approximation" (None where there is nothing to measure), the "seconds" it took. The moment of step 0
+    is measured together with the one after it, from the unstylized colours, so that the first step need not wait. How
+    much is measured is the plan's, or less where the first view takes longer than it thought: decided once, by the
+    first rank, and kept in the first entry with what a moment takes after it ("level", "again").
 
     Args:
         stylizer: the job, at any step.
@@ -49,6 +45,7 @@ class Measurements:
         self.approximated = approximations(stylizer)
         self._exact: ExactTwin | None = None
         self._held_out: HeldOut | None = None
+        self._seen_by: tuple[Scene, Rasterizer] | None = None
 
     @property
     def exact(self) -> ExactTwin:
@@ -72,61 +69,73 @@ class Measurements:
 
     def due(self, step: int) -> bool:
         """Whether the job is to be measured after so many steps."""
-        return step in self.moments
+        return step > 0 and step in self.moments
 
     def seconds_left(self, step: int) -> float:
-        """What the moments after so many steps will take, and the loss at the end."""
+        """What the moments from so many steps on will take, and the loss before and after."""
         expected, measured = self._stylizer.plan.prediction, self._stylizer.measured
-        left = sum(moment >= step and not (measured and moment == measured[-1]["step"]) for moment in self.moments)
+        done = {entry["step"] for entry in measured}
+        left = sum((moment >= step or not measured) and moment not in done for moment in self.moments)
         price: float
-        before = 2 * expected.evaluation if expected else 0.0
+        losses = expected.losses if expected else 0.0
         known: list[float] = [entry["seconds"] for entry in measured[1:] if "seconds" in entry]
         if known:
             price = median(known)
         elif measured and "again" in measured[0]:
             price = measured[0]["again"]
         else:
-            price = (expected.measuring - before) / max(len(self.moments), 1) if expected else 0.0
-        return left * max(price, 0.0) + before / 2
+            price = (expected.measuring - losses) / max(len(self.moments), 1) if expected else 0.0
+        return left * max(price, 0.0) + losses
 
     def evaluate(self, *, unstylized: bool = False) -> Evaluation:
         """Exact loss on the evaluation views, of the present colours or of the unstylized scene."""
         stylizer = self._stylizer
-        with self._counted():
+        if unstylized and not self.approximated:
+            return stylizer.start()
+        with stylizer.measuring():
             if not self.approximated:
-                return stylizer.start() if unstylized else stylizer.evaluate(stylizer.evaluation_views)
+                return stylizer.evaluate(stylizer.evaluation_views)
             colours = stylizer.scene.sh_dc if unstylized else stylizer.stylized()
             return self.exact.evaluate(stylizer.evaluation_views, colours)
 
     def at_the_end(self) -> None:
         """Measure the last moment, wherever the job has ended, unless that has been done."""
-        stylizer = self._stylizer
-        if stylizer.settings.measure and not (stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step):
-            self(stylizer)
+        if self.moments:
+            with self._stylizer.measuring():
+                self._measure_start()
+                measured = self._stylizer.measured
+                if not measured or measured[-1]["step"] != self._stylizer.step:
+                    self._measure(start=False)
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Measure now."""
-        with self._counted():
-            started = time.perf_counter()
-            approximation = self.exact.gradient_error().as_dict() if self.approximated else None
+        """Measure now; the start too, where it is to be and has not been."""
+        if stylizer.step == stylizer.total:
+            stylizer.stylized()  # the result, which is not made for measuring
+        with stylizer.measuring():
+            self._measure_start()
+            if self.due(stylizer.step):  # as the first view's price has it
+                self._measure(start=False)
+
+    def _measure_start(self) -> None:
+        if self.level.start and not self._stylizer.measured:
+            self._measure(start=True)
+
+    def _measure(self, *, start: bool) -> None:
+        """One moment: the present one, or the unstylized scene's."""
+        stylizer, started = self._stylizer, time.perf_counter()
+        approximation = self.exact.gradient_error(start=start).as_dict() if self.approximated else None
+        own: dict[str, Any] = {}
+        if not stylizer.measured:
+            stylized = stylizer.stylized()  # its seconds are a moment's, and it is kept for the one that follows
             seconds = time.perf_counter() - started
-            colours = stylizer.stylized() if stylizer.step else stylizer.scene.sh_dc
-            own: dict[str, Any] = {}
-            if not stylizer.measured:
-                own = self._first(colours, seconds)
-            moment = self._moment(colours, own)
-            entry = {"step": stylizer.step, "held_out": moment, "approximation": approximation, **own}
-            entry["seconds"] = time.perf_counter() - started
+            own = self._first(stylizer.scene.sh_dc if start else stylized, seconds)
+        moment = self._moment(stylizer.scene.sh_dc if start else stylizer.stylized(), own, start=start)
+        step = 0 if start else stylizer.step
+        entry = {"step": step, "held_out": moment, "approximation": approximation, **own}
+        entry["seconds"] = time.perf_counter() - started
         stylizer.measured.append(entry)
 
-    @contextmanager
-    def _counted(self) -> Iterator[None]:
-        """Count the seconds beside those of the steps."""
-        started, parts = time.perf_counter(), self._stylizer.seconds_by_part
-        yield
-        parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
-
-    def _moment(self, colours: Tensor, own: dict[str, Any]) -> dict[str, Any] | None:
+    def _moment(self, colours: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
         """Held-out views with colours [N, 3]; None without any. `own`: what the first entry holds."""
         stylizer, held_out = self._stylizer, self._of_held_out_views()
         if own:
@@ -136,27 +145,19 @@ class Measurements:
         if not held_out.views:
             return None
         measured = held_out.measure(colours.to(held_out.rasterizer.device))
-        first = stylizer.measured[0] if stylizer.measured else {"step": stylizer.step}
-        if first["step"]:  # there is no start to compare it with
+        if not start and (not stylizer.measured or stylizer.measured[0]["step"]):  # no start to compare it with
             measured = replace(measured, gram_relative=None)
-        return measured.as_dict(stylizer.step, stylizer.seconds)
+        return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
 
     def _first(self, colours: Tensor, seconds: float) -> dict[str, Any]:
-        """How much is measured, from what one view of it takes; seconds: of the gradient's error."""
+        """How much is measured, from what one view of it takes; seconds: of a moment beside its views."""
         stylizer, place = self._stylizer, self._stylizer.plan.measuring
         again = 0.0
-        if stylizer.step < stylizer.total and LEVELS[place] is not LEVELS[-1]:
+        if LEVELS[place].views and LEVELS[place].start:
             held_out, prices = self._trial(colours, seconds)
             if held_out.views:
-                found = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
-                if found.once_more:
-                    if self.approximated:
-                        started = time.perf_counter()
-                        self.exact.gradient_error()
-                        seconds = time.perf_counter() - started
-                    prices = self._trial(colours, seconds)[1]
-                    found = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
-                place, again = found.place, found.again
+                place = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
+                again = prices.again(LEVELS[place])
             if LEVELS[place].views == 1:
                 self._held_out = held_out
         if self._held_out is None:
@@ -164,27 +165,28 @@ class Measurements:
         return {"level": place, "again": again}
 
     def _trial(self, colours: Tensor, seconds: float) -> tuple[HeldOut, Prices]:
-        """One view of colours [N, 3], measured, and its price; seconds: of the gradient's error."""
+        """One view of colours [N, 3], measured, and its price; seconds: of a moment beside its views."""
         lpips = load_lpips_or_none(self._stylizer.network.device)  # is not what a view takes
-        started = time.perf_counter()
+        clock = [time.perf_counter()]
         held_out = self._make(1, lpips)
-        ready = time.perf_counter()
-        if held_out.views:
+        for _ in range(2 if held_out.views else 0):  # the first time its lists, depth and warps are made
+            clock.append(time.perf_counter())
             held_out.measure(colours.to(held_out.rasterizer.device))
-        return held_out, Prices(ready - started, time.perf_counter() - ready, seconds)
+        clock.append(time.perf_counter())
+        again = clock[-1] - clock[-2]
+        return held_out, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
 
-    def _affordable(self, place: int, prices: Prices) -> _Affordable:
+    def _affordable(self, place: int, prices: Prices) -> int:
         """The level that these prices allow, from the plan's on.
 
-        Kernels are compiled at first use: where a price may be that of compiling, it is found once more.
+        Nothing is compiled in them: steps have been made by then.
         """
-        stylizer = self._stylizer
-        expected, found = stylizer.plan.prediction, place
-        if expected is not None:
-            allowed = held_out_seconds(stylizer.settings.measure, expected)
-            found = choose_level(prices, allowed, stylizer.total, place)
-        quick = prices.setup + prices.view + prices.moment < _COMPILING
-        return _Affordable(found, prices.again(LEVELS[found]), found != place and quick)
+        stylizer, expected = self._stylizer, self._stylizer.plan.prediction
+        if expected is None:
+            return place
+        allowed = held_out_seconds(stylizer.settings.measure, expected)
+        # One view has been prepared by now: that it be measured at the end costs little.
+        return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
 
     def _of_held_out_views(self) -> HeldOut:
         if self._held_out is None:
@@ -194,15 +196,25 @@ class Measurements:
     def _make(self, views: int, lpips: Lpips | None = None) -> HeldOut:
         """Held-out views, at most so many."""
         stylizer = self._stylizer
-        scene = stylizer.scene.without_zero_bands()
         settings = stylizer.settings
+        options: dict[str, Any] = {"background": settings.background, "near": settings.near}
+        if stylizer.plan.anew == "cpu":
+            options["max_list_bytes"] = held_out_list_bytes(stylizer.memory)
+
+        def rasterizer_of(part: Scene) -> Rasterizer:
+            return make_rasterizer(stylizer.plan.anew, part, **options)
+
+        if self._seen_by is None:
+            scene = stylizer.scene.without_zero_bands()
+            self._seen_by = scene, rasterizer_of(scene)
+        scene, rasterizer = self._seen_by
         source = self.exact if stylizer.network.precision != "float32" else stylizer
         first = stylizer.measured[0]["held_out"] if stylizer.measured else None
         return HeldOut(
             stylizer.views.cameras,
             stylizer.views.covered,
             scene,
-            make_rasterizer(stylizer.plan.anew, scene, background=settings.background, near=settings.near),
+            rasterizer,
             source.loss,
             source.style_targets,
             weighted=stylizer.plan.weighted,
@@ -210,4 +222,5 @@ class Measurements:
             memory=stylizer.memory // 16,
             first={int(scale): value for scale, value in first["gram"].items()} if first else None,
             most=views,
+            rasterizer_of=rasterizer_of,
         )

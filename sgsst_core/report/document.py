@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from sgsst_core.budget import device_peak
@@ -14,6 +14,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.parallel.collectives import TRAFFIC
+from sgsst_core.planning.measuring import allowed_seconds
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version
@@ -104,6 +105,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
             "relative_by_scale": {str(scale): after[scale].total / before[scale].total for scale in before},
         },
         "bought": bought(stylizer, before),
+        "measuring": _measuring_json(stylizer),
         "held_out": held_out_json(stylizer.measured),
         "approximations": approximations_json(stylizer.measured),
     }
@@ -144,29 +146,68 @@ def _graphs_json(stylizer: Stylizer) -> dict[str, Any] | None:
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
     """What happened, beside the plan's prediction.
 
-    Median seconds of a step of either phase and, in the second, of waiting for other ranks; the speed-up over one rank,
-    whose seconds are the predicted ones; peak memory of the process and of its GPU in bytes; seconds of measuring.
+    Median seconds of a step of either phase whose view had been visited before, and what a first visit takes beside
+    them; of waiting for other ranks in the second phase; the speed-up over one rank, whose seconds are the predicted
+    ones; peak memory of the process and of its GPU in bytes; seconds of measuring.
     """
-    values = {
-        stage: [
-            sum(seconds for name, seconds in record.parts.items() if name != "prepare")
-            for record in stylizer.history
-            if record.stage == stage
-        ]
-        for stage in ("sos", "coarse")
-    }
-    seconds = {stage: median(steps) if steps else None for stage, steps in values.items()}
+    seconds, first_visits = zip(*(_step_seconds(stylizer, stage) for stage in ("sos", "coarse")), strict=True)
     waited = [record.parts.get("communication", 0.0) for record in stylizer.history if record.stage == "sos"]
     expected = stylizer.plan.prediction
     one_rank = expected.seconds_one_rank if expected else None
     return {
-        "seconds": seconds["sos"],
-        "seconds_coarse": seconds["coarse"],
+        "seconds": seconds[0],
+        "seconds_coarse": seconds[1],
+        "first_visit": first_visits[0],
+        "first_visit_coarse": first_visits[1],
         "communication": median(waited) if waited else None,
-        "speed_up": one_rank / seconds["sos"] if one_rank and seconds["sos"] else None,
+        "speed_up": one_rank / seconds[0] if one_rank and seconds[0] else None,
         "peak_bytes": peak_memory(),
         "device_bytes": device_peak(stylizer.network.device),
         "measuring": stylizer.seconds_by_part.get("measuring"),
+    }
+
+
+def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float | None]:
+    """Of a step of a phase whose view had been visited, median; and what a first visit takes beside them, mean.
+
+    The job's first step is left out where there are other first visits: it prepares the style, too. Where no view came
+    again, or a step takes several, of which its record names one, what is known to be preparation is left out of all
+    steps, and nothing is said of first visits.
+    """
+    again: list[float] = []
+    first: list[float] = []
+    bare: list[float] = []
+    visited: set[int] = set()
+    before = 0.0
+    for record in stylizer.history:
+        if record.stage == stage:
+            seconds = record.seconds - before
+            (again if record.view in visited else first).append(seconds)
+            visited.add(record.view)
+            bare.append(sum(seconds for name, seconds in record.parts.items() if name != "prepare"))
+        before = record.seconds
+    if stylizer.settings.views_per_step > 1 or not again:
+        return (median(bare) if bare else None), None
+    known = median(again)
+    first = first[1:] if stylizer.history[0].stage == stage and len(first) > 1 else first
+    return known, max(mean(first) - known, 0.0)
+
+
+def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
+    """What was measured beside the steps, what it took, and how much of the steps' time that is."""
+    seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.plan.prediction
+    share = stylizer.settings.measure
+    return {
+        "share": share,
+        "allowed": allowed_seconds(share, expected.job - expected.measuring) if expected else None,
+        "seconds": round(seconds, 3),
+        "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
+        "loss_views": len(stylizer.evaluation_views),
+        "held_out_views": len(stylizer.measured[0].get("held_out_views", [])) if stylizer.measured else 0,
+        "moments": [
+            {"step": entry["step"], "seconds": round(entry["seconds"], 3) if "seconds" in entry else None}
+            for entry in stylizer.measured
+        ],
     }
 
 

@@ -86,15 +86,26 @@ def decision_table(report: dict[str, Any]) -> Table:
     )
 
 
+#: Beside steps whose view has been visited before.
+_VISITS = {"first_visit": "a view's first visit, beside it", "first_visit_coarse": "the same in phase 1"}
+
+
 def prediction_table(report: dict[str, Any]) -> Table:
     """What the plan expected beside what happened."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
     rows = [
         _beside("a step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
+        *(
+            _beside(text, predicted.get(name), measured[name], duration)
+            for name, text in _VISITS.items()
+            if measured.get(name) is not None
+        ),
         _beside("peak memory", predicted.get("peak_bytes"), measured.get("peak_bytes"), byte_count),
     ]
     if predicted.get("measuring") and measured.get("measuring") is not None:
         rows.append(_beside("measuring, in all", predicted["measuring"], measured["measuring"], duration))
+        planned = _share(predicted["measuring"], predicted["job"] - predicted["measuring"])
+        rows.append(_beside("of the steps' time", planned, _share(measured["measuring"], report["seconds"]), percent))
     on_device = predicted.get("device_bytes"), measured.get("device_bytes")
     if any(value is not None for value in on_device):
         rows.append(_beside("peak memory of the GPU", *on_device, byte_count))
@@ -105,6 +116,11 @@ def prediction_table(report: dict[str, Any]) -> Table:
         rows.append(_beside("speed-up over one rank", one_rank / seconds, measured.get("speed_up"), number))
     columns = [Column(""), Column("predicted", True), Column("measured", True), Column("measured / predicted", True)]
     return Table(columns, rows)
+
+
+def _share(part: float, whole: float) -> float | None:
+    """A part's share; None of nothing."""
+    return part / whole if whole else None
 
 
 def _beside(name: str, before: float | None, after: float | None, text: Callable[[float | None], str]) -> list[str]:

@@ -52,7 +52,6 @@ class Checkpoint:
         state: of the stylizer.
         plan: that the job follows; with it a resumed run need not look at every view again.
         ranks: that there were when the plan was made.
-        before: loss of the unstylized scene.
         run: identifies the run of the program that wrote it.
         written_by: versions of the program and of PyTorch.
     """
@@ -60,7 +59,6 @@ class Checkpoint:
     state: StylizerState
     plan: Plan
     ranks: int
-    before: Evaluation
     run: str
     written_by: dict[str, str]
 
@@ -188,7 +186,6 @@ def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
         "measured": json.dumps(state.measured),
         "plan": json.dumps(plan_values),
         "ranks": str(checkpoint.ranks),
-        "before": json.dumps(_evaluation_values(checkpoint.before)),
     }
     try:
         save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
@@ -225,7 +222,6 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
             state=_state(tensors, metadata),
             plan=_plan(tensors, _plan_values(metadata)),
             ranks=int(metadata["ranks"]),
-            before=_evaluation(json.loads(metadata["before"])),
             run=metadata["run"],
             written_by=json.loads(metadata["written_by"]),
         )

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss.terms import LayerTarget, LossTerms
-from sgsst_core.planning.job import EVALUATION_VIEWS
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.views import Views
 
@@ -16,9 +15,9 @@ Evaluation = dict[int, LossTerms]
 StyleTargets = dict[int, dict[str, LayerTarget]]
 
 
-def evaluation_views(covered: Sequence[int]) -> list[int]:
-    """At most four of some views, evenly spread; the contact sheet shows them too."""
-    count = min(EVALUATION_VIEWS, len(covered))
+def evaluation_views(covered: Sequence[int], most: int) -> list[int]:
+    """At most so many of some views, evenly spread; the contact sheet shows them too."""
+    count = min(most, len(covered))
     return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
 
 

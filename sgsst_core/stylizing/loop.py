@@ -36,7 +36,7 @@ class Progress:
         step: made so far, of `total`.
         loss: of the step.
         seconds: of all steps so far.
-        seconds_left: until the job ends, with all that is measured.
+        seconds_left: until the job ends, with all that is measured and written.
     """
 
     stage: str
@@ -71,8 +71,7 @@ class Callbacks:
         stop: asked before every iteration; True ends the loop as "interrupted".
         checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
         preview: called with the stylizer about every `preview_seconds`.
-        measure: called with the stylizer after each step for which it is due, and before the first one for 0; its time
-            does not count as the job's.
+        measure: called with the stylizer after each step for which it is due; its time does not count as the job's.
     """
 
     progress: Callable[[Progress], None] | None = None
@@ -96,7 +95,7 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     """As `run`, which clears up after it."""
     last_checkpoint = last_preview = time.perf_counter()
     pace = _pace(stylizer)
-    _measure(stylizer, callbacks)
+    _measure(stylizer, callbacks)  # where a resumed job had not come to it
     while stylizer.step < stylizer.total:
         reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
@@ -130,7 +129,7 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     if not (settings.target_loss or settings.early_stop):
         return None
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]
-    if settings.target_loss:
+    if settings.target_loss and len(losses) >= stylizer.round_length:  # every view has been visited by then
         target = settings.target_loss * mean_loss(stylizer.start())
         if has_reached(losses, target, stylizer.round_length):
             return "target-loss"
@@ -152,7 +151,7 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
     }
     phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.schedule]
     views_per_step = stylizer.settings.views_per_step
-    pace = SecondsLeft(phases, stylizer.views.covered, views_per_step, stylizer.prepared)
+    pace = SecondsLeft(phases, stylizer.views.covered, views_per_step)
     if views_per_step == 1:  # records name one view of each step
         before = 0.0
         for record in stylizer.history:
@@ -163,14 +162,16 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
 
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
-    """Make a step and count what it took."""
-    before = stylizer.seconds
+    """Make a step and count what it took, but for the style, which comes once."""
+    before = stylizer.seconds - stylizer.style_seconds
     record = stylizer.run_step()
-    pace.add_step(record.stage, stylizer.latest, stylizer.seconds - before, record.parts.get("prepare", 0.0))
+    seconds = stylizer.seconds - stylizer.style_seconds - before
+    pace.add_step(record.stage, stylizer.latest, seconds, record.parts.get("prepare", 0.0))
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:
     record, most, measure = stylizer.history[-1], stylizer.settings.max_seconds, callbacks.measure
+    expected = stylizer.plan.prediction
     left = pace.left(
         stylizer.step,
         stylizer.coming,
@@ -178,7 +179,9 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Pr
         limit=most - stylizer.seconds if most else None,
     )
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
-    return Progress(stage, record.step, stylizer.total, record.loss, stylizer.seconds, left)
+    return Progress(
+        stage, record.step, stylizer.total, record.loss, stylizer.seconds, left + (expected.ending if expected else 0.0)
+    )
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

@@ -7,7 +7,7 @@ are therefore counted apart by phase, and first visits apart from the rest. Afte
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -64,7 +64,6 @@ class SecondsLeft:
         phases: of the schedule.
         views: that are visited, each once before any comes again.
         views_per_step: how many a step takes.
-        visited: those that have been prepared before the first step.
     """
 
     def __init__(
@@ -72,14 +71,12 @@ class SecondsLeft:
         phases: Sequence[ExpectedPhase],
         views: Collection[int],
         views_per_step: int = 1,
-        visited: Iterable[int] = (),
     ) -> None:
         self._phases = phases
         self._views = frozenset(views)
         self._views_per_step = views_per_step
-        self._before = frozenset(visited)
         self._steps = {phase.stage: _Stage() for phase in phases}
-        self._visited: dict[str, set[int]] = {phase.stage: set(self._before) for phase in phases}
+        self._visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
         #: Seconds of all steps, and of checkpoints and the like, which come as often for as long as there are steps.
         self._seconds = self._beside = 0.0
 
@@ -95,7 +92,7 @@ class SecondsLeft:
 
     def resume(self) -> None:
         """The steps so far were another session's: their prices hold, and every view is to be visited anew."""
-        self._visited = {phase.stage: set(self._before) for phase in self._phases}
+        self._visited = {phase.stage: set() for phase in self._phases}
         self._seconds = self._beside = 0.0
 
     def add_beside(self, seconds: float) -> None:

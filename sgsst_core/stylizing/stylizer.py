@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Self
 
 import psutil
@@ -94,6 +95,8 @@ class Stylizer:
         self.history: list[StepRecord] = []
         #: What was measured between steps (`loop.Callbacks.measure`): values for JSON, kept through a resume.
         self.measured: list[dict[str, Any]] = []
+        #: That the style's statistics have taken, in the steps that needed them first.
+        self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
         self.weights = weights
@@ -128,6 +131,7 @@ class Stylizer:
         self.total = sum(phase.steps for phase in self.schedule)
         self._process = psutil.Process()
         self._start: Evaluation | None = None
+        self._stylized: Tensor | None = None
         self._cost = 0  # pixels of this rank's share of the network in the present step
 
     @classmethod
@@ -246,20 +250,30 @@ class Stylizer:
 
     @property
     def evaluation_views(self) -> list[int]:
-        """Indices of at most four views, evenly spread over those that see anything."""
-        return evaluation_views(self.views.covered)
+        """Indices of the plan's `loss_views`, evenly spread over those that see anything."""
+        return evaluation_views(self.views.covered, self.plan.loss_views)
 
     def start(self) -> Evaluation:
-        """Loss of the unstylized scene on the evaluation views."""
+        """Loss of the unstylized scene on the evaluation views; taken once, whenever it is first asked for."""
         if self._start is None:
-            self._start = self.evaluate(self.evaluation_views, self.views.scene.sh_dc)
+            with self.measuring():
+                self._start = self.evaluate(self.evaluation_views, self.views.scene.sh_dc)
         return self._start
+
+    @contextmanager
+    def measuring(self) -> Iterator[None]:
+        """Count seconds as those of measuring, beside the steps."""
+        started, parts = time.perf_counter(), self.seconds_by_part
+        yield
+        parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
 
     def style_targets(self, camera: Camera) -> StyleTargets:
         """The style's statistics for views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
+            started = time.perf_counter()
             self._style_targets[size] = self.loss.style_targets(self._style, size)
+            self.style_seconds += time.perf_counter() - started
         return self._style_targets[size]
 
     def run_step(self) -> StepRecord:
@@ -269,6 +283,7 @@ class Stylizer:
             DivergedError: the gradient has left the range of float32; the colours are those before the step.
         """
         started = time.perf_counter()
+        self._stylized = None
         self.timer.clear()
         sent = dict(self.collectives.sent)
         phase = self.phase
@@ -398,11 +413,6 @@ class Stylizer:
         """Views left in this round, the next one first."""
         return self._queue[::-1]
 
-    @property
-    def prepared(self) -> list[int]:
-        """Views that had been visited before the first step, for the loss of the unstylized scene."""
-        return self.evaluation_views if self._start is not None else []
-
     def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
         """Mean SOS loss over views, split by scale; changes nothing, its time does not count.
 
@@ -444,18 +454,37 @@ class Stylizer:
         return self.views.rasterizer
 
     def stylized(self) -> Tensor:
-        """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians."""
-        result = self.scene.sh_dc.clone()
-        result[self.plan.seen] = self.sh_dc.detach().cpu()
-        if self.settings.unseen == "neighbours":
-            weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
-            result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
-        return result
+        """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians.
+
+        Kept until the colours change, because the neighbours of millions of unseen Gaussians take seconds to find: it
+        must not be written to.
+        """
+        if self._stylized is None:
+            result = self.scene.sh_dc.clone()
+            result[self.plan.seen] = self.sh_dc.detach().cpu()
+            if self.settings.unseen == "neighbours":
+                weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
+                result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
+            self._stylized = result
+        return self._stylized
 
     def set_colours(self, sh_dc: Tensor) -> None:
         """Put the colours [N, 3] of the whole scene in place of the present ones, to evaluate them on these views."""
+        self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(sh_dc[self.plan.seen])
+
+    @contextmanager
+    def with_colours(self, sh_dc: Tensor) -> Iterator[None]:
+        """Have the colours [N, 3] of the whole scene for a while; the present ones come back, bit for bit."""
+        present, stylized = self.sh_dc.detach().clone(), self._stylized
+        self.set_colours(sh_dc)
+        try:
+            yield
+        finally:
+            self._stylized = stylized
+            with torch.no_grad():
+                self.sh_dc.copy_(present)
 
     def state(self) -> StylizerState:
         """A copy of all that a resumed run needs."""
@@ -476,6 +505,7 @@ class Stylizer:
 
     def load_state(self, state: StylizerState) -> None:
         """Go on from a state of a stylizer with the same arguments, and state.memory as its memory limit."""
+        self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(state.sh_dc)
         if state.step:

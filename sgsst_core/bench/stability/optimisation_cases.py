@@ -203,7 +203,7 @@ def _resumed(full: bool) -> CaseResult:
         first.run_step()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
-        save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, first.start(), "run", versions()), "job")
+        save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, "run", versions()), "job")
         second.load_state(load_checkpoint(path, "job").state)
     run(second)
     return CaseResult(float((whole.sh_dc - second.sh_dc).detach().abs().max()), 0.0, "the same bits")

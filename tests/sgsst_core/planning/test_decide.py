@@ -14,7 +14,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.planning.choices import rasterizer_anew
-from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Rate
+from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
 from sgsst_core.planning.decide import LEAST_PASSES, MEASURING_BYTES, decide
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
@@ -33,7 +33,7 @@ def probe(**changes: Any) -> Probe:
     """Four views of a scene of six Gaussians that fills them, on a CPU with 10 GB; changes: to fields of any part."""
     weights = torch.tensor([0.0, 0.5, 1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
     parts: dict[str, Any] = {
-        "scene": SceneFacts(6, 3, 3),
+        "scene": SceneFacts(6, 3, 3, 3),
         "survey": Survey(weights, list(range(VIEWS)), [WHOLE] * VIEWS, 0.0),
         "network": NetworkFacts(64, 3000.0, 500.0, 2048, Rate(1e-6, 3e-6), fixed=0.01),
         "machine": Machine("cpu", 10 * GIGABYTE),
@@ -484,6 +484,9 @@ def test_measuring_takes_memory_but_changes_no_decision() -> None:
     assert measured.prediction == replace(
         plain.prediction,
         peak_bytes=plain.prediction.peak_bytes + MEASURING_BYTES,
+        evaluation=measured.prediction.evaluation,
+        losses=measured.prediction.losses,
+        ending=measured.prediction.ending,
         measuring=measured.prediction.measuring,
         job=plain.prediction.job + measured.prediction.measuring,
     )
@@ -503,7 +506,8 @@ def test_a_gpu_holds_what_is_computed_with() -> None:
         assert on_gpu is not None
         assert on_cpu.device_bytes is None
         assert on_gpu.peak_bytes == GIGABYTE
-        assert on_gpu.device_bytes == own + on_cpu.peak_bytes - GIGABYTE + 5 * OPTIMISER_BYTES
+        beside = 5 * (STEP_BYTES + 12 * VIEWS + gaussian_bytes(3))
+        assert on_gpu.device_bytes == own + on_cpu.peak_bytes - GIGABYTE - beside
 
 
 def test_the_same_probe_gives_the_same_plan() -> None:

@@ -10,13 +10,22 @@ import pytest
 
 from sgsst_core.planning.cost import RasterCost
 from sgsst_core.planning.decide import decide
-from sgsst_core.planning.measuring import LEAST_ALLOWED, LEVELS, Prices, choose_level, held_out_seconds
+from sgsst_core.planning.measuring import (
+    LEAST_ALLOWED,
+    LEVELS,
+    NOTHING,
+    Prices,
+    choose_level,
+    choose_loss_views,
+    held_out_seconds,
+)
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import probe, said
 
 #: 4 M Gaussians: every first look at a view takes long.
 SLOW = RasterCost(2.0, 1.0, 10**9, 10**9 // 2, first_seconds=5.0)
+VERY_SLOW = RasterCost(50.0, first_seconds=100.0)
 
 
 def plan_of(raster: RasterCost, **values: Any) -> Plan:
@@ -30,10 +39,12 @@ def expected(plan: Plan) -> Prediction:
 
 
 @pytest.mark.parametrize("total", [1, 2, 3, 24, 300, 20_000])
-def test_every_level_measures_the_end_and_no_more_than_the_one_before(total: int) -> None:
+def test_every_level_but_the_last_measures_the_end_and_no_more_than_the_one_before(total: int) -> None:
     prices = Prices(3.0, 0.5, 0.25)
     costs = [prices.of(level, len(level.moments(total))) for level in LEVELS]
-    assert all(level.moments(total)[-1] == total for level in LEVELS)
+    assert all(level.moments(total)[-1] == total for level in LEVELS[:NOTHING])
+    assert LEVELS[NOTHING].moments(total) == []
+    assert costs[NOTHING] == 0
     assert costs == sorted(costs, reverse=True)
     for richer, poorer in itertools.pairwise(LEVELS):
         assert set(poorer.moments(total)) <= set(richer.moments(total))
@@ -41,22 +52,42 @@ def test_every_level_measures_the_end_and_no_more_than_the_one_before(total: int
 
 
 def test_the_first_level_that_is_allowed_is_taken() -> None:
-    """300 steps, prices 1, 0.5 and 0.25: 4 * 1 + 7 * 2.25, 4 * 1 + 4 * 2.25, 2 * 1 + 4 * 1.25, 2 + 2.5, 1 + 1.5."""
+    """300 steps: four or two views are prepared at 1 each, a view takes 0.5 at each moment, which takes 0.25."""
     prices = Prices(1.0, 0.5, 0.25)
-    costs = [19.75, 13.0, 7.0, 4.5, 2.5, 1.75]
+    costs = [19.75, 13.0, 7.0, 4.5, 2.5, 1.75, 0.0]
     assert [prices.of(level, len(level.moments(300))) for level in LEVELS] == costs
     for place, cost in enumerate(costs):
         assert choose_level(prices, cost, 300) == place
-        assert choose_level(prices, cost - 0.01, 300) == min(place + 1, len(LEVELS) - 1)
+        assert choose_level(prices, cost - 0.01, 300) == min(place + 1, NOTHING)
     assert choose_level(prices, 1e9, 300, first=3) == 3  # what the plan has thinned out stays so
 
 
 def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() -> None:
-    steps = Prediction(1.0, 1.0, 0, evaluation=1.5, measuring=50.0, job=1050.0)
-    assert held_out_seconds(0.1, steps) == 100.0 - 3.0
-    assert held_out_seconds(0.001, steps) == LEAST_ALLOWED - 3.0
-    assert held_out_seconds(0.001, replace(steps, evaluation=16.0)) == 0.0
+    steps = Prediction(1.0, 1.0, 0, losses=3.0, measuring=50.0, job=1050.0)
+    assert held_out_seconds(0.1, steps) == 80.0 - 3.0
+    assert held_out_seconds(0.001, steps) == 0.8 * LEAST_ALLOWED - 3.0
+    assert held_out_seconds(0.001, replace(steps, losses=32.0)) == 0.0
     assert held_out_seconds(0.0, steps) == 0.0
+
+
+def test_the_loss_has_half_of_what_is_allowed_and_one_view_at_least() -> None:
+    for steps, price, found in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
+        assert choose_loss_views(0.1, steps, price, 97) == found
+    assert choose_loss_views(0.1, 3000.0, 6.01, 97) == 4
+    assert choose_loss_views(0.1, 0.0, 4.0, 3) == 3  # there are no more
+    assert choose_loss_views(0.0, 3000.0, 3.0, 97) == 4
+
+
+def test_a_target_is_a_share_of_the_loss_on_the_same_views_whatever_they_take() -> None:
+    assert plan_of(VERY_SLOW, steps_sos=4).loss_views == 1
+    assert plan_of(VERY_SLOW, steps_sos=4, target_loss=0.1).loss_views == 4
+
+
+def test_views_that_no_step_has_visited_make_the_loss_dearer() -> None:
+    """Of four views, two steps visit two."""
+    all_, half = (expected(plan_of(RasterCost(0.1, first_seconds=0.4), steps_sos=steps)) for steps in (4, 2))
+    assert all_.losses == 2 * all_.evaluation
+    assert half.losses == pytest.approx(2 * half.evaluation + 4 * half.first_visit / 2)
 
 
 def test_a_plan_keeps_to_the_share_where_a_level_does() -> None:
@@ -64,28 +95,31 @@ def test_a_plan_keeps_to_the_share_where_a_level_does() -> None:
         plan = plan_of(SLOW, steps_sos=steps)
         found = expected(plan)
         allowed = max(LEAST_ALLOWED, 0.1 * (found.job - found.measuring))
-        assert found.measuring <= allowed or plan.measuring == len(LEVELS) - 1
+        assert found.measuring <= allowed
         assert f"{found.measuring:.2g} s beside" in said(plan, "measuring")
-    assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [len(LEVELS) - 1, 0]
-    assert "at the end up to 1 view between" in said(plan_of(SLOW), "measuring")
+    assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [NOTHING, 0]
+    assert said(plan_of(SLOW), "measuring").startswith("the loss before and after on 4 views alone: about ")
+    least = expected(plan_of(VERY_SLOW, steps_sos=4))
+    assert least.measuring == least.losses > LEAST_ALLOWED
     assert "at 7 moments up to 4 views between" in said(plan_of(RasterCost(0.01), steps_sos=300), "measuring")
 
 
 def test_nothing_is_measured_without_a_share() -> None:
     plan = plan_of(SLOW, measure=0.0)
-    assert said(plan, "measuring").startswith("the loss before and after alone: asked for")
-    assert expected(plan).measuring == 2 * expected(plan).evaluation > 0
+    assert said(plan, "measuring").startswith("the loss before and after on 4 views alone: asked for")
+    assert expected(plan).measuring == expected(plan).losses == 2 * expected(plan).evaluation > 0
 
 
 def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
-    """Four views, all of them visited in either phase; lists and kept weights come with the first one."""
+    """Four views, all of them visited in either phase; kept weights come with the first one, the survey's lists too."""
     found = expected(plan_of(SLOW))
-    steps = 8 * found.seconds_coarse + 16 * found.seconds
+    steps = 8 * found.seconds_coarse + 16 * found.seconds + found.style
     assert found.job == pytest.approx(steps + 4 * (found.first_visit_coarse + found.first_visit) + found.measuring)
-    assert found.first_visit_coarse > SLOW.first_seconds + SLOW.seconds
-    assert 0 < found.first_visit < SLOW.first_seconds
+    cut = 0.25 * SLOW.first_seconds
+    assert found.first_visit_coarse > cut + SLOW.seconds
+    assert 0 < found.first_visit < found.first_visit_coarse
     alone = expected(plan_of(SLOW, steps_coarse=0))
-    assert alone.first_visit > SLOW.first_seconds
+    assert alone.first_visit == pytest.approx(cut + found.first_visit)
     limited = expected(plan_of(SLOW, max_seconds=5.0))
     assert limited.job - limited.measuring == pytest.approx(5.0)
 

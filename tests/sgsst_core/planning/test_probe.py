@@ -13,17 +13,20 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.cost import Rate
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import Workshop, _side, equip, measure
+from sgsst_core.planning.probe import Workshop, _side, equip, measure, measure_rate
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.planning.pruning import pruned_image_error
 from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import _progress, survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.timing import Timer
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,6 +58,9 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     assert probe.raster.half_bytes is not None
     assert 0 < probe.raster.half_bytes < probe.raster.bytes
     assert probe.raster.seconds > 0
+    sizes = [build_raster_lists(scene, camera).nbytes for camera in cameras(3)]
+    assert probe.raster.lists_bytes == sum(sizes) // 3
+    assert probe.raster.first_seconds > 0 < probe.raster.colours_seconds
     assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
     assert probe.process_bytes > 10**7
 
@@ -68,6 +74,20 @@ def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: B
     for memory, on_cpu, with_gpu in ((1 << 40, 384, 1024), (int(500.5**2 * a_pixel), 384, 500), (1, 384, ALIGNMENT)):
         loss = SosLoss(network, memory=memory)
         assert (_side(workshop, loss), _side(on_gpu, loss)) == (on_cpu, with_gpu)
+
+
+def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the first one, which prepares; two with gradient, two without."""
+    taken = iter([1.0, 5.0, 3.0, 4.0, 2.0])
+
+    class Clock(Timer):
+        def read(self) -> dict[str, float]:
+            return {**super().read(), "evaluation": next(taken)}
+
+    monkeypatch.setattr("sgsst_core.planning.probe.Timer", Clock)
+    loss = SosLoss(equipped(tiny_weights, wall()).network, memory=1 << 30)
+    assert measure_rate(loss, 64) == Rate(forward=2.0 / 64**2, both=3.0 / 64**2)
+    assert next(taken, None) is None
 
 
 def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:

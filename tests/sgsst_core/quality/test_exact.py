@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.planner import make_plan
@@ -46,6 +47,25 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
     assert 1e-6 < error.relative_error < 0.05
     assert error.seconds > 0
     assert error.seconds_exact > 0
+
+
+def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeights) -> None:
+    """After some steps it is what it was before them, and the colours are those of the steps."""
+    stylizer = make(tiny_weights, kept_weights="half")
+    twin = ExactTwin(stylizer)
+    first = twin.gradient_error()
+    for _ in range(3):
+        stylizer.run_step()
+    colours = stylizer.sh_dc.clone()
+    late = twin.gradient_error(start=True)
+    assert (late.step, late.view, late.relative_error, late.cosine) == (
+        0,
+        first.view,
+        first.relative_error,
+        first.cosine,
+    )
+    assert torch.equal(stylizer.sh_dc, colours)
+    assert twin.gradient_error().relative_error != first.relative_error
 
 
 def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: BackboneWeights) -> None:

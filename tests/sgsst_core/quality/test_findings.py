@@ -12,7 +12,15 @@ import torch
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.ply import SceneFile, read_scene, write_scene
-from sgsst_core.quality.findings import Finding, scene_extent, scene_findings, style_findings, view_findings
+from sgsst_core.planning.survey import survey
+from sgsst_core.quality.findings import (
+    Finding,
+    findings_of,
+    scene_extent,
+    scene_findings,
+    style_findings,
+    view_findings,
+)
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -34,6 +42,21 @@ def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Findin
     file = stored(folder, scene)
     rasterizer = make_rasterizer("cpu", file.scene)
     return {finding.what: finding for finding in view_findings(file, views, rasterizer, near=NEAR)}
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_survey_takes_the_place_of_another_look(tmp_path: Path, turned: bool) -> None:
+    """The same findings in the same words; a camera that is turned away sees nothing."""
+    file, views = stored(tmp_path, wall()), cameras()
+    if turned:
+        away = views[0].world_to_camera.clone()
+        away[[0, 2]] *= -1  # half a turn about the camera's own vertical axis
+        views[0] = replace(views[0], world_to_camera=away)
+    looked = survey(file.scene, views, make_rasterizer("cpu", file.scene, near=NEAR))
+    reread = findings_of(file, views, style(), near=NEAR)
+    assert findings_of(file, views, style(), near=NEAR, looked=looked) == reread
+    assert any("see no Gaussian" in finding.what for finding in reread) == turned
+    assert any("in no view" in finding.what for finding in reread)
 
 
 def the(found: dict[str, Finding], text: str) -> Finding:

@@ -23,8 +23,8 @@ from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.loss.sos_reference import box_average_reference, features_reference
 from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.planning.measuring import LEVELS
-from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE
-from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbours
+from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
+from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbours, sampled
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
@@ -391,3 +391,23 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
     assert after.short.compared == before.short.compared > 0.05
     assert 0 < before.short.rmse < 0.2
     assert after.short.rmse < 0.4
+
+
+def test_a_part_of_a_large_scene_covers_as_much_and_lies_as_deep() -> None:
+    """A ball of small Gaussians, and about every fourth of them at twice the size."""
+    camera = cameras()[0]
+    scene = ball(4001)
+    scene = replace(scene, scales=scene.scales - 1.5)
+    part = sampled(scene, 1001)
+    assert len(part) == 1001
+    looks = []
+    for found in (scene, part):
+        rasterizer = make_rasterizer("cpu", found)
+        coverage, depth = rasterizer.coverage(camera), expected_depth(found, camera, rasterizer)
+        looks.append((float(coverage.mean()), float(depth.depth[depth.known].median())))
+    (covered, depth_of_all), (covered_by_part, depth_of_part) = looks
+    assert covered_by_part == pytest.approx(covered, rel=0.25)
+    assert depth_of_part == pytest.approx(depth_of_all, rel=0.1)
+    whole = sampled(scene, len(scene))
+    assert torch.equal(whole.means, scene.means)
+    assert torch.equal(whole.scales, scene.scales)

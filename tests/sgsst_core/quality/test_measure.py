@@ -9,7 +9,7 @@ import torch
 
 from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.measuring import NOTHING
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.stylizing.loop import Callbacks
@@ -20,7 +20,7 @@ STEPS = 16
 #: Of steps that take hours: whatever is measured here is little beside them.
 LONG = Prediction(1e3, 1e3, 0, job=1e6)
 #: What the loss takes is already more than is allowed.
-EXPENSIVE = Prediction(1e3, 1e3, 0, evaluation=1e6, job=1e6)
+EXPENSIVE = Prediction(1e3, 1e3, 0, losses=1e6, job=1e6)
 
 
 def make(
@@ -54,18 +54,52 @@ def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeig
     """Nothing is allowed: the start has been measured by then, and the end is measured all the same."""
     stylizer = make(tiny_weights, EXPENSIVE)
     assert measured(stylizer) == [0, 16]
-    assert stylizer.measured[0]["level"] == len(LEVELS) - 1
+    assert stylizer.measured[0]["level"] == NOTHING - 1
     start, end = (entry["held_out"]["gram_relative"] for entry in stylizer.measured)
     assert start == 1 > end
     assert len(stylizer.measured[0]["held_out_views"]) == 1
 
 
 def test_the_end_alone_is_compared_with_nothing(tiny_weights: BackboneWeights) -> None:
-    stylizer = make(tiny_weights, level=len(LEVELS) - 1)
+    stylizer = make(tiny_weights, level=NOTHING - 1)
     assert measured(stylizer) == [16]
     moment = stylizer.measured[0]["held_out"]
     assert moment["gram_relative"] is None
     assert all(value > 0 for value in moment["gram"].values())
+
+
+def test_what_nothing_pays_for_is_not_measured(tiny_weights: BackboneWeights) -> None:
+    assert measured(make(tiny_weights, level=NOTHING)) == []
+
+
+def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeights) -> None:
+    """It is measured after the first step, from the unstylized colours: as it would have been before."""
+    before, late = make(tiny_weights), make(tiny_weights)
+    Measurements(before)(before)
+    measure = Measurements(late)
+    assert not measure.due(0)
+    late.run_step()
+    colours = late.stylized()
+    assert measure.due(1)
+    measure(late)
+    assert torch.equal(late.stylized(), colours)
+    assert [entry["step"] for entry in late.measured] == [0, 1]
+    assert before.measured[0]["held_out"] == late.measured[0]["held_out"]
+
+
+def test_a_job_that_ends_before_the_first_moment_has_its_start_and_its_end(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, level=2)  # 0, 1, 4 and 16
+    asked = iter([True])
+    measure = Measurements(stylizer)
+    run(stylizer, Callbacks(measure=measure, stop=asked.__next__))
+    measure.at_the_end()
+    assert [entry["step"] for entry in stylizer.measured] == [0]
+    stylizer = make(tiny_weights, level=3)
+    measure = Measurements(stylizer)
+    asked = iter([False, False, True])
+    run(stylizer, Callbacks(measure=measure, stop=asked.__next__))
+    measure.at_the_end()
+    assert [entry["step"] for entry in stylizer.measured] == [0, 2]
 
 
 def test_nothing_is_measured_without_a_share_and_colours_are_the_same(tiny_weights: BackboneWeights) -> None:
@@ -100,7 +134,7 @@ def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> N
 
 def test_seconds_left_of_measuring(tiny_weights: BackboneWeights) -> None:
     """First the plan's, then what a moment takes after the first one, then their median; the loss at the end."""
-    stylizer = make(tiny_weights, Prediction(1.0, 1.0, 0, evaluation=3.0, measuring=18.0, job=100.0))
+    stylizer = make(tiny_weights, Prediction(1.0, 1.0, 0, losses=3.0, measuring=15.0, job=100.0))
     measure = Measurements(stylizer)
     assert measure.seconds_left(0) == 6 * 2.0 + 3.0  # 12 s of 6 moments
     stylizer.measured = [{"step": 0, "level": 0, "again": 1.5, "seconds": 9.0}]

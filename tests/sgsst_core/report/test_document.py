@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.json_files import write_json
 from sgsst_core.loss.terms import LossTerms
+from sgsst_core.planning.plan import Prediction
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import REPORT_VERSION, Sources, bought, build_report
 from sgsst_core.settings import make_settings
@@ -64,6 +66,48 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     assert report["memory"]["device_peak_bytes"] is report["plan"]["measured"]["device_bytes"] is None
     parts = sum(report["seconds_by_part"].values())
     assert 0.5 * report["seconds"] < parts <= report["seconds"] + 0.01
+
+
+def test_first_and_later_visits_are_told_apart(
+    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps of 9, 5, 2, 4 and 2 s; the first one has the style in it. With several views to a step nothing is known."""
+    stylizer, before, after = finished
+    visits = [(1, 9.0), (4, 14.0), (1, 16.0), (0, 20.0), (4, 22.0)]
+    history = [
+        replace(record, view=view, seconds=seconds, parts={"prepare": 0.25, "render": 1.5})
+        for record, (view, seconds) in zip(stylizer.history, visits, strict=False)
+    ]
+    monkeypatch.setattr(stylizer, "history", history)
+    measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
+    assert (measured["seconds"], measured["first_visit"]) == (2.0, 2.5)
+    assert measured["seconds_coarse"] is measured["first_visit_coarse"] is None
+    monkeypatch.setattr(stylizer, "settings", make_settings(views_per_step=2))
+    measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
+    assert (measured["seconds"], measured["first_visit"]) == (1.5, None)
+
+
+def test_what_was_measured_and_its_share(
+    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stylizer, before, after = finished
+    monkeypatch.setattr(stylizer, "seconds", 200.0)
+    monkeypatch.setitem(stylizer.seconds_by_part, "measuring", 30.0)
+    entries = [
+        {"step": 0, "held_out": None, "approximation": None, "held_out_views": ["a", "b"], "seconds": 9.0},
+        {"step": 7, "held_out": None, "approximation": None},  # of a version that did not tell
+    ]
+    monkeypatch.setattr(stylizer, "measured", entries)
+    monkeypatch.setattr(stylizer, "plan", replace(stylizer.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50)))
+    assert build_report(stylizer, sources, "finished", before, after)["measuring"] == {
+        "share": 0.1,
+        "allowed": 40.0,
+        "seconds": 30.0,
+        "of_steps": 0.15,
+        "loss_views": 4,
+        "held_out_views": 2,
+        "moments": [{"step": 0, "seconds": 9.0}, {"step": 7, "seconds": None}],
+    }
 
 
 def test_losses_in_the_report_are_those_of_the_steps(

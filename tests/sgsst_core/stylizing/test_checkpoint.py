@@ -73,8 +73,7 @@ def kept(state: StylizerState) -> Checkpoint:
         decisions=(Decision("item", "decision", "reason", seconds=0.1, bytes=3),),
         prediction=Prediction(0.1, 0.2, 3),
     )
-    before = {0: LossTerms(gram=1.0, mean=2.0, std=1 / 3)}
-    return Checkpoint(state, plan, 3, before, "run", versions())
+    return Checkpoint(state, plan, 3, "run", versions())
 
 
 def assert_same(expected: object, found: object) -> None:
@@ -135,14 +134,19 @@ def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Che
     save_checkpoint(tmp_path / "c", kept, "job")
     with safe_open(tmp_path / "c", "pt") as file:
         metadata = file.metadata()
-    history, before = json.loads(metadata["history"]), json.loads(metadata["before"])
+    history = json.loads(metadata["history"])
     stored = {"gram": 1.5, "mean": 2.5e-30, "std": 1 / 3, "content": 0.0}
     assert stored.items() <= history[1].pop("terms")["0"].items()
     assert history[1] == {
         **{"step": 2, "stage": "sos", "view": 3, "seconds": 0.3, "loss": 4.0},
         **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9, "sent": {"image": 7}, "device_memory": None},
     }
-    assert {"gram": 1.0, "mean": 2.0, "std": 1 / 3, "content": 0.0}.items() <= before["0"].items()
+
+
+def with_terms(kept: Checkpoint, **terms: float) -> Checkpoint:
+    """A checkpoint whose one step has these terms."""
+    record = replace(kept.state.history[0], terms={0: LossTerms(**terms)})
+    return replace(kept, state=replace(kept.state, history=[record]))
 
 
 def test_a_term_that_the_loss_did_not_have_yet_is_0(
@@ -150,8 +154,9 @@ def test_a_term_that_the_loss_did_not_have_yet_is_0(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.delitem(TERMS, "content")
-        save_checkpoint(tmp_path / "c", replace(kept, before={0: LossTerms(gram=1.0, mean=2.0, std=3.0)}), "job")
-    assert load_checkpoint(tmp_path / "c", "job").before == {0: LossTerms(gram=1.0, mean=2.0, std=3.0, content=0.0)}
+        save_checkpoint(tmp_path / "c", with_terms(kept, gram=1.0, mean=2.0, std=3.0), "job")
+    (record,) = load_checkpoint(tmp_path / "c", "job").state.history
+    assert record.terms == {0: LossTerms(gram=1.0, mean=2.0, std=3.0, content=0.0)}
 
 
 def test_a_term_that_the_loss_does_not_have_is_refused_by_name(
@@ -159,7 +164,7 @@ def test_a_term_that_the_loss_does_not_have_is_refused_by_name(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setitem(TERMS, "later", "a term of a later version")
-        save_checkpoint(tmp_path / "c", replace(kept, before={0: LossTerms(gram=1.0, later=2.0)}), "job")
+        save_checkpoint(tmp_path / "c", with_terms(kept, gram=1.0, later=2.0), "job")
     with pytest.raises(CheckpointError, match="the loss has no term later"):
         load_checkpoint(tmp_path / "c", "job")
 

@@ -90,17 +90,12 @@ def test_without_expectations_the_steps_themselves_tell() -> None:
     assert all(entry.left == entry.truth for entry in later)
 
 
-def test_views_that_were_prepared_before_are_no_first_visits() -> None:
-    pace = SecondsLeft([SOS], range(VIEWS), visited=[0, 1])
-    pace.add_step("sos", [0], SOS.seconds)
-    assert pace.left(1, list(range(1, VIEWS))) == 59 * SOS.seconds + 10 * SOS.first_visit
-
-
 def test_an_unfinished_round_is_a_mean() -> None:
     """4 steps are left: 2 of this round, 2 of the next one's 12; of these, 3 views are new, 1 of them comes soon."""
     phase = ExpectedPhase("sos", 20, 1.0, 6.0)
-    pace = SecondsLeft([phase], range(VIEWS), visited=range(8))
-    pace.add_step("sos", [8], 7.0)
+    pace = SecondsLeft([phase], range(VIEWS))
+    for view in range(9):
+        pace.add_step("sos", [view], 7.0)
     pace.add_step("sos", [1], 1.0)
     assert pace.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,12 +14,14 @@ import torch
 from sgsst_core import stylize
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.convergence import smoothed
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
 from sgsst_core.scene.camera import Camera, fit_cameras, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import Callbacks, Progress, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -87,7 +90,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
     for _ in range(4):
         stopped.run_step()
     assert stopped.state().queue
-    kept = Checkpoint(stopped.state(), stopped.plan, 1, stopped.start(), "run", versions())
+    kept = Checkpoint(stopped.state(), stopped.plan, 1, "run", versions())
     save_checkpoint(tmp_path / "c.safetensors", kept, "job")
     resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
@@ -193,6 +196,51 @@ def test_stop_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: S
     assert saved == [3]
     assert [(p.step, p.total, p.stage) for p in seen] == [(1, 5, "sos"), (2, 5, "sos"), (3, 5, "sos")]
     assert all(p.seconds_left > 0 for p in seen)
+
+
+def test_the_style_is_taken_for_no_views_price(
+    tiny_weights: BackboneWeights, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes a thousand seconds of the first step, which none of the seconds left expects again."""
+    stylizer, seen = make(tiny_weights, scene), list[Progress]()
+    style_targets, clock, late = stylizer.loss.style_targets, time.perf_counter, [0.0]
+
+    def slowly(*arguments: Any) -> Any:
+        late[0] += 1000.0
+        return style_targets(*arguments)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: clock() + late[0])
+    monkeypatch.setattr(stylizer.loss, "style_targets", slowly)
+    run(stylizer, Callbacks(progress=seen.append))
+    assert seen[0].seconds > 1000
+    assert all(now.seconds_left < 1000 for now in seen)
+
+
+def test_a_result_is_made_once_for_the_same_colours(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    stylizer = make(tiny_weights, scene)
+    first = stylizer.stylized()
+    assert stylizer.stylized() is first
+    kept = stylizer.sh_dc.clone()
+    with stylizer.with_colours(scene.sh_dc + 1):
+        assert torch.equal(stylizer.stylized()[stylizer.plan.seen], scene.sh_dc[stylizer.plan.seen] + 1)
+    assert stylizer.stylized() is first
+    assert torch.equal(stylizer.sh_dc, kept)
+    stylizer.run_step()
+    second = stylizer.stylized()
+    assert not torch.equal(second, first)
+    stylizer.load_state(make(tiny_weights, scene).state())
+    assert torch.equal(stylizer.stylized(), first)
+
+
+def test_a_target_is_a_share_of_the_loss_before(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    """Which is taken when every view has been visited; jobs without a target take it when they are asked."""
+    stylizer = make(tiny_weights, scene, steps_sos=40, target_loss=0.8, early_stop=False)
+    assert stylizer.start() == make(tiny_weights, scene, steps_sos=40).start()
+    stylizer = make(tiny_weights, scene, steps_sos=40, target_loss=0.8, early_stop=False)
+    assert run(stylizer) == "target-loss"
+    start = mean_loss(stylizer.start())
+    rounds = [smoothed([r.loss for r in stylizer.history[: end + 1]], 3) for end in range(2, stylizer.step)]
+    assert rounds[-1] <= 0.8 * start < min(rounds[:-1], default=math.inf)
 
 
 def test_previews_and_checkpoints_come_as_often_as_asked(tiny_weights: BackboneWeights, scene: Scene) -> None:

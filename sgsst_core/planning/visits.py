@@ -1,0 +1,149 @@
+"""What a view costs beside an iteration's passes: what is made at its first visit, and made anew where it is not kept.
+
+Lists of Gaussians, colours of spherical harmonics, blend weights and content features of a view are made when it is
+first visited, and kept as far as each of them fits its share of the memory. What fits costs seconds once; what does not
+costs them at every visit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES
+from sgsst_core.planning.cost import Work
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.probe import Probe
+from sgsst_core.settings import Settings
+
+#: Making a view's kept weights on the CPU, in renders with gradient.
+KEEPING_RENDERS = 3
+#: A render without its gradient, in renders with it.
+RENDER = 0.5
+#: Bytes of the colours of a Gaussian in a view: what its spherical harmonics add.
+_COLOUR_BYTES = 12
+#: Cutting the survey's lists of a view down to the Gaussians of the job, in making them.
+_CUT = 0.25
+
+
+@dataclass(frozen=True)
+class Made:
+    """Something that is made for each view.
+
+    Attributes:
+        seconds: of making it.
+        bytes: of all views together.
+        room: bytes that there are for them.
+    """
+
+    seconds: float
+    bytes: float = 0.0
+    room: float = float("inf")
+
+    @property
+    def kept(self) -> float:
+        """The share of the views for which it is kept."""
+        return min(1.0, self.room / self.bytes) if self.bytes else 1.0
+
+    @property
+    def once(self) -> float:
+        """Seconds at a view's first visit beside those of every visit, mean over views."""
+        return self.kept * self.seconds
+
+    @property
+    def always(self) -> float:
+        """Seconds at every visit of a view, mean over views."""
+        return (1 - self.kept) * self.seconds
+
+    @property
+    def kept_bytes(self) -> int:
+        """Memory that it takes at last."""
+        return int(min(self.bytes, self.room))
+
+
+@dataclass(frozen=True)
+class Visits:
+    """Everything that is made for the views of a job.
+
+    Attributes:
+        lists: of the rasterizer that computes weights anew.
+        surveyed: lists that the survey has made, of all views.
+        handed: share of the seconds of lists that are kept which the survey's save the job.
+        colours: of spherical harmonics.
+        weights: kept ones; None where none are.
+        content: features at all scales, with the render that they are of; `content_coarse`: of the coarsest alone.
+        raster: seconds of a render and its gradient, weights computed anew; `raster_kept`: with kept ones.
+        in_coarse: phase 1 makes lists, colours and weights, so that phase 2 finds them.
+        coarse_weights: phase 1 makes weights of its own.
+    """
+
+    lists: Made
+    surveyed: Made
+    handed: float
+    colours: Made
+    weights: Made | None
+    content: Made
+    content_coarse: Made
+    raster: float
+    raster_kept: float
+    in_coarse: bool
+    coarse_weights: bool
+
+    @staticmethod
+    def of(plan: Plan, probe: Probe, settings: Settings, work: Work, coarse: Work, content: int) -> Visits:
+        """Of a plan, as far as it is made.
+
+        Args:
+            work: of an iteration on all scales, and `coarse` on the coarsest alone.
+            content: bytes of the content features of all views.
+        """
+        raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
+        room = memory * MEMORY_SHARES["views"]
+        weighed = memory * MEMORY_SHARES["rasterizer"]
+        surveyed = Made(0.0, len(probe.sizes) * raster.lists_bytes, weighed)
+        room_of_lists = weighed if plan.kept_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
+        lists = Made(raster.first_seconds, views * raster.lists_bytes, room_of_lists)
+        colours = views * int(plan.seen.sum()) * _COLOUR_BYTES if probe.scene.used_degree else 0
+        weights = None
+        if plan.kept_weights != "none":
+            size = (raster.bytes if plan.kept_weights == "float32" else raster.half_bytes) or 0
+            seconds = KEEPING_RENDERS * raster.seconds if raster.keeping_seconds is None else raster.keeping_seconds
+            weights = Made(seconds, size, weighed)
+        rendered = RENDER * raster.seconds if settings.content_weight else 0.0
+        forward = probe.network.rate.forward if settings.content_weight else 0.0
+        room_of_content = 0 if "content" in settings.keep else room / 2
+        share = coarse.pixels / work.pixels  # of the content's bytes, as of its pixels
+        return Visits(
+            lists=lists,
+            surveyed=surveyed,
+            handed=min(surveyed.kept / lists.kept, 1.0) * (1 if plan.seen.all() else 1 - _CUT),
+            colours=Made(raster.colours_seconds, colours, room / 4),
+            weights=weights,
+            content=Made(rendered + work.pixels * forward, content, room_of_content),
+            content_coarse=Made(rendered + coarse.pixels * forward, content * share, room_of_content),
+            raster=raster.seconds,
+            raster_kept=raster.seconds if raster.kept_seconds is None else raster.kept_seconds,
+            in_coarse=plan.steps_coarse > 0,
+            coarse_weights=plan.coarse_weights,
+        )
+
+    def rasterized(self) -> float:
+        """Seconds of a render and its gradient at a later visit, mean over views."""
+        anew = self.raster + self.lists.always
+        if self.weights is not None:
+            anew = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * anew
+        return anew + self.colours.always
+
+    def later(self, *, coarse: bool) -> float:
+        """Seconds of every visit beside rendering and the network: content that is not kept."""
+        return (self.content_coarse if coarse else self.content).always
+
+    def first(self, *, coarse: bool) -> float:
+        """Seconds of a view's first visit in a phase beside those of its later visits."""
+        content = (self.content_coarse if coarse else self.content).once
+        lists = (1 - self.handed) * self.lists.once + self.colours.once
+        keeping = self.weights.once if self.weights else 0.0
+        if coarse:
+            return content + lists + (0.0 if self.coarse_weights else keeping)
+        if not self.in_coarse:
+            return content + lists + keeping
+        return content + (keeping if self.coarse_weights else 0.0)

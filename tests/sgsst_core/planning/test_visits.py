@@ -1,0 +1,97 @@
+"""What views cost beside the passes: once where what is made for them is kept, at every visit where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, RasterCost, gaussian_bytes
+from sgsst_core.planning.decide import MEASURING_BYTES, decide
+from sgsst_core.planning.measuring import LEVELS, held_out_list_bytes
+from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.planning.visits import Made
+from sgsst_core.settings import make_settings
+from tests.sgsst_core.planning.test_decide import GIGABYTE, VIEWS, probe
+
+#: Lists take 5 s and fit, colours 0.5 s.
+LARGE = RasterCost(2.0, first_seconds=5.0, lists_bytes=10**8, colours_seconds=0.5)
+#: Of four views, the lists of one fit a quarter of 10 GB.
+HUGE = replace(LARGE, lists_bytes=10 * GIGABYTE // 4)
+
+
+def plan_of(raster: RasterCost, *, measured: bool = False, **values: Any) -> Plan:
+    settings = make_settings(**{"steps_coarse": 0, "steps_sos": 40, "position_weights": "off", **values})
+    return decide(probe(raster=raster), settings, measured=measured)
+
+
+def expected(*arguments: Any, **values: Any) -> Prediction:
+    found = plan_of(*arguments, **values).prediction
+    assert found is not None
+    return found
+
+
+def test_what_fits_is_made_once_and_the_rest_at_every_visit() -> None:
+    made = Made(6.0, 400, 100)
+    assert (made.kept, made.once, made.always, made.kept_bytes) == (0.25, 1.5, 4.5, 100)
+    assert Made(6.0, 400, 500) == replace(made, room=500)
+    assert (Made(6.0, 400, 500).once, Made(6.0, 400, 500).always, Made(6.0, 400, 500).kept_bytes) == (6.0, 0.0, 400)
+    assert (Made(6.0).once, Made(6.0, 400, 0).always) == (6.0, 6.0)
+
+
+def test_lists_and_colours_come_with_the_first_visit_where_they_fit() -> None:
+    """The survey's lists are cut down to the Gaussians that are rendered, for a quarter of what they cost."""
+    small, large = expected(replace(LARGE, first_seconds=0.0, colours_seconds=0.0)), expected(LARGE)
+    assert large.first_visit - small.first_visit == pytest.approx(0.25 * 5 + 0.5)
+    assert large.seconds == small.seconds
+
+
+def test_lists_that_do_not_fit_are_made_at_every_visit() -> None:
+    large, huge = expected(LARGE), expected(HUGE)
+    assert huge.seconds - large.seconds == pytest.approx(5.0 * 3 / 4)
+    assert large.first_visit - huge.first_visit == pytest.approx(0.25 * 5.0 * 3 / 4)
+    assert huge.job > large.job
+
+
+def test_lists_of_the_survey_are_the_jobs_where_every_gaussian_is_rendered() -> None:
+    """Those of some Gaussians are cut down first."""
+    cut, handed = expected(LARGE), expected(LARGE, keep=("unseen",))
+    assert cut.first_visit - handed.first_visit == pytest.approx(0.25 * 5.0)
+
+
+def test_phase_1_makes_what_phase_2_finds() -> None:
+    alone, both = expected(LARGE), expected(LARGE, steps_coarse=40)
+    assert alone.first_visit - both.first_visit == pytest.approx(0.25 * 5 + 0.5)
+    assert both.first_visit_coarse > 0.25 * 5 + 0.5
+
+
+def test_content_that_is_not_kept_is_computed_at_every_visit() -> None:
+    kept, anew = expected(LARGE), expected(LARGE, keep=("content",))
+    assert anew.seconds - kept.seconds == pytest.approx(kept.first_visit - anew.first_visit)
+    assert anew.first_visit == pytest.approx(0.25 * 5 + 0.5)
+
+
+def test_weights_that_do_not_fit_save_nothing() -> None:
+    """Of 10 GB, kept weights have a quarter."""
+    fit, quarter = (
+        expected(RasterCost(0.3, 0.1, 40 * GIGABYTE, size), kept_weights="half")
+        for size in (10 * GIGABYTE // 4, 10 * GIGABYTE)
+    )
+    assert quarter.seconds - fit.seconds == pytest.approx(0.2 * 3 / 4)
+
+
+def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
+    """Five of six Gaussians are rendered, as a copy of the scene of degree 3; its lists take those of the survey's."""
+    lists = 10**8
+    plain = expected(LARGE).peak_bytes
+    whole = expected(LARGE, keep=("unseen",)).peak_bytes
+    own = OPTIMISER_BYTES + STEP_BYTES + 12 * VIEWS
+    assert plain - whole == 5 * (own + gaussian_bytes(3)) - 6 * own
+    assert gaussian_bytes(3) == 4 * 59
+    for steps in (1, 40, 4000):  # nothing, some and all of it
+        plan = plan_of(LARGE, measured=True, steps_sos=steps)
+        held_out = min(4 * LEVELS[plan.measuring].views * lists, held_out_list_bytes(10 * GIGABYTE))
+        assert plan.prediction is not None
+        assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + held_out
+    assert expected(HUGE).peak_bytes == plain, "what does not fit is not kept, and the survey had kept as much"
