@@ -191,13 +191,15 @@ class _ShiftedSums:
         """Add positions centred [n, c], which are overwritten, with their weights [n]."""
         if position_weights is None:
             self.total.count.add_(centred.shape[0])
-            roots = centred.new_ones(centred.shape[0])
+            first = centred.sum(dim=0)
         else:
             self.total.count.add_(position_weights.sum(dtype=torch.float64))
             # With the roots of the weights in both factors, the product is symmetric, and half of it is enough.
             roots = position_weights.sqrt()
             centred *= roots[:, None]
-        self._first.addmv_(centred.T, roots)
+            first = (centred * roots[:, None]).sum(dim=0)
+        # A sum in pairs: a product with a vector may add up one position after the other, and lose two more digits.
+        self._first.add_(first)
         for left in range(0, centred.shape[1], self._strip):
             strip = slice(left, left + self._strip)
             self._second[strip, left:].addmm_(centred[:, strip].T, centred[:, left:])
