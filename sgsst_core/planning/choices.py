@@ -18,6 +18,10 @@ from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
 from sgsst_core.settings import Precision, Settings
 
+#: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
+#: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
+LEAST_VISITS = 5
+
 
 def optimised_gaussians(looked: Survey, settings: Settings) -> Tensor:
     """[N] bool, Gaussians whose colours the views decide.

@@ -14,7 +14,13 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
-from sgsst_core.planning.choices import GPU_RASTERIZERS, optimised_gaussians, precision_of, rendered_gaussians
+from sgsst_core.planning.choices import (
+    GPU_RASTERIZERS,
+    LEAST_VISITS,
+    optimised_gaussians,
+    precision_of,
+    rendered_gaussians,
+)
 from sgsst_core.planning.cost import (
     OPTIMISER_BYTES,
     STEP_BYTES,
@@ -34,9 +40,6 @@ from sgsst_core.settings import KeptWeights, Settings
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
 UNCOVERED_SHARE = 0.01
-#: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
-#: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
-LEAST_VISITS = 5
 #: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few per cent.
 LEAST_PASSES = 200
 #: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.

@@ -24,6 +24,7 @@ from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import (
     GPU_RASTERIZERS,
+    LEAST_VISITS,
     optimised_gaussians,
     precision_of,
     pruned_gaussians,
@@ -372,15 +373,20 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     scene, rasterizer = workshop.scene, workshop.rasterizer
     count = min(SAMPLED_VIEWS, len(cameras))
     sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
-    timed = [_raster_seconds(rasterizer, len(scene), camera) for camera in sample]
-    seconds = [later for _, later in timed]
-    mean = sum(seconds) / count
-    # The least: one of them may have compiled something, or waited for memory.
-    more = max(min(first - later for first, later in timed), 0.0)
     middle = count // 2
-    lists_bytes = 0
-    if isinstance(rasterizer, CpuRasterizer):  # the survey has made the lists that were timed
+    if isinstance(rasterizer, CpuRasterizer):
+        _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles
+        seconds = []
+        for camera in sample:
+            rasterizer.lists(camera)  # the survey's, where it could keep them
+            seconds += _raster_seconds(rasterizer, len(scene), camera)
         more, lists_bytes = _lists_cost(scene, sample, workshop.settings.near)
+    else:
+        timed = [_raster_seconds(rasterizer, len(scene), camera, visits=2) for camera in sample]
+        seconds = [later for _, later in timed]
+        # The least: one of them may have compiled something, or waited for memory.
+        more, lists_bytes = max(min(first - later for first, later in timed), 0.0), 0
+    mean = sum(seconds) / count
     known: dict[str, Any] = {
         "first_seconds": more,
         "lists_bytes": lists_bytes,
@@ -392,6 +398,9 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     if not isinstance(anew, CpuRasterizer | TritonRasterizer):
         anew = CpuRasterizer(scene, near=workshop.settings.near)
     cached = CachedRasterizer(scene, anew=anew)
+    if isinstance(anew, CpuRasterizer) and _comes_too_seldom(workshop.settings, len(cameras)):
+        total, half = (cached.count(sample[middle]).nbytes(form) * len(cameras) for form in _FORMS)
+        return RasterCost(mean, None, total, half, **known)
     sizes = [[counted.nbytes(form) for form in _FORMS] for counted in map(cached.count, sample)]
     total, half = (sum(column) * len(cameras) // count for column in zip(*sizes, strict=True))
     fitting = [form for form, size in zip(_FORMS, sizes[middle], strict=True) if size <= budget]
@@ -401,9 +410,15 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     if isinstance(anew, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
         keeping = _keeping_seconds(cached, sample[middle], fitting[0])
     cached = CachedRasterizer(scene, precision=fitting[0], anew=anew)
-    kept = _raster_seconds(cached, len(scene), sample[middle])[1]
+    kept = _raster_seconds(cached, len(scene), sample[middle], visits=2)[1]
     # Of the mean view, as the seconds it is compared with.
     return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, **known)
+
+
+def _comes_too_seldom(settings: Settings, views: int) -> bool:
+    """Whether a view comes so seldom that its kept weights, which nobody asked for, do not pay on a CPU."""
+    visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / views
+    return settings.kept_weights == "auto" and visits < LEAST_VISITS
 
 
 def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
@@ -440,13 +455,13 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
     return seconds
 
 
-def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera) -> tuple[float, float]:
-    """Of two renders with gradient: the first one prepares the view."""
+def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
+    """Of some renders with gradient: the first one prepares the view, where that has not been done."""
     colours = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
-    seconds = [0.0, 0.0]
-    for visit in range(2):
+    seconds = []
+    for _ in range(visits):
         started = time.perf_counter()
         rasterizer.colour_gradient(rasterizer.render(colours, camera), camera)
         wait_for(rasterizer.device)
-        seconds[visit] = time.perf_counter() - started
-    return seconds[0], seconds[1]
+        seconds.append(time.perf_counter() - started)
+    return seconds
