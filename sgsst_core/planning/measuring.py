@@ -70,7 +70,7 @@ class Prices:
 
     Attributes:
         setup: once, for each of `Level.views`: the poses' surroundings, depth and warps.
-        view: at each moment, for each of them.
+        view: at each moment, for each of them; and once more, to judge them at the end.
         moment: at each moment beside them: the gradient against the exact one.
     """
 
@@ -83,8 +83,8 @@ class Prices:
         return level.views * self.view + self.moment
 
     def of(self, level: Level, moments: int) -> float:
-        """Of so many moments."""
-        return level.views * self.setup + moments * self.again(level)
+        """Of so many moments, and of judging the last one."""
+        return level.views * (self.setup + self.view) + moments * self.again(level)
 
 
 def allowed_seconds(share: float, steps: float) -> float:

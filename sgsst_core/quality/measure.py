@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from statistics import median
 from typing import Any
 
@@ -20,6 +20,7 @@ from sgsst_core.planning.measuring import (
 )
 from sgsst_core.quality.exact import ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut
+from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.gaussians import Scene
@@ -34,7 +35,8 @@ class Measurements:
     "held_out" and "approximation" (None where there is nothing to measure), the "seconds" it took. The moment of step 0
     is measured together with the one after it, from the unstylized colours, so that the first step need not wait. How
     much is measured is the plan's, or less where the first view takes longer than it thought: decided once, by the
-    first rank, and kept in the first entry with what a moment takes after it ("level", "again").
+    first rank, and kept in the first entry with what a moment takes after it ("level", "again"). The last entry holds
+    what the result is "judged" to be (`Judgement`, "before" and "after"), where AlexNet is installed.
 
     Args:
         stylizer: the job, at any step.
@@ -106,6 +108,7 @@ class Measurements:
                 measured = self._stylizer.measured
                 if not measured or measured[-1]["step"] != self._stylizer.step:
                     self._measure(start=False)
+                self._judge()
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Measure now; the start too, where it is to be and has not been."""
@@ -115,6 +118,18 @@ class Measurements:
             self._measure_start()
             if self.due(stylizer.step):  # as the first view's price has it
                 self._measure(start=False)
+
+    def _judge(self) -> None:
+        """Judge the result and the unstylized scene, into the last entry ("judged"); the first rank's alone."""
+        stylizer, held_out = self._stylizer, self._of_held_out_views()
+        if held_out.lpips is None or stylizer.collectives.rank:
+            return
+        views = [held_out.cameras[index] for index in held_out.views]
+        background = stylizer.settings.background
+        judge = Judge(held_out.lpips, stylizer.style, held_out.scene, held_out.rasterizer, views, background)
+        colours = {"before": stylizer.scene.sh_dc, "after": stylizer.stylized()}
+        found = {name: judge.judge(sh_dc) for name, sh_dc in colours.items()}
+        stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in found.items() if one} or None
 
     def _measure_start(self) -> None:
         if self.level.start and not self._stylizer.measured:

@@ -256,7 +256,8 @@ def held_out_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     if not moments:
         return None
     first = measured[0]
-    return {"views": first["held_out_views"], "lpips": first["lpips"], "moments": moments}
+    judged = measured[-1].get("judged")
+    return {"views": first["held_out_views"], "lpips": first["lpips"], "moments": moments, "judged": judged}
 
 
 def approximations_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:

@@ -21,6 +21,7 @@ from sgsst_core.report.tables import (
     decision_table,
     finding_table,
     held_out_table,
+    judged_table,
     loss_table,
     prediction_table,
 )
@@ -90,6 +91,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None) -> str:
         figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
         losses=loss_table(report),
         held_out=held_out_table(report),
+        judged=judged_table(report),
         seconds=duration(report["seconds"]),
         parts=_time_split(report),
         decisions=decision_table(report),
@@ -205,7 +207,9 @@ def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]
     """All fields that have no place of their own, as (field, [(name, value)])."""
     fields = {field: value for field, value in report.items() if field not in _PLACED}
     if report.get("held_out"):
-        fields["held_out"] = {name: value for name, value in report["held_out"].items() if name != "moments"}
+        fields["held_out"] = {
+            name: value for name, value in report["held_out"].items() if name not in ("moments", "judged")
+        }
     return [(field, [(name or field, text) for name, text in _flat("", value)]) for field, value in fields.items()]
 
 

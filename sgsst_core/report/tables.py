@@ -60,6 +60,27 @@ def held_out_table(report: dict[str, Any]) -> Table | None:
     return Table([Column(title, True) for title in columns], list(zip(*columns.values(), strict=True)))
 
 
+#: What a result is judged by, and how it is written.
+_JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
+    "style": ("distance to the style", number),
+    "palette": ("distance to its colours, in levels of 8 bits", number),
+    "content": ("content lost (LPIPS)", number),
+    "features": ("features turned (1 - cosine)", number),
+    "swing": ("style on black against white", number),
+    "saturated": ("colours that no screen shows", percent),
+}
+
+
+def judged_table(report: dict[str, Any]) -> Table | None:
+    """What the result is judged to be by a network that was not optimised, beside the unstylized scene."""
+    judged = (report.get("held_out") or {}).get("judged")
+    if not judged:
+        return None
+    before, after = judged["before"], judged["after"]
+    rows = [[title, text(before[name]), text(after[name])] for name, (title, text) in _JUDGED.items()]
+    return Table([Column(""), Column("unstylized", True), Column("stylized", True)], rows)
+
+
 def decision_table(report: dict[str, Any]) -> Table:
     """What the plan decided and why, what it saves and what it costs."""
     columns = [

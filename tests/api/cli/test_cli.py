@@ -201,6 +201,9 @@ def test_held_out_views_approximations_and_findings_are_reported(files: Files) -
     assert moments[0]["gram_relative"] == 1
     assert moments[-1]["gram_relative"] < 1
     assert moments[0]["consistency"]["short"]["rmse"] >= 0
+    judged = report["held_out"]["judged"]
+    assert judged["before"]["content"] == 0 < judged["after"]["content"]
+    assert judged["after"]["style"] != judged["before"]["style"]
     assert report["approximations"]["what"] == ["half-precision blend weights"]
     assert all(0 < moment["relative_error"] < 0.1 for moment in report["approximations"]["moments"])
     assert isinstance(report["findings"], list)

@@ -52,9 +52,9 @@ def test_every_level_but_the_last_measures_the_end_and_no_more_than_the_one_befo
 
 
 def test_the_first_level_that_is_allowed_is_taken() -> None:
-    """300 steps: four or two views are prepared at 1 each, a view takes 0.5 at each moment, which takes 0.25."""
+    """300 steps: views are prepared at 1 each; one takes 0.5 at each moment, which takes 0.25, and to be judged."""
     prices = Prices(1.0, 0.5, 0.25)
-    costs = [19.75, 13.0, 7.0, 4.5, 2.5, 1.75, 0.0]
+    costs = [21.75, 15.0, 8.0, 5.5, 3.0, 2.25, 0.0]
     assert [prices.of(level, len(level.moments(300))) for level in LEVELS] == costs
     for place, cost in enumerate(costs):
         assert choose_level(prices, cost, 300) == place

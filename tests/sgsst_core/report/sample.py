@@ -52,7 +52,12 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "memory": {"limit_bytes": 8_000_000_000, "peak_bytes": 2_400_000_000},
         "machine": {"processor": "some processor", "cores": 2, "device": "cpu"},
         "history": history,
-        "held_out": {"views": ["c"], "lpips": "alex", "moments": [_moment(s, history) for s in (0, 4, coarse + sos)]},
+        "held_out": {
+            "views": ["c"],
+            "lpips": "alex",
+            "moments": [_moment(s, history) for s in (0, 4, coarse + sos)],
+            "judged": {"before": _judged(1.5, 0.0), "after": _judged(0.625, 0.375)},
+        },
         "approximations": {
             "what": ["bfloat16 features", "half-precision blend weights"],
             "moments": [
@@ -117,3 +122,8 @@ def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
         "gram_relative": relative,
         "consistency": {"short": {"gap": 1, **pairs}, "long": {"gap": 7, **pairs, "lpips": None}},
     }
+
+
+def _judged(style: float, content: float) -> dict[str, float]:
+    found = {"style": style, "palette": 40 * style, "content": content, "features": content / 2}
+    return {**found, "swing": 0.25, "saturated": 0.02}

@@ -346,6 +346,19 @@ def test_held_out_moments_are_in_a_table() -> None:
     assert page.cells[place - 1 : place + 9] == row
 
 
+def test_what_the_result_is_judged_to_be_stands_beside_the_start() -> None:
+    report = sample_report()
+    page = parsed_without_figures(report)
+    place = page.cells.index("distance to the style")
+    assert page.cells[place : place + 3] == ["distance to the style", "1.5", "0.625"]
+    place = page.cells.index("colours that no screen shows")
+    assert page.cells[place + 1 : place + 3] == ["2 %", "2 %"]
+    report["held_out"]["judged"] = None
+    assert "distance to the style" not in parsed_without_figures(report).text
+    del report["held_out"]["judged"]  # a report of a version that did not judge
+    assert "distance to the style" not in parsed_without_figures(report).text
+
+
 def test_folded_part_holds_all_other_fields() -> None:
     report = sample_report()
     report["a_field_of_later"] = {"deep": [{"inside": True}], "bytes": 5_000_000}

@@ -63,7 +63,8 @@ def test_raster_lists_of_the_survey_are_not_built_again(
     built: list[int] = []
 
     def build(scene: Scene, camera: Camera, **options: Any) -> RasterLists:
-        built.append(len(scene))
+        if len(scene) > 1:  # of one Gaussian, the plan makes them to have kernels compiled
+            built.append(len(scene))
         return build_raster_lists(scene, camera, **options)
 
     monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_raster_lists", build)
