@@ -202,7 +202,7 @@ def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted mean [3] and covariance [3, 3], float64, of colours [n, 3]."""
     colours, weights = colours.double(), weights.double()
     total = weights.sum()
-    mean = weights @ colours / total
+    mean = colours.T @ weights / total
     centred = colours - mean
     return mean, (weights[:, None] * centred).T @ centred / total
 
