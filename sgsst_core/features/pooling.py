@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -27,7 +28,8 @@ def max_pool(source: Tensor) -> Tensor:
     _, channels, height, width = source.shape
     out = source.new_empty((height // 2, width // 2, channels))
     with kernel_threads():
-        kernels.max_pool(_integers(_cells(source)), _integers(out))
+        cells = _integers(_cells(source))
+        kernels.max_pool(cells, _all_but_sign(cells), _integers(out))
     return out.permute(2, 0, 1).unsqueeze(0)
 
 
@@ -46,7 +48,8 @@ def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
     cells = _integers(_cells(source))
     out = source.new_empty(cells.shape)
     with kernel_threads():
-        kernels.max_pool_backward(_integers(_cells(gradient)), cells, cells.dtype.type(0), _integers(out))
+        slopes, nothing = _integers(_cells(gradient)), cells.dtype.type(0)
+        kernels.max_pool_backward(slopes, cells, nothing, _all_but_sign(cells), _integers(out))
     return out.permute(2, 0, 1).unsqueeze(0)
 
 
@@ -85,3 +88,8 @@ def _cells(values: Tensor) -> Tensor:
 def _integers(values: Tensor) -> Any:
     """A NumPy array of the same bits."""
     return values.view(_INTEGERS[values.element_size()]).numpy()
+
+
+def _all_but_sign(values: Any) -> Any:
+    """All bits but the sign's, in the type of some integers."""
+    return values.dtype.type(np.iinfo(values.dtype).max)

@@ -48,10 +48,13 @@ def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtyp
     assert found.flatten().tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
 
 
-def test_not_a_number_is_the_maximum() -> None:
-    """So that a network that was given one does not hide it."""
-    source = relu_output(2, 2, torch.float32)
-    source[0, 5, 1, 0] = torch.nan
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_not_a_number_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
+    """So that a network that was given one does not hide it; processors make it with either sign."""
+    source = relu_output(2, 2, dtype)
+    source[0, 5, 1, 0] = torch.copysign(torch.tensor(torch.nan, dtype=dtype), torch.tensor(sign, dtype=dtype))
+    assert bool(torch.signbit(source[0, 5, 1, 0])) == (sign < 0)
     assert max_pool(source)[0, 5].isnan().all()
     assert int(max_pool(source).isnan().sum()) == 1
 
