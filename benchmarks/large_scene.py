@@ -1,11 +1,11 @@
 """Scenes of millions of Gaussians on the CPU: what reading, looking, rendering and unseen Gaussians take.
 
-    python -m benchmarks.large_scene [--millions 1 4 12] [--views 4] [--parts reading survey ...]
+    python -m benchmarks.large_scene [--millions 1 4 12] [--views 4] [--parts reading survey ...] [--write FOLDER]
 
 The plush scene is multiplied: each copy of a Gaussian is moved by up to its size, and scales are reduced so that the
 volume stays the same; where the data is not there, a generated scene takes its place. Seeded. Every size runs in a
 process of its own, for its peak of memory. Of what was made faster, the plain way runs in the same process, and the
-ratio is what counts: seconds depend on what else the machine does.
+ratio is what counts: seconds depend on what else the machine does. `--write` keeps the scenes, for `sgsst` itself.
 """
 
 from __future__ import annotations
@@ -118,6 +118,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
         "ratio_lists_to_handed": lists / seconds["handed_seconds"],
         **seconds,
         "ratio_plain_to_survey": seconds["plain_seconds"] / seconds["survey_seconds"],
+        "ratio_plain_view_to_surveyed": (alone + seconds["plain_seconds"]) / (lists + seconds["survey_seconds"]),
     }
 
 
@@ -150,17 +151,21 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     return {f"{name}_seconds_of_a_job": seconds for name, seconds in timer.seconds.items()}
 
 
-def measure(count: int, views: int, parts: list[str]) -> dict[str, float]:
+def measure_reading(scene: Scene, folder: Path | None) -> dict[str, float]:
+    """A scene's file; it stays in `folder` if there is one."""
+    with tempfile.TemporaryDirectory() as temporary:
+        path = (folder or Path(temporary)) / f"{len(scene) / 1e6:g}m.ply"
+        write_scene(path, scene)
+        return {"file_bytes": path.stat().st_size, "read_seconds": timed(lambda: read_scene(path))}
+
+
+def measure(count: int, views: int, parts: list[str], folder: Path | None) -> dict[str, float]:
     """All figures of one size; `parts`: of PARTS."""
     small, cameras, _ = small_scene()
     scene, cameras = multiplied(small, count), spread(cameras, views)
     figures: dict[str, float] = {"gaussians": count}
     if "reading" in parts:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "point_cloud.ply"
-            write_scene(path, scene)
-            figures["file_bytes"] = path.stat().st_size
-            figures["read_seconds"] = timed(lambda: read_scene(path))
+        figures |= measure_reading(scene, folder)
     if "harmonics" in parts:
         figures |= measure_harmonics(scene, cameras)
     if "survey" in parts:
@@ -179,12 +184,13 @@ def main() -> None:
     parser.add_argument("--millions", type=float, nargs="+", default=[1, 4, 12])
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--write", type=Path, metavar="FOLDER", help="keep the files that reading is measured on")
     arguments = parser.parse_args()
     sizes = []
     for millions in arguments.millions:
         # A new process, not a copy of this one: its peak of memory and its threads are its own.
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            sizes.append(pool.apply(measure, (int(millions * 1e6), arguments.views, arguments.parts)))
+            sizes.append(pool.apply(measure, (int(millions * 1e6), arguments.views, arguments.parts, arguments.write)))
         print(json.dumps(sizes[-1], indent=2), flush=True)
     print(write_result("large_scene", {"scene": small_scene()[2], "views": arguments.views, "sizes": sizes}))
 
