@@ -233,6 +233,30 @@ def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pyt
     assert len(read_scene(folder / "standard.ply").scene) == len(wall())
 
 
+def test_bench_quality_writes_table_plot_pictures_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = files.out.with_name("bench")
+    command = ["bench", "quality", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24", "--resolution", "96"]
+    assert main([*command, "--variants", "standard,finest"]) == 2
+    assert "no variant finest" in capsys.readouterr().err
+    assert not folder.exists()
+    assert main([*command, "--seconds", "2", "--variants", "standard,coarse-only"]) == 0
+    shown = capsys.readouterr().out
+    values = json.loads((folder / "quality.json").read_text())
+    names = [outcome["name"] for outcome in values["outcomes"]]
+    assert names == ["unstylized", "transfer", "standard", "coarse-only"]
+    assert all(name in shown for name in names)
+    assert {path.name for path in folder.iterdir()} == {
+        "quality.json",
+        "quality.png",
+        "quality.jpg",
+        "transfer.ply",
+        "standard.ply",
+        "coarse-only.ply",
+    }
+    assert len(read_scene(folder / "transfer.ply").scene) == len(wall())
+
+
 def test_bench_stability_measures_the_cases_asked_for(
     files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
