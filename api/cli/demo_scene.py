@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage import data
@@ -26,6 +25,7 @@ from skimage import data
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
 from sgsst_core.files.ply import write_scene
+from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.scene.gaussians import Scene
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class DemoScene:
     Attributes:
         ply: the scene, 3DGS PLY of SH degree 0.
         cameras: its views, INRIA cameras.json.
-        style: the style image, PNG.
+        style: the style image, JPEG.
     """
 
     ply: Path
@@ -106,13 +106,12 @@ def build_demo(folder: Path) -> DemoScene:
         OutputError: the folder cannot be written.
     """
     ensure_writable_folder(folder)
-    demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "style.png")
+    demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "starry_night.jpg")
     write_scene(demo.ply, lift_pair())
     with atomic_path(demo.cameras) as temporary:
         temporary.write_text(json.dumps(camera_path(), indent=1), encoding="utf-8")
     with atomic_path(demo.style) as temporary:
-        # A stained tissue section: fibres like brush strokes, in three strong colours. In the wheel, no download.
-        Image.fromarray(data.immunohistochemistry()).save(temporary, format="PNG")
+        temporary.write_bytes(STARRY_NIGHT.read_bytes())
     return demo
 
 

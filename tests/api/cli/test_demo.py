@@ -28,7 +28,7 @@ def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
     shown = capsys.readouterr().out
     names = {"stylized.ply", "stylized.report.json", "stylized.before_after.jpg", "stylized.loss.png"}
     names |= {"stylized.report.html"}
-    inputs = {"motorcycle.ply", "cameras.json", "style.png"}
+    inputs = {"motorcycle.ply", "cameras.json", "starry_night.jpg"}
     assert {path.name for path in out.iterdir()} == names | inputs | {"stylized.plan.json"}
     for name in names:
         assert str(out / name) in shown

@@ -133,9 +133,9 @@ def test_slope_takes_the_pixel_s_own_side_of_an_edge() -> None:
     assert (demo_scene._slope(disparity, 0) == 0).all()
 
 
-def test_style_is_a_picture_from_the_wheel(demo: DemoScene) -> None:
+def test_style_is_the_painting_that_comes_with_the_program(demo: DemoScene) -> None:
     with Image.open(demo.style) as image:
-        assert image.size == (512, 512)
+        assert image.size == (800, 633)
         assert image.mode == "RGB"
         assert float(np.asarray(image).std(axis=(0, 1)).min()) > 20
 
