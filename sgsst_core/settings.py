@@ -15,6 +15,7 @@ PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
+FeatureScale = Literal["paper", "even"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -66,6 +67,11 @@ class Settings(BaseModel):
     )
     content_weight: Annotated[float, Option(unit="factor", metavar="W")] = Field(
         1.0, ge=0, le=_MAX_WEIGHT, allow_inf_nan=False, description="Weight of the content term; 0 leaves it out."
+    )
+    feature_scale: FeatureScale = Field(
+        "even",
+        description="How much each layer of the network counts; paper: as in the paper's network; even: in each layer "
+        "Gram matrix, mean and deviation count about alike.",
     )
     position_weights: PositionWeights = Field(
         "auto",
@@ -171,6 +177,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "steps_sos": 10_000,
         "learning_rate": 2.5e-3,
         "learning_rate_end": 2.5e-3,
+        "feature_scale": "paper",
         "position_weights": "off",
         "unseen": "keep",
     },

@@ -9,7 +9,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ class BackboneWeights:
         sha256: digest of the installed file's contents, verified at load: the identity of these weights.
         convolutions: layer name ("conv1_1") to weight [out, in, 3, 3] and bias [out], float32, in network order.
         input_scale, input_shift: [3] float32; the network's input is rgb (0..1) * input_scale + input_shift.
+        scales: layer ("relu1_1") to the factor by which its features have been made larger; empty as installed.
     """
 
     name: str
@@ -50,6 +51,7 @@ class BackboneWeights:
     convolutions: dict[str, tuple[Tensor, Tensor]]
     input_scale: Tensor  # [3]
     input_shift: Tensor  # [3]
+    scales: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

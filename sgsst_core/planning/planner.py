@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.loss.feature_scale import at_scale
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan
@@ -56,7 +57,8 @@ def make_plan(
     timer = timer or Timer()
     with timer("planning"):
         fitted = fit_cameras(cameras, settings)
-        workshop = equip(scene, fitted, settings, weights or load_network_weights("auto"), collectives, rasterizer)
+        weights = at_scale(weights or load_network_weights("auto"), settings.feature_scale)
+        workshop = equip(scene, fitted, settings, weights, collectives, rasterizer)
         if looked is None:
             with timer("survey"):
                 looked = survey(scene, fitted, workshop.rasterizer, collectives, show)

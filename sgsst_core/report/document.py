@@ -116,7 +116,12 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     backbone, style = sources.backbone, stylizer.style
     return {
         "settings": stylizer.settings.model_dump(mode="json"),
-        "backbone": {"name": backbone.name, "source": backbone.source, "sha256": backbone.sha256},
+        "backbone": {
+            "name": backbone.name,
+            "source": backbone.source,
+            "sha256": backbone.sha256,
+            "scales": stylizer.weights.scales,
+        },
         "scene": {
             "path": str(sources.scene),
             "gaussians": len(stylizer.scene),

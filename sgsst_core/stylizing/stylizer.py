@@ -18,6 +18,7 @@ from torch import Tensor
 from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.loss.feature_scale import at_scale
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -99,7 +100,7 @@ class Stylizer:
         self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
-        self.weights = weights
+        self.weights = weights = at_scale(weights, settings.feature_scale)
         self.photos = photos
         self.style = style
         forget_device_peak(plan.device)
