@@ -16,6 +16,7 @@ Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
+KeptColours = Literal["no", "match"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -87,6 +88,15 @@ class Settings(BaseModel):
         (0.0, 0.0, 0.0), description="Colour behind the Gaussians."
     )
     near: Near = NEAR
+    style_scale: Annotated[float, Option(unit="factor", metavar="S")] = Field(
+        1.0, ge=0.25, le=4, description="Strokes S times as large as the style image has them in a view."
+    )
+    style_rotation: Annotated[float, Option(unit="degrees", metavar="D")] = Field(
+        0.0, ge=-360, le=360, description="Turn the style image by D degrees, against the clock."
+    )
+    keep_colours: KeptColours = Field(
+        "no", description="match: the style image takes the scene's colours first, so that only its strokes are taken."
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."

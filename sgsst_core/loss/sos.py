@@ -138,6 +138,7 @@ class SosLoss:
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
         coarsest: int = COARSEST_SHORTER_SIDE,
+        style_scale: float = 1.0,
         leave_out: bool = True,
         keep_activations: bool = True,
         timer: Timer | None = None,
@@ -148,6 +149,7 @@ class SosLoss:
         self.memory = memory
         self.tile_size = tile_size
         self.coarsest = coarsest
+        self.style_scale = style_scale
         self.leave_out = leave_out
         held = network.held_bytes_per_pixel()
         working = network.working_bytes_per_pixel() / held
@@ -213,7 +215,8 @@ class SosLoss:
 
         A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
         """
-        image = resize_area(style, style_size((style.shape[0], style.shape[1]), view_size)).to(self.network.device)
+        size = style_size(_size(style), view_size, self.style_scale)
+        image = resize_area(style, size).to(self.network.device)
         scaled = {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
         share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}

@@ -79,6 +79,7 @@ class ExactTwin:
             content_weight=settings.content_weight,
             memory=stylizer.loss.memory,
             coarsest=settings.coarsest_side,
+            style_scale=settings.style_scale,
         )
         self.shown = stylizer.plan.survey.total_blend_weights > 0
         scene = stylizer.scene.subset(self.shown).without_zero_bands()

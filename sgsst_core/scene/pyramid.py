@@ -45,15 +45,16 @@ def add_upscaled_(target: Tensor, gradient: Tensor, scale: int, factor: float = 
     view.add_(gradient[:, None, :, None, :], alpha=factor / side**2)
 
 
-def style_size(style: tuple[int, int], view: tuple[int, int]) -> tuple[int, int]:
-    """Size (height, width) at which a style image is used for views of a size: never enlarged.
+def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0) -> tuple[int, int]:
+    """Size (height, width) at which a style image is used for views of a size: never enlarged for a scale of 1.
 
-    A style whose shorter side is more than 1.1 times the view's is brought down to the view's shorter side.
+    A style whose shorter side is more than 1.1 times the view's is brought down to the view's shorter side; then, its
+    strokes are made so many times as large as `scale` says.
     """
     shorter, target = min(style), min(view)
-    if shorter <= STYLE_SIZE_TOLERANCE * target:
+    factor = scale * (1.0 if shorter <= STYLE_SIZE_TOLERANCE * target else target / shorter)
+    if factor == 1.0:
         return style
-    factor = target / shorter
     return max(1, round(style[0] * factor)), max(1, round(style[1] * factor))
 
 

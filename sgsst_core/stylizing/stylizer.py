@@ -44,6 +44,7 @@ from sgsst_core.stylizing.evaluation import (
 from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
+from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import Views
@@ -102,7 +103,7 @@ class Stylizer:
         self.latest: list[int] = []
         self.weights = weights = at_scale(weights, settings.feature_scale)
         self.photos = photos
-        self.style = style
+        self.style = style = prepared_style(style, settings, scene.sh_dc, plan.survey.total_blend_weights)
         forget_device_peak(plan.device)
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
         self._style = style.to(self.network.device)
@@ -172,6 +173,7 @@ class Stylizer:
             content_weight=settings.content_weight,
             memory=int(self.memory * MEMORY_SHARES["activations"]),
             coarsest=settings.coarsest_side,
+            style_scale=settings.style_scale,
             leave_out="uncovered" not in settings.keep,
             keep_activations="activations" not in settings.keep,
             timer=self.timer,

@@ -39,6 +39,20 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor) -> Tensor:
     return ((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype)
 
 
+def in_colours_of(style: Tensor, sh_dc: Tensor, weights: Tensor) -> Tensor:
+    """A style image [H, W, 3] in 0..1 with mean and covariance of a scene's colours: the map the other way round.
+
+    Args:
+        sh_dc, weights: as in `warm_start`.
+    """
+    colours = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
+    wanted_mean, wanted = _moments(colours, weights.double() / weights.double().amax())
+    pixels = style.reshape(-1, 3).double()
+    mean, covariance = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
+    matched = (pixels - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
+    return matched.clamp(0, 1).to(style.dtype).reshape(style.shape)
+
+
 def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted mean [3] and covariance [3, 3] of colours [n, 3]."""
     total = weights.sum()

@@ -1,0 +1,63 @@
+"""The style image as a job uses it: turned, and in the scene's colours, where that is asked."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.warm_start import in_colours_of
+
+
+def prepared_style(style: Tensor, settings: Settings, sh_dc: Tensor, weights: Tensor) -> Tensor:
+    """A style image [H, W, 3] in 0..1 as the settings want it; itself where they want nothing.
+
+    Args:
+        sh_dc: [N, 3], of the scene.
+        weights: [N] float64, total blend weights, at least one positive.
+    """
+    if settings.style_rotation:
+        style = turned(style, settings.style_rotation)
+    if settings.keep_colours == "match":
+        # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
+        # 2017, section 5.2.
+        style = in_colours_of(style, sh_dc, weights)
+    return style
+
+
+def turned(style: Tensor, degrees: float) -> Tensor:
+    """A picture [H, W, 3] turned against the clock, cut to the largest upright rectangle that lies inside.
+
+    By quarters of a turn exactly; otherwise interpolated (cubic splines) and clamped to 0..1.
+    """
+    quarters, rest = divmod(degrees, 90)
+    style = torch.rot90(style, int(quarters) % 4, (0, 1)).contiguous()
+    if not rest:
+        return style
+    height, width = style.shape[:2]
+    spun = ndimage.rotate(style.double().numpy(), rest, axes=(1, 0), reshape=True, order=3, mode="nearest")
+    kept_height, kept_width = _inside(height, width, math.radians(rest))
+    top, left = (spun.shape[0] - kept_height) // 2, (spun.shape[1] - kept_width) // 2
+    cut = spun[top : top + kept_height, left : left + kept_width]
+    return torch.from_numpy(cut).clamp(0, 1).to(style.dtype).contiguous()
+
+
+def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
+    """Sides of the largest upright rectangle inside one that is turned by an angle between 0 and pi/2; at least 1.
+
+    Either two of its corners lie on one long side of the turned one and it is as long as can be with half of the short
+    side above it, or each of its corners lies on another side.
+    """
+    sine, cosine = math.sin(angle), math.cos(angle)
+    shorter, longer = min(height, width), max(height, width)
+    if shorter <= 2 * sine * cosine * longer:
+        half = shorter / 2
+        across, down = (half / sine, half / cosine) if width >= height else (half / cosine, half / sine)
+    else:
+        spread = cosine * cosine - sine * sine
+        across, down = (width * cosine - height * sine) / spread, (height * cosine - width * sine) / spread
+    # A pixel less on each side, where the interpolation reaches beyond the picture.
+    return max(int(down) - 2, 1), max(int(across) - 2, 1)

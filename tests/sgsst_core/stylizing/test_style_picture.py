@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from sgsst_core.constants import SH_C0
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.scene.pyramid import style_size
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.style_picture import _inside, prepared_style, turned
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.small_scenes import cameras, wall
+
+
+def picture(height: int = 40, width: int = 60) -> torch.Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+
+
+def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tensor:
+    """0.5 in the middle, and a plane through it."""
+    y = torch.arange(height) - (height - 1) / 2
+    x = torch.arange(width) - (width - 1) / 2
+    return (0.5 + slope_y * y[:, None] + slope_x * x).unsqueeze(2).expand(-1, -1, 3).contiguous()
+
+
+def test_quarters_of_a_turn_move_pixels_only() -> None:
+    style = picture()
+    assert torch.equal(turned(style, 90), torch.rot90(style, 1, (0, 1)))
+    assert torch.equal(turned(style, -90), torch.rot90(style, -1, (0, 1)))
+    assert torch.equal(turned(style, 360), style)
+    assert turned(style, 180).is_contiguous()
+
+
+@pytest.mark.parametrize("degrees", [1, 17, 45, 89, 107, -30, 200])
+@pytest.mark.parametrize("size", [(80, 80), (60, 150), (150, 60)])
+def test_a_plane_of_brightness_turns_with_the_picture(degrees: float, size: tuple[int, int]) -> None:
+    """What is inside comes from inside: no edge is drawn out, nothing is filled in."""
+    height, width = size
+    found = turned(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
+    angle = math.radians(degrees)
+    # Against the clock, seen with y downwards: what lay to the right goes up.
+    slope_x = 0.002 * math.cos(angle) + 0.001 * math.sin(angle)
+    slope_y = 0.001 * math.cos(angle) - 0.002 * math.sin(angle)
+    wanted = ramp(found.shape[0], found.shape[1], slope_y, slope_x)[..., 0]
+    shift = 0.0025  # where the cut is half a pixel off the middle
+    torch.testing.assert_close(found - found.mean(), wanted - wanted.mean(), atol=1e-4, rtol=0)
+    assert abs(float(found.mean()) - 0.5) <= shift
+
+
+@pytest.mark.parametrize("degrees", [0.5, 10, 30, 45, 60, 89.5])
+@pytest.mark.parametrize("size", [(100, 100), (80, 200), (300, 90)])
+def test_the_cut_is_the_largest_that_lies_inside(degrees: float, size: tuple[int, int]) -> None:
+    (height, width), angle = size, math.radians(degrees)
+    sine, cosine = math.sin(angle), math.cos(angle)
+
+    def fits(across: float, down: float) -> bool:
+        corners = ((across / 2, down / 2), (across / 2, -down / 2))
+        turned_back = [(x * cosine + y * sine, y * cosine - x * sine) for x, y in corners]
+        return all(abs(x) <= width / 2 + 1e-9 and abs(y) <= height / 2 + 1e-9 for x, y in turned_back)
+
+    down, across = _inside(height, width, angle)
+    assert fits(across, down)
+    sides = [step / 2 for step in range(2, 800)]
+    best = max((a * d for a in sides[::2] for d in sides[::4] if fits(a, d)), default=0)
+    assert (across + 3) * (down + 3) >= best * 0.99
+
+
+def test_a_style_of_one_pixel_can_be_turned() -> None:
+    assert turned(torch.full((1, 1, 3), 0.25), 30).shape == (1, 1, 3)
+
+
+def test_matched_colours_have_the_scenes_mean_and_covariance() -> None:
+    generator = torch.Generator().manual_seed(1)
+    colours = 0.5 + 0.08 * torch.randn(5000, 3, generator=generator) @ torch.tensor(
+        [[1.0, 0.3, 0.0], [0.0, 1.0, 0.5], [0.0, 0.0, 0.4]]
+    )
+    weights = torch.rand(5000, generator=generator, dtype=torch.float64)
+    settings = make_settings("standard", keep_colours="match")
+    style = 0.5 + 0.05 * torch.randn(64, 64, 3, generator=generator)
+    found = prepared_style(style, settings, (colours - 0.5) / SH_C0, weights).reshape(-1, 3).double()
+    share = (weights / weights.sum())[:, None]
+    inside = colours.double().clamp(0, 1)
+    mean = (share * inside).sum(dim=0)
+    covariance = (share * (inside - mean)).T @ (inside - mean)
+    torch.testing.assert_close(found.mean(dim=0), mean, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.T.cov(correction=0), covariance, atol=1e-4, rtol=0)
+
+
+def test_a_flat_style_takes_the_scenes_mean() -> None:
+    settings = make_settings("standard", keep_colours="match")
+    found = prepared_style(torch.full((4, 4, 3), 0.9), settings, torch.zeros(10, 3), torch.ones(10).double())
+    torch.testing.assert_close(found, torch.full((4, 4, 3), 0.5))
+
+
+def test_without_wishes_the_style_is_itself() -> None:
+    style = picture()
+    assert prepared_style(style, make_settings("standard"), torch.zeros(2, 3), torch.ones(2).double()) is style
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_larger_strokes_are_statistics_of_a_larger_style(tiny_weights: BackboneWeights, scale: float) -> None:
+    style, view = picture(96, 120), (64, 96)
+    size = style_size((96, 120), view, scale)
+    assert size == (round(64 * scale), round(80 * scale))
+    network = FeatureNetwork(tiny_weights)
+    found = SosLoss(network, style_scale=scale).style_targets(style, view)[0]
+    wanted = SosLoss(network).style_targets(resize_area(style, size), size)[0]
+    for layer in found:
+        torch.testing.assert_close(found[layer].gram, wanted[layer].gram)
+
+
+def test_strokes_as_they_are_leave_a_small_style_alone() -> None:
+    assert style_size((50, 70), (64, 96)) == (50, 70)
+    assert style_size((50, 70), (64, 96), 2) == (100, 140)
+    assert style_size((1, 1), (64, 96), 0.25) == (1, 1)
+
+
+def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
+    settings = make_settings("standard", style_rotation=90, keep_colours="match", style_scale=2, coarsest_side=24)
+    scene, style = wall(), picture()
+    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
+    assert stylizer.style.shape == (60, 40, 3)
+    assert stylizer.loss.style_scale == 2
+    weights = stylizer.plan.survey.total_blend_weights
+    wanted = prepared_style(style, settings, scene.sh_dc, weights)
+    assert torch.equal(stylizer.style, wanted)
+    stylizer.run_step()
