@@ -21,6 +21,9 @@ _SIDE = 960
 class Previews:
     """Writes the first evaluation view with its present colours now and then; for `loop.Callbacks.preview`.
 
+    Before the first step there is one, too, with the closed-form colours of a warm start: it shows in seconds where the
+    job goes.
+
     Args:
         folder: of the JPEGs, `step_0000123.jpg` and so on; made at the first of them.
         seconds: between two, at least.
@@ -40,7 +43,7 @@ class Previews:
     def __call__(self, stylizer: Stylizer) -> None:
         """Write one, if it is time."""
         now = time.monotonic()
-        if now - self._last < max(self._seconds, _SHARE * (now - self._started)):
+        if stylizer.step and now - self._last < max(self._seconds, _SHARE * (now - self._started)):
             return
         try:
             path = self._write(stylizer)
@@ -58,8 +61,9 @@ class Previews:
             camera = resized(camera, _SIDE)
         path = self._folder / f"step_{stylizer.step:07d}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
+        colours = stylizer.sh_dc.detach() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
         with torch.no_grad():
             # The rasterizer's own render: other ranks take no part in it.
-            image = views.rasterizer.render(views.colours(index, stylizer.sh_dc.detach()), camera)
+            image = views.rasterizer.render(views.colours(index, colours), camera)
         save_jpg(path, image)
         return path

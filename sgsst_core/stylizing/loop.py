@@ -70,7 +70,7 @@ class Callbacks:
         progress: after every iteration.
         stop: asked before every iteration; True ends the loop as "interrupted".
         checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
-        preview: called with the stylizer about every `preview_seconds`.
+        preview: called with the stylizer before the first step and about every `preview_seconds`.
         measure: called with the stylizer after each step for which it is due; its time does not count as the job's.
     """
 
@@ -95,6 +95,8 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     """As `run`, which clears up after it."""
     last_checkpoint = last_preview = time.perf_counter()
     pace = _pace(stylizer)
+    if callbacks.preview and not stylizer.step:
+        callbacks.preview(stylizer)
     _measure(stylizer, callbacks)  # where a resumed job had not come to it
     while stylizer.step < stylizer.total:
         reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)

@@ -122,9 +122,7 @@ class Stylizer:
         rasterizer, self._coarse = self._rasterizers(seen, workshop)
         self.views = self._views(seen, fit_cameras(cameras, settings), rasterizer)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
-        start = seen.sh_dc
-        if settings.warm_start:
-            start = warm_start(start, plan.survey.total_blend_weights[plan.seen], style)
+        start = self.transferred() if settings.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
         self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate)
         self._generator = torch.Generator().manual_seed(settings.seed)
@@ -165,6 +163,11 @@ class Stylizer:
             collectives=collectives,
             workshop=workshop,
         )
+
+    def transferred(self) -> Tensor:
+        """Colours [N, 3] of the Gaussians that are optimised, with the style's mean and spread in closed form."""
+        seen = self.plan.seen
+        return warm_start(self.scene.sh_dc[seen], self.plan.survey.total_blend_weights[seen], self.style)
 
     def _loss(self) -> SosLoss:
         settings = self.settings

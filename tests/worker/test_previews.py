@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.images import save_jpg
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.warm_start import warm_start
+from tests.small_scenes import cameras, wall
+from worker.previews import Previews
+
+
+def test_the_first_preview_shows_the_closed_form_colours_before_any_step(
+    tiny_weights: BackboneWeights, tmp_path: Path
+) -> None:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.5, 0.1])
+    scene = wall()
+    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
+    written: list[tuple[int, Path]] = []
+    missing: list[str] = []
+    previews = Previews(tmp_path / "previews", 3600, lambda path: written.append((stylizer.step, path)), missing.append)
+    run(stylizer, Callbacks(preview=previews, preview_seconds=0))
+    assert stylizer.step == 2
+    assert written == [(0, tmp_path / "previews" / "step_0000000.jpg")], "and none before the hour is over"
+    assert not missing
+
+    index = stylizer.evaluation_views[0]
+    wanted = warm_start(scene.sh_dc, stylizer.plan.survey.total_blend_weights, style)[stylizer.plan.seen]
+    views = stylizer.views
+    save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colours(index, wanted), views.cameras[index]))
+    found, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
+    np.testing.assert_array_equal(found, expected)
+    assert found.std() > 1
