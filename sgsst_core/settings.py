@@ -15,6 +15,7 @@ PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
+StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -66,6 +67,11 @@ class Settings(BaseModel):
     )
     content_weight: Annotated[float, Option(unit="factor", metavar="W")] = Field(
         1.0, ge=0, le=_MAX_WEIGHT, allow_inf_nan=False, description="Weight of the content term; 0 leaves it out."
+    )
+    style_loss: StyleLossName = Field(
+        "sos",
+        description="How views are compared with the style; sos: by statistics of features, as in the paper; nnfm: "
+        "each feature with the nearest one of the style, as in ARF; mixed: both.",
     )
     position_weights: PositionWeights = Field(
         "auto",
