@@ -243,8 +243,8 @@ class SosLoss:
         vectors = {scale: self._style_vectors(picture) for scale, picture in scaled.items()}
         if self.nearest_layers and all(found is None for found in vectors.values()):
             raise ImageError(
-                f"The style has {style.shape[1]} x {style.shape[0]} pixels, too few to match features with. Give a "
-                "larger picture, or leave --style-loss at sos."
+                f"The style is used at {image.shape[1]} x {image.shape[0]} pixels, too few to match features with. "
+                "Give a larger picture, or larger views, or leave --style-loss at sos."
             )
         return {scale: ScaleTarget(layers.get(scale, {}), vectors[scale]) for scale in scaled}
 

@@ -232,7 +232,7 @@ def test_a_style_of_hardly_any_vector(
 
 
 def test_a_style_without_a_vector_is_refused(tiny_weights: BackboneWeights) -> None:
-    with pytest.raises(ImageError, match="The style has 200 x 3 pixels, too few to match features with"):
+    with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
         loss_of(tiny_weights, "nnfm").style_targets(picture(3, 200), (100, 80))
 
 
