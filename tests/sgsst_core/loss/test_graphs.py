@@ -107,10 +107,13 @@ def test_graphs_hold_the_search_for_nearest_vectors(
     loss = SosLoss(network, style_loss=style_loss, coarsest=16, timer=Timer("cuda"))
     style, view, graphs = style_of(loss), view_of(loss, 2, weighted=True), LossGraphs(loss)
     for step in range(FIRST_VISITS + 1):
-        expected = loss.evaluate(image(step), style, view, SCALES)
+        pixels = image(step)
+        expected = loss.evaluate(pixels, style, view, SCALES)
         counts.clear()
-        assert_same(graphs.evaluate(image(step), style, view, SCALES), expected)
-    assert not counts.waits
+        found = graphs.evaluate(pixels, style, view, SCALES)
+        assert not counts.waits
+        assert not counts.copies
+        assert_same(found, expected)
     assert graphs.problem is None
     assert graphs.captured == 1
     assert all(terms["nearest"] > 0 for terms in expected.terms.values())
