@@ -58,7 +58,7 @@ def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: 
         features = network.forward(image[tile.outer.slices], keep=False).features
         for layer in STYLE_LAYERS:
             parts[layer].append(layer_statistics(features[layer][tile.owned_cells(layer, size)[1].slices]))
-    maps = {layer: style_loss(merge_all(parts[layer]), style[layer])[1] for layer in STYLE_LAYERS}
+    maps = {layer: style_loss(merge_all(parts[layer]), style.layers[layer])[1] for layer in STYLE_LAYERS}
     cells = torch.tensor(float((size[0] // 8) * (size[1] // 8)), dtype=torch.float64)
     result = torch.zeros_like(image)
     for tile in tiles:

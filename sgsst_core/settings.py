@@ -17,6 +17,7 @@ PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
 KeptColours = Literal["no", "match"]
+StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -73,6 +74,11 @@ class Settings(BaseModel):
         "even",
         description="How much each layer of the network counts; paper: as in the paper's network; even: in each layer "
         "Gram matrix, mean and deviation count about alike.",
+    )
+    style_loss: StyleLossName = Field(
+        "sos",
+        description="How views are compared with the style; sos: by statistics of features, as in the paper; nnfm: "
+        "each feature with the nearest one of the style, as in ARF; mixed: both.",
     )
     position_weights: PositionWeights = Field(
         "auto",

@@ -22,7 +22,7 @@ from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.consistency import Consistency
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import ExactLoss
 from sgsst_core.quality.held_out import HeldOut, HeldOutMoment
 from sgsst_core.quality.judge import Judge, Judgement
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -183,15 +183,15 @@ def _left_out(curves: Sequence[Curve]) -> dict[str, str]:
 
 def _held_out(stylizer: Stylizer) -> HeldOut:
     """Views between a job's cameras, of its whole scene."""
-    settings, twin = stylizer.settings, ExactTwin(stylizer)
+    settings, exact = stylizer.settings, ExactLoss(stylizer, "sos")
     rasterizer = make_rasterizer(stylizer.plan.anew, stylizer.scene, background=settings.background, near=settings.near)
     return HeldOut(
         stylizer.views.cameras,
         stylizer.views.covered,
         stylizer.scene,
         rasterizer,
-        twin.loss,
-        twin.style_targets,
+        exact.loss,
+        exact.style_targets,
         weighted=stylizer.plan.weighted,
         memory=stylizer.memory // 16,
     )

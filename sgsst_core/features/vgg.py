@@ -141,6 +141,7 @@ class FeatureNetwork:
     Attributes:
         precision: in which convolutions are asked for: "tf32", or the name of `dtype`.
         rounding: of features, relative.
+        unit: by what features of the content layer have been made larger, where 1 is the units of a 0-255 input.
         search: cuDNN tries its algorithms on pictures of every new size, which takes about ten passes. Off, unless set:
             it pays for sizes that come back often enough.
     """
@@ -165,6 +166,7 @@ class FeatureNetwork:
         self.search = False
         self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
         self.halo = HALO[weights.name]
+        self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         # The normalisation stays in at least float32: in bfloat16, 255 grey levels would lose their last bits twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)

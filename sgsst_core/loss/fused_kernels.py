@@ -25,7 +25,7 @@ def compare(
     Args:
         count, mean, centred: of the view's statistics.
         target_gram, target_mean, target_std: of the style.
-        terms: [CHANNELS, 4] float64, what each channel adds to each term.
+        terms: [CHANNELS, 5] float64, what each channel adds to each term.
         matrix, own_mean, offset: [CHANNELS, CHANNELS], [CHANNELS], [CHANNELS] float32, of `terms.StyleGradient`.
     """
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
@@ -50,10 +50,11 @@ def compare(
     tl.store(offset + i, drawn.to(tl.float32))
     present = tl.where(some, 1.0, 0.0).to(tl.float64)
     squares = tl.sum(gram_error * gram_error, 1) / (CHANNELS * CHANNELS)
-    tl.store(terms + 4 * i, present * weight * squares)
-    tl.store(terms + 4 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error)
-    tl.store(terms + 4 * i + 2, present * (STD / CHANNELS) * std_error * std_error)
-    tl.store(terms + 4 * i + 3, 0.0 * own)
+    tl.store(terms + 5 * i, present * weight * squares)
+    tl.store(terms + 5 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error)
+    tl.store(terms + 5 * i + 2, present * (STD / CHANNELS) * std_error * std_error)
+    tl.store(terms + 5 * i + 3, 0.0 * own)
+    tl.store(terms + 5 * i + 4, 0.0 * own)
 
 
 @triton.jit

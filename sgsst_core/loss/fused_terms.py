@@ -18,7 +18,7 @@ def fused_style_loss(
     weights: tuple[float, float, float],
     feature_eps: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What `terms.style_loss` gives: terms [4] float64; matrix [c, c], mean [c] and offset [c] float32.
+    """What `terms.style_loss` gives: terms [5] float64; matrix [c, c], mean [c] and offset [c] float32.
 
     Args:
         target: Gram matrix, mean and standard deviation of the style, float64.
@@ -28,7 +28,7 @@ def fused_style_loss(
     from sgsst_core.loss import fused_kernels as kernels
 
     device, channels = statistics.mean.device, len(statistics.mean)
-    terms = torch.empty((channels, 4), dtype=torch.float64, device=device)
+    terms = torch.empty((channels, 5), dtype=torch.float64, device=device)
     matrix = torch.empty((channels, channels), device=device)
     mean, offset = torch.empty(channels, device=device), torch.empty(channels, device=device)
     gram_weight, mean_weight, std_weight = weights

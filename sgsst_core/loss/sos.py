@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
+from sgsst_core.errors import ImageError
 from sgsst_core.features.fused_statistics import can_be_fused, fused_statistics
 from sgsst_core.features.partition import PartitionTile, Rectangle, covered_region, scaled_region
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
@@ -25,6 +26,8 @@ from sgsst_core.features.vgg import (
     FeatureNetwork,
     layer_stride,
 )
+from sgsst_core.loss.nearest import Matches, StyleVectors, chosen_places, places_in
+from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
@@ -35,11 +38,24 @@ from sgsst_core.scene.pyramid import (
     downscale,
     style_size,
 )
+from sgsst_core.settings import StyleLossName
 from sgsst_core.timing import Timer
 
-ScaleTarget = Mapping[str, LayerTarget]
 #: Bytes for activations where the caller names no budget: leaves most of a laptop to others.
 DEFAULT_MEMORY = 4 << 30
+
+
+@dataclass(frozen=True)
+class ScaleTarget:
+    """What the style asks of a scale.
+
+    Attributes:
+        layers: layer to its statistics, for those that are compared and have a cell at this scale.
+        vectors: that positions are matched with; None where nothing is matched.
+    """
+
+    layers: Mapping[str, LayerTarget]
+    vectors: StyleVectors | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +64,7 @@ class SosResult:
 
     Attributes:
         scales: that were evaluated.
-        values: [scales, 4] float64, each scale's loss split into `TERMS`, still on the device.
+        values: [scales, 5] float64, each scale's loss split into `TERMS`, still on the device.
         image_gradient: dE/dimage [H, W, 3], of which every rank has a part: they add up to the whole. None if only the
             loss was asked for.
     """
@@ -118,12 +134,13 @@ class SosLoss:
     Args:
         network: the feature network; it must report the style layers, and the content layer if it is used.
         content_weight: lambda_c; 0 leaves the content branch out.
+        style_loss: what is compared with the style; see `style_losses`.
         memory: bytes that activations may take.
         tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
         coarsest: pixels of the coarsest scale's shorter side at most.
         leave_out: pixels without weight do not go through the network; False for comparison.
         keep_activations: as many as fit between the two passes; False computes each tile twice, for comparison.
-        timer: receives the seconds of `vgg_forward`, `vgg_backward`, `statistics` and `communication`.
+        timer: receives the seconds of `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
         collectives: of the ranks that evaluate each view together; all call the same methods with the same arguments.
 
     Attributes:
@@ -135,6 +152,7 @@ class SosLoss:
         network: FeatureNetwork,
         *,
         content_weight: float = 1.0,
+        style_loss: StyleLossName = "sos",
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
         coarsest: int = COARSEST_SHORTER_SIDE,
@@ -157,7 +175,10 @@ class SosLoss:
         self.timer = timer or Timer()
         self.collectives = collectives
         self.speeds = (1.0,) * collectives.size
-        self.style_layers = [layer for layer in STYLE_LAYERS if layer in network.layers]
+        statistics = STYLE_LAYERS if has_statistics(style_loss) else ()
+        self.style_layers = [layer for layer in statistics if layer in network.layers]
+        self.nearest_layers = nearest_layers(style_loss, network.name)
+        self.nearest_weight = nearest_weight(style_loss, network.unit)
 
     def scale_count(self, height: int, width: int) -> int:
         """n_s of views of a size."""
@@ -210,14 +231,28 @@ class SosLoss:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
-    def style_targets(self, style: Tensor, view_size: Size) -> dict[int, dict[str, LayerTarget]]:
+    def style_targets(self, style: Tensor, view_size: Size) -> dict[int, ScaleTarget]:
         """Targets of every scale of views of view_size (height, width) from a style image [H, W, 3] in 0..1.
 
         A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
+
+        Raises:
+            ImageError: features are to be matched, and the style is too small to have any.
         """
         size = style_size(_size(style), view_size, self.style_scale)
         image = resize_area(style, size).to(self.network.device)
         scaled = {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
+        layers = self._style_statistics(scaled) if self.style_layers else {}
+        vectors = {scale: self._style_vectors(picture) for scale, picture in scaled.items()}
+        if self.nearest_layers and all(found is None for found in vectors.values()):
+            raise ImageError(
+                f"The style is used at {image.shape[1]} x {image.shape[0]} pixels, too few to match features with. "
+                "Give a larger picture, or larger views, or leave --style-loss at sos."
+            )
+        return {scale: ScaleTarget(layers.get(scale, {}), vectors[scale]) for scale in scaled}
+
+    def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
+        """Statistics of a style image [h, w, 3] at some scales, shared out over the ranks."""
         share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
         for scales in rounds(list(scaled), self.collectives.size):
@@ -228,6 +263,30 @@ class SosLoss:
                     layer: LayerTarget.of(part) for layer, part in parts if min(pass_.size) >= layer_stride(layer)
                 }
         return targets
+
+    def _style_vectors(self, image: Tensor) -> StyleVectors | None:
+        """Vectors of a style image [h, w, 3] at one scale; None where nothing is matched, or there is none.
+
+        They are too many to be sent: every rank computes them all.
+        """
+        if not self.nearest_layers:
+            return None
+        size, stride = _size(image), layer_stride(self.nearest_layers[0])
+        width = size[1] // stride
+        places = chosen_places(size[0] // stride * width)
+        if not len(places):
+            return None
+        vectors = {
+            layer: torch.empty((len(places), self.network.channels(layer)), dtype=self.network.dtype)
+            for layer in self.nearest_layers
+        }
+        for tile in self._partition(Piece(0, size, Rectangle(0, 0, *size)), None):
+            features = self._forward(image, tile, keep=False).features
+            view, own = tile.owned_cells(self.nearest_layers[0], size)
+            inside, row, column = places_in(places, width, view)
+            for layer, found in vectors.items():
+                found[inside] = features[layer][own.slices].cpu()[row, column]
+        return StyleVectors.of({layer: found.to(image.device) for layer, found in vectors.items()})
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
         """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""
@@ -315,7 +374,15 @@ class SosLoss:
     ) -> Iterator[tuple[_ScalePass, Tensor | None]]:
         """Loss (in the pass) and pixel gradient [h, w, 3] of some scales, whose statistics travel together."""
         passes = [
-            _ScalePass(self, image, scale, share.tiles[scale], view, self._content(view, scale, share.tiles[scale]))
+            _ScalePass(
+                self,
+                image,
+                scale,
+                share.tiles[scale],
+                view,
+                self._content(view, scale, share.tiles[scale]),
+                style[scale].vectors if self.nearest_layers else None,
+            )
             for scale, image in scaled.items()
         ]
         merged, kept = self._first_passes(passes, keep=gradient)
@@ -323,14 +390,16 @@ class SosLoss:
             parts, pass_.terms = self._wait(waiting)
             with self.timer("statistics"):
                 statistics = dict(zip(self.style_layers, parts, strict=True))
-                self._compare(pass_, statistics, style[pass_.scale])
+                self._compare(pass_, statistics, style[pass_.scale].layers)
         yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
 
     def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], Tensor]:
         with self.timer("communication"):
             return merged()
 
-    def _compare(self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], style: ScaleTarget) -> None:
+    def _compare(
+        self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], style: Mapping[str, LayerTarget]
+    ) -> None:
         """Style loss of one scale, added to its terms, and gradient maps, from the statistics of the whole scale."""
         for layer, part in statistics.items():
             if layer in style:
@@ -408,25 +477,33 @@ class _ScalePass:
         tiles: list[PartitionTile],
         view: ViewTarget,
         content: ContentFeatures | None,
+        vectors: StyleVectors | None = None,
     ) -> None:
         self.image = image
         self.scale = scale
         self.tiles = tiles
         self.size = _size(image)
         self.maps: dict[str, StyleGradient] = {}
+        self.matches: dict[PartitionTile, Matches] = {}
         self.terms = torch.zeros(len(TERMS), dtype=torch.float64, device=image.device)
         self._coverage = view.coverage
         self._content_weight = loss.content_weight
         self._timer = loss.timer
         self._content = content
         if content is not None:
-            self._content_count = self._all_content_positions()
+            self._content_count = self._all_positions(CONTENT_LAYER)
+        self._vectors = vectors
+        if vectors is not None:
+            self._nearest_layer = loss.nearest_layers[0]  # the others' cells are the same
+            count = self._all_positions(self._nearest_layer)
+            self._nearest_factor = loss.nearest_weight / torch.where(count > 0, count, torch.inf)
+            self._rounding = loss.network.rounding
 
-    def _all_content_positions(self) -> Tensor:
-        """How many cells of the content layer the whole scale has, or the sum of their weights: float64 scalar."""
-        stride = layer_stride(CONTENT_LAYER)
+    def _all_positions(self, layer: str) -> Tensor:
+        """How many cells of a layer the whole scale has, or the sum of their weights: float64 scalar."""
+        stride = layer_stride(layer)
         cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
-        weights = self.position_weights(CONTENT_LAYER, cells)
+        weights = self.position_weights(layer, cells)
         if weights is not None:
             return weights.sum(dtype=torch.float64)
         return torch.full((), cells.pixels, dtype=torch.float64, device=self.image.device)
@@ -444,10 +521,27 @@ class _ScalePass:
         return fused_statistics(owned, weights) if can_be_fused(owned) else layer_statistics(owned, weights)
 
     def tile_terms(self, tile: PartitionTile, activations: Activations) -> Tensor:
-        """The tile's share [4] of the terms that are sums over positions; the others follow from the whole scale."""
+        """The tile's share [5] of the terms that are sums over positions; the others follow from the whole scale."""
         content = self._content_difference(tile, activations.features.get(CONTENT_LAYER))
         nothing = torch.zeros_like(self.terms)
-        return nothing if content is None else torch.cat([nothing[1:], content.loss()[None]])
+        sums = [None if content is None else content.loss(), self._match(tile, activations)]
+        if sums == [None, None]:
+            return nothing
+        return torch.cat([nothing[2:], *(nothing[:1] if found is None else found[None] for found in sums)])
+
+    def _match(self, tile: PartitionTile, activations: Activations) -> Tensor | None:
+        """Match the cells that a tile owns; their share of the nearest-neighbour term, None where nothing is matched.
+
+        What was found is kept for the second pass: a few bytes a cell, and the search takes long.
+        """
+        if self._vectors is None:
+            return None
+        view, own = tile.owned_cells(self._nearest_layer, self.size)
+        weights = self.position_weights(self._nearest_layer, view)
+        features = {layer: activations.features[layer][own.slices] for layer in self._vectors.parts}
+        with self._timer("matching"):
+            found = self.matches[tile] = Matches.of(features, self._vectors, self._rounding, weights)
+            return self._nearest_factor * found.distance(weights)
 
     def _content_difference(self, tile: PartitionTile, features: Tensor | None) -> ContentDifference | None:
         """On owned cells; features are those of all the tile's cells. None where content does not count."""
@@ -473,6 +567,10 @@ class _ScalePass:
                     self.maps[layer].add_to(gradient[own.slices], features[own.slices], weights)
                 elif layer == CONTENT_LAYER and (content := self._content_difference(tile, features)) is not None:
                     gradient[own.slices] += content.gradient()
+                if self._vectors is not None and layer in self._vectors.parts:
+                    weights, vectors = self.position_weights(layer, view), self._vectors
+                    places = gradient[own.slices], features[own.slices]
+                    self.matches[tile].add_gradient(*places, layer, vectors, self._nearest_factor, weights)
 
         return add
 

@@ -9,8 +9,11 @@ from torch import Tensor
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
+from sgsst_core.loss.nearest import nearest_reference
+from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget
 from sgsst_core.scene.pyramid import scale_count
+from sgsst_core.settings import StyleLossName
 
 
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
@@ -70,6 +73,7 @@ def sos_reference(
     *,
     content_weight: float = 1.0,
     coverage: Tensor | None = None,
+    style_loss: StyleLossName = "sos",
     coarsest: int = COARSEST_SHORTER_SIDE,
 ) -> tuple[float, Tensor]:
     """E and dE/dimage [H, W, 3] in float64.
@@ -78,6 +82,7 @@ def sos_reference(
         image, content: [H, W, 3] in 0..1.
         style: [H', W', 3], already at the size at which it is used (`pyramid.style_size`).
         coverage: [H, W] position weights; None for equal weights.
+        style_loss: see `style_losses`; with features that are matched, the style has at most `nearest.MOST_VECTORS`.
         coarsest: pixels of the coarsest scale's shorter side at most.
     """
     x = image.double().clone().requires_grad_()
@@ -87,9 +92,14 @@ def sos_reference(
         side = 1 << scale
         features = features_reference(network_weights, box_average_reference(x, side))
         wanted = features_reference(network_weights, box_average_reference(style.double(), side))
-        for layer in STYLE_LAYERS:
+        for layer in STYLE_LAYERS if has_statistics(style_loss) else ():
             position = _cells(coverage, side * layer_stride(layer))
             loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position)
+        if matched := nearest_layers(style_loss, network_weights.name):
+            position = _cells(coverage, side * layer_stride(matched[0]))
+            own, other = ([found[layer] for layer in matched] for found in (features, wanted))
+            weight = nearest_weight(style_loss, network_weights.scales.get(CONTENT_LAYER, 1.0))
+            loss = loss + weight * nearest_reference(own, other, position)
         if content is not None and content_weight:
             difference = features[CONTENT_LAYER] - _content_reference(network_weights, content, side)
             position = _cells(coverage, side * layer_stride(CONTENT_LAYER))

@@ -2,6 +2,7 @@
 
 E_style = sum over layers of w_G mean((G - G_v)^2) + w_m mean((mu - mu_v)^2) + w_s mean((sigma - sigma_v)^2)
 E_content = lambda_c mean((F_42 - F_42^content)^2)
+E_nearest: see `nearest`
 
 with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025); means over the entries of each matrix or vector.
 With position weights a_p, n becomes their sum and the content mean is weighted in the same way.
@@ -23,7 +24,13 @@ from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_lo
 
 #: What the loss of a scale is the sum of: names, as files and reports have them, to what people read. The order is that
 #: in which they are added up, shown and given their colours.
-TERMS = {"gram": "Gram matrix", "mean": "mean", "std": "standard deviation", "content": "content"}
+TERMS = {
+    "gram": "Gram matrix",
+    "mean": "mean",
+    "std": "standard deviation",
+    "content": "content",
+    "nearest": "nearest neighbours",
+}
 
 #: w_G = GRAM_WEIGHT / c^2: the numerator.
 GRAM_WEIGHT = 1e3
@@ -67,7 +74,7 @@ class LossTerms(Mapping[str, float]):
 
     @property
     def total(self) -> float:
-        """What is minimised: E_style + E_content."""
+        """What is minimised: the sum of all terms."""
         # `sum` would round otherwise from Python 3.12 on, and results would depend on the interpreter.
         return reduce(operator.add, self._values.values())
 
@@ -145,7 +152,7 @@ def style_loss(
         feature_eps: relative rounding of the features (2^-23 for float32, 2^-52 for float64).
 
     Returns:
-        [4] float64, what the layer adds to each of `TERMS`; and the gradient.
+        [5] float64, what the layer adds to each of `TERMS`; and the gradient.
 
     Where sigma is zero, or no more than the rounding of the mean, a channel is constant: its factor (F - mu)/sigma
     is taken as 0. The loss keeps the term, the gradient stays finite.
@@ -160,13 +167,14 @@ def style_loss(
     mean_error = statistics.mean - target.mean
     std = statistics.std()
     std_error = std - target.std
-    gram_weight = GRAM_WEIGHT / channels**2
+    gram_weight, nothing = GRAM_WEIGHT / channels**2, torch.zeros_like(statistics.count)
     terms = torch.stack(
         [
             gram_weight * gram_error.square().mean(),
             MEAN_WEIGHT * mean_error.square().mean(),
             STD_WEIGHT * std_error.square().mean(),
-            torch.zeros_like(statistics.count),
+            nothing,
+            nothing,
         ]
     )
     matrix = (4 * gram_weight / channels**2) * gram_error

@@ -6,9 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sgsst_core.features.partition import Rectangle, computed_twice, scaled_region
+from sgsst_core.features.vgg import layer_stride
 from sgsst_core.loss.graphs import FIRST_VISITS
+from sgsst_core.loss.nearest import MATCH_BYTES, MOST_VECTORS, working_bytes
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Piece, Size
+
+#: One of the layers whose features are matched with the style's: they have the same cells.
+_MATCHED = "relu3_1"
 
 #: Bytes an optimised Gaussian costs beside the scene: colours, gradient and two moments, float32.
 OPTIMISER_BYTES = 4 * 3 * 4
@@ -24,10 +29,15 @@ def gaussian_bytes(sh_degree: int) -> int:
 
 @dataclass(frozen=True)
 class Rate:
-    """Seconds a pixel: `forward` alone (with statistics), and `both` passes."""
+    """Seconds a pixel: `forward` alone (with statistics), and `both` passes.
+
+    Attributes:
+        search: seconds of the search for a position's nearest style vector, for each of them; 0 where none is searched.
+    """
 
     forward: float
     both: float
+    search: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -121,6 +131,7 @@ class Work:
         without_region: what `pixels` would be if uncovered pixels were not left out.
         tiles: of the full-size view with most tiles.
         peak: most pixels that are held at a time, and what a pass needs beside them counted as such.
+        pairs: of a position and a style vector, which the search for the nearest would compare.
     """
 
     pixels: float
@@ -128,6 +139,7 @@ class Work:
     without_region: float
     tiles: int
     peak: float
+    pairs: float = 0.0
 
     @staticmethod
     def of(
@@ -139,7 +151,7 @@ class Work:
             sizes: (height, width) of each view.
             regions: of each view, that hold every covered pixel; None where uncovered pixels go through too.
         """
-        pixels = again = without = 0.0
+        pixels = again = without = pairs = 0.0
         tiles = 0
         peak = 0.0
         for index, size in enumerate(sizes):
@@ -149,17 +161,50 @@ class Work:
                 twice = computed_twice(areas, flags)
                 pixels += sum(areas)
                 again += twice
+                pairs += pairs_of(piece)
                 without += sum(tile.outer.pixels for tile in tiling.tiles(piece.size))
                 tiles = max(tiles, len(areas))
                 once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
                 held = sum(areas) - twice + tiling.working * max(areas, default=0)
                 peak = max(peak, held, (1 + tiling.working) * once)
         views = len(sizes)
-        return Work(pixels / views, again / views, without / views, tiles, peak)
+        return Work(pixels / views, again / views, without / views, tiles, peak, pairs / views)
 
     def seconds(self, rate: Rate) -> float:
         """Of the feature network and the statistics in one iteration."""
-        return self.pixels * rate.both + self.again * rate.forward
+        return self.pixels * rate.both + self.again * rate.forward + self.pairs * rate.search
+
+    def evaluation(self, rate: Rate) -> float:
+        """Of the loss alone, without its gradient."""
+        return self.pixels * rate.forward + self.pairs * rate.search
+
+
+def pairs_of(piece: Piece) -> int:
+    """Positions of a piece, each with every vector of a style that is as large as the view."""
+    return piece.cells(_MATCHED) * _vectors(piece.size)
+
+
+def _vectors(size: Size) -> int:
+    """Of a style as large as a scaled view of a size (height, width)."""
+    stride = layer_stride(_MATCHED)
+    return min((size[0] // stride) * (size[1] // stride), MOST_VECTORS)
+
+
+def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: int, device: str) -> int:
+    """Style vectors of every size of views (height, width) at all scales, matches and buffers of the search.
+
+    Args:
+        channels: of a vector; 0 where nothing is matched.
+        value: bytes of a value.
+    """
+    if not channels:
+        return 0
+    scaled = {size: [(size[0] >> s, size[1] >> s) for s in range(tiling.scale_count(size))] for size in set(sizes)}
+    vectors = sum(_vectors(part) for parts in scaled.values() for part in parts)
+    positions = (
+        max(sum(part[0] * part[1] for part in parts) for parts in scaled.values()) // layer_stride(_MATCHED) ** 2
+    )
+    return vectors * channels * value + positions * MATCH_BYTES + working_bytes(channels, value, device)
 
 
 def content_bytes(sizes: Sequence[Size], tiling: Tiling, cell: int) -> int:

@@ -28,6 +28,8 @@ from sgsst_core.planning.cost import (
     content_bytes,
     gaussian_bytes,
     image_bytes,
+    nearest_bytes,
+    pairs_of,
     pieces_of,
 )
 from sgsst_core.planning.job import of_measuring, whole_job
@@ -210,7 +212,7 @@ class _Deciding:
         computing = image_bytes(probe.sizes) + activations * (2 if self.base.graphs else 1)
         weights = visits.weights.bytes if visits.weights else 0.0
         computing += min(int(visits.content.bytes) // ranks, int(visits.content.room))
-        computing += min(int(weights) // ranks, self.budget)
+        computing += min(int(weights) // ranks, self.budget) + self._nearest_bytes()
         gaussians = int(self.base.seen.sum())
         measuring = MEASURING_BYTES if self.measured else 0
         if probe.machine.device != "cpu":
@@ -219,6 +221,11 @@ class _Deciding:
         scene = 0 if bool(self.base.seen.all()) else gaussians * gaussian_bytes(probe.scene.held_degree)
         optimising = gaussians * (OPTIMISER_BYTES + STEP_BYTES) + visits.colours.kept_bytes
         return probe.process_bytes + scene + lists + optimising + computing + measuring, None
+
+    def _nearest_bytes(self) -> int:
+        """What matching features with the style's takes; every rank has all of the style's vectors."""
+        network, device = self.probe.network, self.probe.machine.device
+        return nearest_bytes(self.sizes, self.tiling, network.vector_channels, 4, device)
 
     def _held_out_bytes(self, level: int) -> int:
         """Lists that the held-out views of a level keep."""
@@ -291,6 +298,7 @@ class _Deciding:
                     working=self.tiling.working,
                     sharing=sharing,
                     shown=self.base.survey.shown,
+                    matching=network.rate.search * sum(map(pairs_of, pieces)),
                 )
             )
         return found

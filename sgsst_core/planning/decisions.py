@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
+from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.style_losses import NEAREST_WEIGHTS
 from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
@@ -104,8 +106,10 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
 
 def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -> list[Decision]:
     """Layers, content, partition and forward passes; activations: bytes that they may take."""
-    layers = "relu5_1, the deepest one used"
+    layers = f"{probe.network.deepest}, the deepest one used"
     decisions = [Decision("network layers", f"none behind {layers}", "the loss reads no deeper one")]
+    if settings.style_loss != "sos":
+        decisions.append(_of_style_loss(probe, settings, work))
     if not settings.content_weight:
         decisions.append(Decision("content", "no content features are computed or kept", "its weight is 0"))
     gigabytes = f"{activations / 1e9:.1f} GB for activations"
@@ -126,6 +130,19 @@ def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -
             )
         )
     return decisions
+
+
+def _of_style_loss(probe: Probe, settings: Settings, work: Work) -> Decision:
+    """Where features are matched with the style's."""
+    weight, network = NEAREST_WEIGHTS[settings.style_loss], probe.network
+    what = "takes the place of the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
+    return Decision(
+        "style loss",
+        f"the distance of relu3 features to the nearest of at most {MOST_VECTORS:,} of the style's {what}, with "
+        f"weight {weight:.3g}; the search takes {work.pairs * network.rate.search:.2g} s a view",
+        f"{settings.style_loss} was asked for",
+        error="it is another loss than the paper's",
+    )
 
 
 def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:

@@ -62,7 +62,7 @@ def whole_job(
     views = len(plan.covered)
     if not plan.measured:
         return expected, Measured(plan.measuring, min(LOSS_VIEWS[0], views))
-    once = RENDER * visits.rasterized() + visits.later(coarse=False) + work.pixels * probe.network.rate.forward
+    once = RENDER * visits.rasterized() + visits.later(coarse=False) + work.evaluation(probe.network.rate)
     unvisited = max(1 - settings.steps_sos * settings.views_per_step / views, 0.0)
     price = 2 * once + unvisited * expected.first_visit
     # A target is a share of the loss before: how long that takes must not decide where the job ends.

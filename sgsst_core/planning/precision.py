@@ -19,7 +19,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
-from sgsst_core.settings import Precision
+from sgsst_core.settings import Precision, StyleLossName
 from sgsst_core.timing import Timer
 
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16}
@@ -85,6 +85,7 @@ def gradient_error(
     rasterizer: Rasterizer,
     memory: int,
     side: int,
+    style_loss: StyleLossName = "sos",
 ) -> Difference | None:
     """The pixel gradient of a view against that of the same network in whole float32, with a made-up style.
 
@@ -93,6 +94,7 @@ def gradient_error(
         camera: of the view, rendered unstylized and brought down until its longer side is at most `side`.
         rasterizer: of the whole scene.
         memory: bytes that activations may take.
+        style_loss: of the job.
 
     Returns:
         The difference; None where the network is in float32.
@@ -106,7 +108,7 @@ def gradient_error(
     exact = FeatureNetwork(weights, network.layers, torch.float32, network.device)
     gradients = []
     for each in (network, exact):
-        loss = SosLoss(each, content_weight=0, memory=memory)
+        loss = SosLoss(each, content_weight=0, style_loss=style_loss, memory=memory)
         style = loss.style_targets(soft_picture(max(image.shape[:2])), (image.shape[0], image.shape[1]))
         result = loss.evaluate(image, style, loss.view_target(image), [0])
         assert result.image_gradient is not None

@@ -9,17 +9,20 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import psutil
 import torch
+from torch import Tensor
 
 from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork, use_whole_float32
+from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.nearest import search
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import (
@@ -63,6 +66,8 @@ LEAST_GRAPH_VISITS = 20
 #: Views whose blend weights are counted and timed; the others are taken to be like them.
 SAMPLED_VIEWS = 3
 
+#: Made-up vectors that are compared with each other to measure the search.
+SEARCHED = {"cpu": 1 << 11, "cuda": 1 << 14}
 #: Runs of the network, of which the fastest counts.
 _RATE_RUNS = 2
 #: Of kept blend weights, the exact one first.
@@ -100,6 +105,8 @@ class NetworkFacts:
         precision_ratio: seconds of a convolution in float32, over those in the precision that was asked for; None where
             that is float32, or what there is not here.
         gradient_error: of a view's pixel gradient, against float32; None where that is what runs.
+        vector_channels: of a vector that is matched with the style's; 0 where none is.
+        deepest: layer that it reports.
     """
 
     halo: int
@@ -110,6 +117,8 @@ class NetworkFacts:
     fixed: float = 0.0
     precision_ratio: float | None = None
     gradient_error: Difference | None = None
+    vector_channels: int = 0
+    deepest: str = "relu5_1"
 
 
 @dataclass(frozen=True)
@@ -254,7 +263,7 @@ def sharing_memory(collectives: Collectives, device: Device) -> int:
 
 def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
     """The feature network, with layers up to the deepest one used."""
-    layers = (*STYLE_LAYERS, CONTENT_LAYER) if settings.content_weight else STYLE_LAYERS
+    layers = layers_of(settings.style_loss, weights.name, content=settings.content_weight > 0)
     use_whole_float32()
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
@@ -312,7 +321,18 @@ def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
         rate,
         fixed,
         workshop.precision_ratio,
-        gradient_error(network, workshop.weights, workshop.scene, first, workshop.rasterizer, loss.memory, side),
+        gradient_error(
+            network,
+            workshop.weights,
+            workshop.scene,
+            first,
+            workshop.rasterizer,
+            loss.memory,
+            side,
+            settings.style_loss,
+        ),
+        sum(network.channels(layer) for layer in loss.nearest_layers),
+        max(network.layers),
     )
 
 
@@ -322,6 +342,7 @@ def _loss(workshop: Workshop) -> SosLoss:
     return SosLoss(
         workshop.network,
         content_weight=settings.content_weight,
+        style_loss=settings.style_loss,
         memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
         coarsest=settings.coarsest_side,
         keep_activations="activations" not in settings.keep,
@@ -353,6 +374,9 @@ def measure_rate(loss: SosLoss, side: int) -> Rate:
     """
     image = soft_picture(side).to(loss.network.device)
     style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
+    vectors = style[0].vectors
+    if vectors is not None:  # its time grows with their number, and is not the pixels'
+        style = {0: replace(style[0], vectors=replace(vectors, units=vectors.units[:1]))}
 
     def seconds(gradient: bool) -> float:
         timer = Timer(loss.network.device)
@@ -362,7 +386,23 @@ def measure_rate(loss: SosLoss, side: int) -> Rate:
 
     seconds(True)
     both = min(seconds(True) for _ in range(_RATE_RUNS))
-    return Rate(forward=min(seconds(False) for _ in range(_RATE_RUNS)), both=both)
+    forward = min(seconds(False) for _ in range(_RATE_RUNS))
+    return Rate(forward, both, 0.0 if vectors is None else _search_seconds(vectors.units))
+
+
+def _search_seconds(units: Tensor) -> float:
+    """Of a position and a style vector in the search for the nearest one."""
+    size = SEARCHED[units.device.type]
+    made = torch.rand((size, units.shape[1]), generator=torch.Generator().manual_seed(0)).to(units)
+
+    def seconds() -> float:
+        timer = Timer(units.device)
+        with timer("search"):
+            search(made, made)
+        return timer.read()["search"] / size**2
+
+    seconds()
+    return min(seconds() for _ in range(_RATE_RUNS))
 
 
 # --- the rasterizer ------------------------------------------------------------------------------------------------

@@ -64,6 +64,7 @@ class IterationWork:
         fixed: seconds that every rank needs, however many there are: comparing statistics, the optimiser.
         gaussians: that are optimised.
         shown: that the view shows, for which alone its gradient travels; None for all.
+        matching: seconds of the search for nearest style vectors on one rank.
         whole_image: the full-size image and its gradient are exchanged (phase 1 with kept weights needs neither).
         forward: seconds a pixel of a forward pass alone, for pixels whose activations do not stay in memory.
         held, working: pixels whose activations one rank alone can hold, and what a pass needs beside them as a share of
@@ -83,12 +84,17 @@ class IterationWork:
     working: float = 0.0
     sharing: int = 1
     shown: float | None = None
+    matching: float = 0.0
 
     def computing(self, ranks: int, groups: int = 1) -> float:
         """Seconds of the rank with most work, where so many groups of ranks take a view each."""
         shares = divide(self.pieces, self.halo, (1.0,) * ranks)
         held = self.held / min(ranks * groups, self.sharing)
-        return max(self._network(share, ranks, held) for share in shares) + self.raster / ranks + self.fixed
+        return (
+            max(self._network(share, ranks, held) for share in shares)
+            + (self.raster + self.matching) / ranks
+            + self.fixed
+        )
 
     def _network(self, share: Sequence[Piece], ranks: int, held: float) -> float:
         """Seconds of a rank's pieces, cut into partition tiles as its memory allows."""

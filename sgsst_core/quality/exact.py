@@ -17,10 +17,11 @@ from torch import Tensor
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.terms import LayerTarget
+from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
-from sgsst_core.stylizing.evaluation import Evaluation, evaluate
+from sgsst_core.settings import StyleLossName
+from sgsst_core.stylizing.evaluation import Evaluation, StyleTargets, evaluate
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 
@@ -62,25 +63,50 @@ class GradientError:
         return asdict(self)
 
 
-class ExactTwin:
+class ExactLoss:
+    """A job's loss in float32.
+
+    Args:
+        stylizer: the job; it is not changed.
+        style_loss: another one than the job's, for jobs with different ones to be compared; None for the job's.
+    """
+
+    def __init__(self, stylizer: Stylizer, style_loss: StyleLossName | None = None) -> None:
+        self._stylizer = stylizer
+        settings = stylizer.settings
+        style_loss = style_loss or settings.style_loss
+        layers = layers_of(style_loss, stylizer.weights.name, content=settings.content_weight > 0)
+        self.loss = SosLoss(
+            FeatureNetwork(stylizer.weights, layers, torch.float32, stylizer.network.device),
+            content_weight=settings.content_weight,
+            style_loss=style_loss,
+            memory=stylizer.loss.memory,
+            coarsest=settings.coarsest_side,
+            style_scale=settings.style_scale,
+        )
+        self._style_targets: dict[tuple[int, int], StyleTargets] = {}
+
+    def style_targets(self, camera: Camera) -> StyleTargets:
+        """What the style asks of views of the camera's size."""
+        size = (camera.height, camera.width)
+        if size not in self._style_targets:
+            style = self._stylizer.style.to(self.loss.network.device)
+            self._style_targets[size] = self.loss.style_targets(style, size)
+        return self._style_targets[size]
+
+
+class ExactTwin(ExactLoss):
     """Evaluates loss and gradient of a job's colours exactly.
 
     Args:
         stylizer: the job; it is not changed.
         memory: bytes that view targets may take.
+        style_loss: as for `ExactLoss`.
     """
 
-    def __init__(self, stylizer: Stylizer, memory: int = 1 << 30) -> None:
-        self._stylizer = stylizer
+    def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
+        super().__init__(stylizer, style_loss)
         settings = stylizer.settings
-        network = FeatureNetwork(stylizer.weights, stylizer.network.layers, torch.float32, stylizer.network.device)
-        self.loss = SosLoss(
-            network,
-            content_weight=settings.content_weight,
-            memory=stylizer.loss.memory,
-            coarsest=settings.coarsest_side,
-            style_scale=settings.style_scale,
-        )
         self.shown = stylizer.plan.survey.total_blend_weights > 0
         scene = stylizer.scene.subset(self.shown).without_zero_bands()
         self.views = Views(
@@ -94,15 +120,6 @@ class ExactTwin:
             memory=memory,
             revive=settings.revive,
         )
-        self._style_targets: dict[tuple[int, int], dict[int, dict[str, LayerTarget]]] = {}
-
-    def style_targets(self, camera: Camera) -> dict[int, dict[str, LayerTarget]]:
-        """The style's statistics for views of the camera's size."""
-        size = (camera.height, camera.width)
-        if size not in self._style_targets:
-            style = self._stylizer.style.to(self.loss.network.device)
-            self._style_targets[size] = self.loss.style_targets(style, size)
-        return self._style_targets[size]
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
         """Mean SOS loss over views of colours [N, 3] of the whole scene, split by scale."""

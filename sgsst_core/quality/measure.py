@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.planning.measuring import (
     LEVELS,
     NOTHING,
@@ -18,7 +19,7 @@ from sgsst_core.planning.measuring import (
     held_out_list_bytes,
     held_out_seconds,
 )
-from sgsst_core.quality.exact import ExactTwin, approximations
+from sgsst_core.quality.exact import ExactLoss, ExactTwin, approximations
 from sgsst_core.quality.held_out import HeldOut
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
@@ -203,6 +204,12 @@ class Measurements:
         # One view has been prepared by now: that it be measured at the end costs little.
         return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
 
+    def _source_of_statistics(self) -> Stylizer | ExactLoss:
+        """What has network and style targets to measure Gram distances with: exact ones, whatever the job optimises."""
+        if not has_statistics(self._stylizer.settings.style_loss):
+            return ExactLoss(self._stylizer, "sos")
+        return self.exact if self._stylizer.network.precision != "float32" else self._stylizer
+
     def _of_held_out_views(self) -> HeldOut:
         if self._held_out is None:
             self._held_out = self._make(self.level.views)
@@ -223,7 +230,7 @@ class Measurements:
             scene = stylizer.scene.without_zero_bands()
             self._seen_by = scene, rasterizer_of(scene)
         scene, rasterizer = self._seen_by
-        source = self.exact if stylizer.network.precision != "float32" else stylizer
+        source = self._source_of_statistics()
         first = stylizer.measured[0]["held_out"] if stylizer.measured else None
         return HeldOut(
             stylizer.views.cameras,

@@ -146,8 +146,8 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
         # Where the coarsest scale went first, the others would be a sliver at the end of its axis.
         there = history.x[against][np.any([~np.isnan(values) for values in terms.values()], axis=0)]
         own = replace(history, limits={**history.limits, against: log_limits(there, X_MARGIN)})
-        for place, (term, values) in enumerate(terms.items()):
-            draw_line(axes, own, against, values, colour_of(place), TERMS[term])
+        for term, values in terms.items():
+            draw_line(axes, own, against, values, colour_of(list(TERMS).index(term)), TERMS[term])
         axes.set_title(scale_name(scale))
         set_log_x(axes, own.limits[against], against)
         set_log_y(axes, everything)

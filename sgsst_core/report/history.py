@@ -84,13 +84,14 @@ def history_of(report: dict[str, Any]) -> History:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         relative = {scale: _of_scale(records, scale, "total") / starts[scale] for scale in scales}
     moments = held_out_moments(report)
+    terms = _terms_there(records)
     return History(
         x=x,
         limits={
             against: log_limits(np.append(x[against], moment_places(moments, against)), X_MARGIN) for against in AGAINST
         },
         phases=_phases([record["stage"] for record in records]),
-        terms={scale: {term: _of_scale(records, scale, term) for term in TERMS} for scale in scales},
+        terms={scale: {term: _of_scale(records, scale, term) for term in terms} for scale in scales},
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
         memory=column([record.get("memory_bytes") for record in records]),
@@ -117,6 +118,12 @@ def held_out_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
 def moment_places(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
     """Where moments lie on an x axis, [n]."""
     return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
+
+
+def _terms_there(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Terms of which a record's loss has any; all where none has."""
+    split = [terms for record in records for terms in record["scales"].values()]
+    return [term for term in TERMS if any(terms.get(term) for terms in split)] or list(TERMS)
 
 
 def _of_scale(records: Sequence[dict[str, Any]], scale: int, term: str) -> Floats:

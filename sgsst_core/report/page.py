@@ -43,6 +43,7 @@ _PARTS = {
     "vgg_forward": "feature network, forward",
     "vgg_backward": "feature network, backward",
     "statistics": "statistics of the features",
+    "matching": "nearest neighbours of the features",
     "network": "feature network and loss, as a graph",
     "render": "rendering",
     "raster_backward": "rendering, backward",

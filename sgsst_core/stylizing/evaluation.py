@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from sgsst_core.loss.terms import LayerTarget, LossTerms
+from sgsst_core.loss.sos import ScaleTarget
+from sgsst_core.loss.terms import LossTerms
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.views import Views
 
 Evaluation = dict[int, LossTerms]
-StyleTargets = dict[int, dict[str, LayerTarget]]
+StyleTargets = dict[int, ScaleTarget]
 
 
 def evaluation_views(covered: Sequence[int], most: int) -> list[int]:

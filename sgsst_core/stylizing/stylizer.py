@@ -174,6 +174,7 @@ class Stylizer:
         return SosLoss(
             self.network,
             content_weight=settings.content_weight,
+            style_loss=settings.style_loss,
             memory=int(self.memory * MEMORY_SHARES["activations"]),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,

@@ -20,7 +20,7 @@ BALANCE_STEPS = 6
 #: Ranks are given other shares of the work only where the fastest is faster than the slowest by more than this.
 LEAST_IMBALANCE = 1.15
 
-_NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics")
+_NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching")
 
 
 class Team:

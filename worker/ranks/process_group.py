@@ -207,6 +207,8 @@ class ProcessGroupCollectives:
         C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T, the pairwise update of
         Chan et al. (1979) for many parts at once.
         """
+        if not parts:
+            return [], self.all_reduce(numbers.clone(), "statistics")
         sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
         flat = self.all_reduce(torch.cat([*sums, numbers]), "statistics")
         *totals, added = flat.split([*(len(part) for part in sums), len(numbers)])

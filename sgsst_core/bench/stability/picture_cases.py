@@ -104,9 +104,9 @@ def _long_style(full: bool) -> CaseResult:
     size = (50, 60) if full else (16, 20)
     style = texture(10000, 50, 5)
     single, double = (
-        SosLoss(FeatureNetwork(vgg16(), STYLE_LAYERS, dtype), content_weight=0, memory=memory).style_targets(
-            style.to(dtype), size
-        )[0]
+        SosLoss(FeatureNetwork(vgg16(), STYLE_LAYERS, dtype), content_weight=0, memory=memory)
+        .style_targets(style.to(dtype), size)[0]
+        .layers
         for dtype, memory in ((torch.float32, 1 << 28), (torch.float64, 1 << 34))
     )
     errors = [

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from torch import Tensor
 
 from sgsst_core.bench.error_time import (
     VARIANTS,
@@ -20,6 +21,8 @@ from sgsst_core.bench.error_time import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.stylizing.evaluation import Evaluation
 from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -43,6 +46,26 @@ def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneW
     values = json.loads(json.dumps(as_dict(curves)))
     assert set(values["variants"]) == set(names)
     assert values["pareto_front"]
+
+
+def test_other_style_losses_are_judged_by_the_same_one(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The paper's, even where all variants optimise another one."""
+    found: list[Evaluation] = []
+    evaluate = ExactTwin.evaluate
+
+    def kept(self: ExactTwin, indices: list[int], sh_dc: Tensor) -> Evaluation:
+        found.append(evaluate(self, indices, sh_dc))
+        return found[-1]
+
+    monkeypatch.setattr(ExactTwin, "evaluate", kept)
+    scene, views, variants = wall(), cameras(2, 48, 36), choose_variants(["nnfm", "mixed"])
+    for style_loss in ("sos", "nnfm"):
+        curves = error_time(scene, views, style(), variants, 1.0, weights=tiny_weights, style_loss=style_loss)
+        assert all(len(curve.points) == 6 for curve in curves)
+    assert len(found) == 2 * (1 + 2 * 6)
+    assert all(terms["nearest"] == 0 < terms["gram"] for evaluation in found for terms in evaluation.values())
 
 
 def test_the_front_holds_what_nothing_beats() -> None:

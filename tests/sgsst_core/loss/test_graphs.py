@@ -16,7 +16,9 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, has_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
+from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.loss.tiling import Tiling
+from sgsst_core.settings import StyleLossName
 from sgsst_core.stylizing.evaluation import StyleTargets
 from sgsst_core.timing import Timer
 from tests.pretend_cuda.counts import Counts
@@ -94,6 +96,28 @@ def test_a_graph_gives_the_same_bits_for_every_view(
         assert values.cpu().equal(expected_values.cpu())
     assert graphs.problem is None
     assert loss.timer.read()["network"] > 0
+
+
+@pytest.mark.usefixtures("without_triton")
+@pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
+def test_graphs_hold_the_search_for_nearest_vectors(
+    counts: Counts, tiny_weights: BackboneWeights, style_loss: StyleLossName
+) -> None:
+    network = FeatureNetwork(tiny_weights, layers_of(style_loss, "vgg16", content=True), device="cuda")
+    loss = SosLoss(network, style_loss=style_loss, coarsest=16, timer=Timer("cuda"))
+    style, view, graphs = style_of(loss), view_of(loss, 2, weighted=True), LossGraphs(loss)
+    for step in range(FIRST_VISITS + 1):
+        pixels = image(step)
+        expected = loss.evaluate(pixels, style, view, SCALES)
+        counts.clear()
+        found = graphs.evaluate(pixels, style, view, SCALES)
+        if step >= FIRST_VISITS:
+            assert not counts.waits
+            assert not counts.copies
+        assert_same(found, expected)
+    assert graphs.problem is None
+    assert graphs.captured == 1
+    assert all(terms["nearest"] > 0 for terms in expected.terms.values())
 
 
 @pytest.mark.usefixtures("without_triton")

@@ -13,6 +13,7 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.planning.choices import rasterizer_anew
 from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
 from sgsst_core.planning.decide import LEAST_PASSES, MEASURING_BYTES, decide
@@ -161,6 +162,28 @@ def test_partition_and_second_forward_follow_from_the_memory() -> None:
 def test_memory_is_shared_by_the_ranks_of_a_machine() -> None:
     assert said(plan_of(probe(sharing=5)), "partition") == said(plan_of(probe(memory_limit=2 * GIGABYTE)), "partition")
     assert plan_of(probe(sharing=5)).memory_limit == 10 * GIGABYTE
+
+
+def test_matching_features_is_in_seconds_and_memory() -> None:
+    """Beside what the passes of a network take; nothing is said or counted where nothing is matched."""
+    search, rate, channels = 1e-9, probe().network.rate, 48
+    positions = [(600 >> scale) // 4 * ((800 >> scale) // 4) for scale in (0, 1)]
+    pairs = sum(count * min(count, MOST_VECTORS) for count in positions)
+    matching = probe(rate=replace(rate, search=search), vector_channels=channels, deepest="relu4_2")
+    for ranks in (1, 2):
+        plain, found = (
+            plan_of(replace(each, machine=replace(each.machine, ranks=ranks)), keep=("ranks",), style_loss=style_loss)
+            for each, style_loss in ((probe(), "sos"), (matching, "nnfm"))
+        )
+        assert plain.prediction is not None
+        assert found.prediction is not None
+        assert found.prediction.seconds - plain.prediction.seconds == pytest.approx(search * pairs / ranks)
+        vectors = 4 * channels * sum(min(count, MOST_VECTORS) for count in positions)
+        more = found.prediction.peak_bytes - plain.prediction.peak_bytes
+        assert vectors + 16 * sum(positions) < more < vectors + 16 * sum(positions) + (16 << 20)
+        assert line(plain, "style loss") is None
+        assert said(found, "style loss").startswith("the distance of relu3 features to the nearest of at most 8,192 of")
+        assert said(found, "network layers").startswith("none behind relu4_2")
 
 
 def test_content_is_left_out_without_weight() -> None:

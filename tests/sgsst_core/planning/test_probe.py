@@ -65,6 +65,19 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     assert probe.process_bytes > 10**7
 
 
+def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    looked = survey(scene, cameras(3), make_rasterizer("cpu", scene))
+    plain, nnfm, mixed = (
+        measure(equipped(tiny_weights, scene, style_loss=style_loss, precision="bfloat16"), looked, FREE).network
+        for style_loss in ("sos", "nnfm", "mixed")
+    )
+    assert (plain.rate.search, plain.vector_channels, plain.deepest) == (0.0, 0, "relu5_1")
+    assert nnfm.rate.search > 0 < mixed.rate.search
+    assert (nnfm.vector_channels, nnfm.deepest) == (48, "relu4_2")
+    assert (mixed.vector_channels, mixed.deepest) == (48, "relu5_1")
+
+
 def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
     """On a GPU large, as far as their activations fit; the views' own size bounds both (`measure_rate` is given it)."""
     workshop = equipped(tiny_weights, wall(), memory_limit=10**9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -24,9 +25,13 @@ EXPENSIVE = Prediction(1e3, 1e3, 0, losses=1e6, job=1e6)
 
 
 def make(
-    weights: BackboneWeights, prediction: Prediction | None = LONG, level: int = 0, measure: float = 0.1
+    weights: BackboneWeights,
+    prediction: Prediction | None = LONG,
+    level: int = 0,
+    measure: float = 0.1,
+    **values: Any,
 ) -> Stylizer:
-    settings = make_settings(steps_sos=STEPS, steps_coarse=0, measure=measure)
+    settings = make_settings(steps_sos=STEPS, steps_coarse=0, measure=measure, **values)
     stylizer = Stylizer.planned(wall(), cameras(5), style(), settings, weights=weights)
     stylizer.plan = replace(stylizer.plan, prediction=prediction, measuring=level)
     return stylizer
@@ -48,6 +53,17 @@ def test_all_moments_where_they_are_cheap(tiny_weights: BackboneWeights) -> None
     assert len(first["held_out_views"]) == 3  # first ones of the pairs of four views
     assert first["again"] > 0 < first["seconds"]
     assert stylizer.seconds_by_part["measuring"] >= sum(entry["seconds"] for entry in stylizer.measured)
+
+
+@pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
+def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: BackboneWeights, style_loss: str) -> None:
+    usual, other = (make(tiny_weights, level=NOTHING - 2, style_loss=each) for each in ("sos", style_loss))
+    measured(usual)
+    measured(other)
+    assert other.measured[0]["step"] == usual.measured[0]["step"] == 0
+    start, same = (found.measured[0]["held_out"]["gram"] for found in (other, usual))
+    assert start == pytest.approx(same, rel=1e-6)
+    assert all(terms["nearest"] > 0 for terms in other.history[-1].terms.values())
 
 
 def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeights) -> None:

@@ -215,6 +215,18 @@ def test_split_has_a_panel_for_each_scale() -> None:
     assert all(name in words for name in TERMS.values())
 
 
+def test_terms_that_a_loss_does_not_have_are_not_drawn() -> None:
+    report = sample_report(scales=2)
+    for record in report["history"]:
+        for terms in record["scales"].values():
+            terms["nearest"] = 0.0
+            del terms["content"]  # as a report of before there was the term
+    words = Page(draw_figures(report)[1].svg["seconds"]).text
+    assert TERMS["gram"] in words
+    assert TERMS["nearest"] not in words
+    assert TERMS["content"] not in words
+
+
 def test_both_axes_of_the_loss_are_logarithmic() -> None:
     """Held-out points of which each has twice the step and half the value of the one before lie evenly spaced."""
     report = sample_report(0, 64)

@@ -109,8 +109,8 @@ def test_larger_strokes_are_statistics_of_a_larger_style(tiny_weights: BackboneW
     network = FeatureNetwork(tiny_weights)
     found = SosLoss(network, style_scale=scale).style_targets(style, view)[0]
     wanted = SosLoss(network).style_targets(resize_area(style, size), size)[0]
-    for layer in found:
-        torch.testing.assert_close(found[layer].gram, wanted[layer].gram)
+    for layer in found.layers:
+        torch.testing.assert_close(found.layers[layer].gram, wanted.layers[layer].gram)
 
 
 def test_strokes_as_they_are_leave_a_small_style_alone() -> None:

@@ -165,6 +165,21 @@ def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
     assert left_out.evaluate([0])[0].total < 0.6 * start
 
 
+@pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_features_come_nearer_to_the_style(
+    tiny_weights: BackboneWeights, scene: Scene, style_loss: str, precision: str
+) -> None:
+    values: dict[str, Any] = {"style_loss": style_loss, "precision": precision, "content_weight": 0.0}
+    stylizer = make(tiny_weights, scene, steps_sos=20, learning_rate=0.1, **values)
+    before = stylizer.evaluate([0, 1, 2])[0]
+    run(stylizer)
+    after = stylizer.evaluate([0, 1, 2])[0]
+    assert after["nearest"] < 0.9 * before["nearest"]
+    assert after.total < 0.9 * before.total
+    assert stylizer.seconds_by_part["matching"] > 0
+
+
 def test_evaluating_changes_nothing(tiny_weights: BackboneWeights, scene: Scene) -> None:
     stylizer = make(tiny_weights, scene)
     stylizer.run_step()

@@ -9,14 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import make_settings
+from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
@@ -39,10 +40,13 @@ def gradient(
     tile_size: int | None,
     speeds: tuple[float, ...] | None = None,
     memory: int = 1 << 34,
+    style_loss: StyleLossName = "sos",
 ) -> tuple[Tensor, float, list[bool]]:
     """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
-    network = FeatureNetwork(tiny_weights(), (*STYLE_LAYERS, CONTENT_LAYER), dtype)
-    loss = SosLoss(network, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives)
+    network = FeatureNetwork(tiny_weights(), layers_of(style_loss, "vgg16", content=True), dtype)
+    loss = SosLoss(
+        network, style_loss=style_loss, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives
+    )
     loss.speeds = speeds or loss.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     looked = survey(scene, [camera], rasterizer)
@@ -107,6 +111,17 @@ def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
     results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, memory)
     assert set(results[0][2]) == {True, False}
     for found, found_loss, _ in results:
+        assert relative_error(found, expected) < 1e-9
+        assert found_loss == pytest.approx(loss, rel=1e-9)
+
+
+@pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
+def test_matched_features_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
+    """On three ranks, of which one has hardly anything to match."""
+    scene, camera = ball(), cameras(1, 128, 96)[0]
+    arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss
+    expected, loss, _ = gradient(ALONE, *arguments)
+    for found, found_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(found, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 

@@ -1,0 +1,271 @@
+"""Nearest-neighbour feature matching against its definition, and where angles do not exist."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import ImageError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss import nearest
+from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, nearest_reference, search
+from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.sos_reference import sos_reference
+from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, layers_of, nearest_layers
+from sgsst_core.settings import StyleLossName
+from tests.networks import tiny_weights as make_tiny_weights
+from tests.sgsst_core.pictures import picture, relative_error
+
+EPS = torch.finfo(torch.float64).eps
+MATCHED: tuple[StyleLossName, ...] = ("nnfm", "mixed")
+
+
+def loss_of(
+    weights: BackboneWeights, style_loss: StyleLossName, dtype: torch.dtype = torch.float64, **options: object
+) -> SosLoss:
+    network = FeatureNetwork(weights, layers_of(style_loss, weights.name, content=True), dtype)
+    return SosLoss(network, style_loss=style_loss, **options)  # type: ignore[arg-type]
+
+
+def setting(height: int, width: int, *, covered: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Image, style, content and coverage."""
+    coverage = None
+    if covered:
+        coverage = (picture(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+        coverage[: height // 3] = 0
+    return picture(height, width, seed=1), picture(90, 110, seed=3) ** 2, picture(height, width, seed=2), coverage
+
+
+def evaluate(loss: SosLoss, case: tuple[Tensor, Tensor, Tensor, Tensor | None]) -> SosResult:
+    image, style, content, coverage = (None if part is None else part.to(loss.network.dtype) for part in case)
+    assert image is not None
+    assert style is not None
+    assert content is not None
+    targets = loss.style_targets(style, (image.shape[0], image.shape[1]))
+    return loss.evaluate(image, targets, loss.view_target(content, coverage))
+
+
+def gradient_of(result: SosResult) -> Tensor:
+    assert result.image_gradient is not None
+    return result.image_gradient
+
+
+def features(positions: tuple[int, int], channels: tuple[int, ...], seed: int) -> dict[str, Tensor]:
+    """As a ReLU leaves them, float64; none of them is 0."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        f"relu3_{place}": torch.randn((*positions, count), generator=generator, dtype=torch.float64).relu() + 0.01
+        for place, count in enumerate(channels, start=1)
+    }
+
+
+def vectors_of(parts: dict[str, Tensor]) -> StyleVectors:
+    return StyleVectors.of({layer: part.flatten(0, 1) for layer, part in parts.items()})
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+@pytest.mark.parametrize("network", ["vgg16", "vgg19"])
+@pytest.mark.parametrize(("tile_size", "covered"), [(None, False), (64, True), (48, False)])
+def test_any_partition_agrees_with_untiled_autograd(
+    network: str, style_loss: StyleLossName, tile_size: int | None, covered: bool
+) -> None:
+    weights = make_tiny_weights(network)  # type: ignore[arg-type]
+    image, style, content, coverage = case = setting(101, 150, covered=covered)
+    expected, gradient = sos_reference(
+        weights, image, style, content, coverage=coverage, style_loss=style_loss, coarsest=60
+    )
+    result = evaluate(loss_of(weights, style_loss, tile_size=tile_size, coarsest=60), case)
+    assert result.scales == (0, 1)
+    assert result.loss == pytest.approx(expected, rel=1e-9)
+    assert relative_error(gradient_of(result), gradient) < 1e-9
+    assert all(terms["nearest"] > 0 for terms in result.terms.values())
+    assert all((terms["gram"] > 0) == (style_loss == "mixed") for terms in result.terms.values())
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_the_gradient_is_the_slope_of_the_loss(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
+    image, style, content, coverage = setting(48, 64, covered=True)
+    loss = loss_of(tiny_weights, style_loss)
+    gradient = gradient_of(evaluate(loss, (image, style, content, coverage)))
+    direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    step = 1e-7
+    ahead, behind = (evaluate(loss, (image + way * direction, style, content, coverage)).loss for way in (step, -step))
+    assert (ahead - behind) / (2 * step) == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_the_real_network_agrees_with_untiled_autograd(
+    vgg16_weights: BackboneWeights, style_loss: StyleLossName
+) -> None:
+    image, style, content, coverage = case = setting(84, 100, covered=True)
+    expected, gradient = sos_reference(vgg16_weights, image, style, content, coverage=coverage, style_loss=style_loss)
+    result = evaluate(loss_of(vgg16_weights, style_loss, tile_size=48), case)
+    assert result.loss == pytest.approx(expected, rel=1e-9)
+    assert relative_error(gradient_of(result), gradient) < 1e-9
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+def test_other_precisions_match_as_float64_does(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
+    case = setting(84, 100)
+    exact, found = (evaluate(loss_of(vgg16_weights, "nnfm", each), case) for each in (torch.float64, dtype))
+    loss, gradient = (1e-5, 1e-2) if dtype == torch.float32 else (1e-2, 0.5)
+    assert found.loss == pytest.approx(exact.loss, rel=loss)
+    assert relative_error(gradient_of(found), gradient_of(exact)) < gradient
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_tiles_that_are_computed_twice_are_matched_once(
+    tiny_weights: BackboneWeights, style_loss: StyleLossName, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case, searched = setting(96, 128), []
+
+    def counted(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
+        searched.append(len(units))
+        return search(units, style)
+
+    kept = evaluate(loss_of(tiny_weights, style_loss, tile_size=48), case)
+    monkeypatch.setattr(nearest, "search", counted)
+    twice = evaluate(loss_of(tiny_weights, style_loss, tile_size=48, keep_activations=False), case)
+    assert torch.equal(gradient_of(twice), gradient_of(kept))
+    assert sum(searched) == 24 * 32
+
+
+@pytest.mark.parametrize("blocks", [(7, 5), (1, 1), (1000, 1000)])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_blocks_of_any_size_find_the_same(
+    blocks: tuple[int, int], weighted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(nearest._BLOCK, "cpu", blocks)
+    own, style = features((9, 11), (6, 4), 1), features((5, 8), (6, 4), 2)
+    a = torch.rand((9, 11), generator=torch.Generator().manual_seed(3), dtype=torch.float64) if weighted else None
+    leaves = {layer: part.clone().requires_grad_() for layer, part in own.items()}
+    expected = nearest_reference(list(leaves.values()), list(style.values()), a)
+    wanted = dict(zip(own, torch.autograd.grad(expected, list(leaves.values())), strict=True))
+    vectors, count = vectors_of(style), torch.tensor(99.0, dtype=torch.float64) if a is None else a.sum()
+    found = Matches.of(own, vectors, EPS, a)
+    assert float(found.distance(a) / count) == pytest.approx(expected.item(), rel=1e-12)
+    for layer, part in own.items():
+        gradient = torch.ones_like(part)  # it is added
+        found.add_gradient(gradient, part, layer, vectors, 1 / count, a)
+        assert relative_error(gradient - 1, wanted[layer]) < 1e-12
+
+
+def test_the_first_of_equally_near_vectors_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(nearest._BLOCK, "cpu", (2, 2))
+    units = torch.eye(3)
+    style = units[[2, 1, 1, 0, 2, 0, 0]]
+    values, places = search(units, style)
+    assert values.tolist() == [1, 1, 1]
+    assert places.tolist() == [3, 1, 0]
+
+
+def test_features_of_no_length_have_no_angle() -> None:
+    """They count as far from everything, and nothing pulls at them; those that are mere rounding likewise."""
+    own, style = features((3, 4), (6, 4), 1), features((2, 2), (6, 4), 2)
+    for part in own.values():
+        part[0] = 0
+        part[1] *= 1e-17
+    vectors = vectors_of(style)
+    found = Matches.of(own, vectors, EPS)
+    away = 1 - found.cosine
+    assert torch.equal(away[:2], torch.ones_like(away[:2]))
+    assert (away[2] < 0.9).all()
+    gradient = torch.zeros_like(own["relu3_1"])
+    found.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert gradient[:2].abs().max() == 0
+    assert torch.isfinite(gradient).all()
+    assert gradient[2].abs().max() > 0
+
+
+def test_a_style_of_no_length_pulls_at_nothing() -> None:
+    own = features((3, 4), (6,), 1)
+    vectors = vectors_of({"relu3_1": torch.zeros((2, 2, 6), dtype=torch.float64)})
+    found = Matches.of(own, vectors, EPS)
+    gradient = torch.zeros_like(own["relu3_1"])
+    found.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert float(found.distance()) == 12
+    assert gradient.abs().max() == 0
+
+
+def test_what_is_no_number_does_not_look_like_one() -> None:
+    """A run that diverges is stopped by its gradient."""
+    own, style = features((3, 4), (6,), 1), features((2, 2), (6,), 2)
+    own["relu3_1"][1, 2, 3] = torch.nan
+    vectors = vectors_of(style)
+    gradient = torch.zeros_like(own["relu3_1"])
+    Matches.of(own, vectors, EPS).add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert gradient[1, 2].isnan().all()
+    assert torch.isfinite(gradient[0]).all()
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_uncovered_positions_do_not_count(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
+    image, style, content, _ = setting(96, 64)
+    coverage = torch.zeros((96, 64), dtype=torch.float64)
+    loss = loss_of(tiny_weights, style_loss, leave_out=False)
+    nothing = evaluate(loss, (image, style, content, coverage))
+    assert nothing.loss == 0
+    assert gradient_of(nothing).abs().max() == 0
+    coverage[:32] = 1
+    other = image.clone()
+    other[80:] = 0  # beyond what features of covered cells see
+    lean = loss_of(tiny_weights, "nnfm")
+    results = [evaluate(lean, (each, style, content, coverage)) for each in (image, other)]
+    assert results[0].terms[0]["nearest"] == results[1].terms[0]["nearest"] > 0
+
+
+@pytest.mark.parametrize("size", [(4, 4), (7, 5), (4, 300)])
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_a_style_of_hardly_any_vector(
+    tiny_weights: BackboneWeights, style_loss: StyleLossName, size: tuple[int, int]
+) -> None:
+    loss = loss_of(tiny_weights, style_loss)
+    vectors = loss.style_targets(picture(*size, seed=3), (100, 80))[0].vectors
+    assert vectors is not None
+    assert len(vectors.units) == size[0] // 4 * (size[1] // 4)
+    image, _, content, _ = setting(100, 80)
+    result = evaluate(loss, (image, picture(*size, seed=3), content, None))
+    assert result.terms[0]["nearest"] > 0
+    assert torch.isfinite(gradient_of(result)).all()
+
+
+def test_a_style_without_a_vector_is_refused(tiny_weights: BackboneWeights) -> None:
+    with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
+        loss_of(tiny_weights, "nnfm").style_targets(picture(3, 200), (100, 80))
+
+
+def test_large_styles_are_thinned_evenly() -> None:
+    assert chosen_places(MOST_VECTORS).tolist() == list(range(MOST_VECTORS))
+    places = chosen_places(1000 * 700, 5000)
+    assert len(places) == 5000
+    assert (places.diff() >= 0).all()
+    assert 0 <= int(places[0]) <= int(places[-1]) < 700_000
+    for count, most in ((places // 700, 1000), (places % 700, 700)):  # rows and columns alike
+        assert torch.histc(count.double(), 10, 0, most).sub(500).abs().max() < 25
+    # Fewer than two for each: all of them in range, few twice.
+    assert len(chosen_places(6001, 6000).unique()) > 4000
+
+
+@pytest.mark.parametrize("tile_size", [None, 64, 208])
+def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
+    tiny_weights: BackboneWeights, tile_size: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sgsst_core.loss.sos.chosen_places", lambda count: chosen_places(count, 200))
+    style = picture(130, 201, seed=3)
+    loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
+    vectors = loss.style_targets(style, (130, 201))[0].vectors
+    assert vectors is not None
+    found = loss.network.forward(style, keep=False).features
+    whole = torch.cat([found[layer] for layer in nearest_layers("nnfm", "vgg16")], dim=2).flatten(0, 1)
+    expected = whole[chosen_places(32 * 50, 200)]
+    assert relative_error(vectors.units, expected / expected.norm(dim=1, keepdim=True)) < 1e-12
+
+
+def test_layers_are_those_that_a_loss_reads() -> None:
+    assert layers_of("sos", "vgg19", content=True) == (*STYLE_LAYERS, CONTENT_LAYER)
+    assert layers_of("nnfm", "vgg16", content=False) == ("relu3_1", "relu3_2", "relu3_3")
+    assert layers_of("nnfm", "vgg19", content=True) == ("relu3_1", "relu3_2", "relu3_3", "relu3_4", CONTENT_LAYER)
+    assert layers_of("mixed", "vgg16", content=False) == (*STYLE_LAYERS, "relu3_2", "relu3_3")
+    assert NEAREST_WEIGHTS["sos"] == 0
