@@ -170,7 +170,7 @@ def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
 def test_features_come_nearer_to_the_style(
     tiny_weights: BackboneWeights, scene: Scene, style_loss: str, precision: str
 ) -> None:
-    values = {"style_loss": style_loss, "precision": precision, "content_weight": 0.0}
+    values: dict[str, Any] = {"style_loss": style_loss, "precision": precision, "content_weight": 0.0}
     stylizer = make(tiny_weights, scene, steps_sos=20, learning_rate=0.1, **values)
     before = stylizer.evaluate([0, 1, 2])[0]
     run(stylizer)
