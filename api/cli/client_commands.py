@@ -18,6 +18,7 @@ from rich.table import Table
 from api.cli.options import with_options
 from api.cli.progress_bars import clock
 from service.parameters import JobParameters
+from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm, form_of_name, packed_name
 
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
@@ -47,7 +48,10 @@ def add_to(app: typer.Typer) -> None:
 
 @with_options(JobParameters)
 def submit(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)],
+    scene: Annotated[
+        Path,
+        typer.Argument(metavar="SCENE", help="3DGS scene: .ply, .compressed.ply, .spz or .splat.", show_default=False),
+    ],
     style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
     cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
@@ -55,7 +59,9 @@ def submit(
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
     webhook: Annotated[str | None, typer.Option(help="URL that is told when the job has ended.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Wait for the end, and write the stylized PLY here.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Wait for the end, and write the scene here: .ply, .compressed.ply or .spz.")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and plan, but queue nothing.")] = False,
     as_json: JsonOption = False,
     url: UrlOption = None,
@@ -109,6 +115,9 @@ def download(
         "stylized.ply"
     ),
     out: Annotated[Path | None, typer.Option(help="File to write, or folder for all. [the file's own name]")] = None,
+    form: Annotated[
+        PackedForm | None, typer.Option("--format", help="Of stylized.ply: another form. [that of --out's ending]")
+    ] = None,
     as_json: JsonOption = False,
     url: UrlOption = None,
     key: KeyOption = None,
@@ -121,7 +130,10 @@ def download(
             target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
             target.parent.mkdir(parents=True, exist_ok=True)
             with _transfer(each) as progress:
-                written.append(str(client.download(job, target, each, progress)))
+                chosen = (form or _packed_form(target)) if each == "stylized.ply" else None
+                if form and out is None and each == "stylized.ply":
+                    target = Path(packed_name(each, form))
+                written.append(str(client.download(job, target, each, progress, chosen)))
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
 
@@ -245,8 +257,14 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
         error_console.print(_job_text(job))
         raise typer.Exit(_JOB_FAILED)
     with _transfer(out.name) as progress:
-        client.download(job.id, out, progress=progress)
+        client.download(job.id, out, progress=progress, form=_packed_form(out))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
+
+
+def _packed_form(out: Path) -> PackedForm | None:
+    """The packed form that a file's name asks for."""
+    form = form_of_name(out.name)
+    return form if form in PACKED_FORMS else None
 
 
 def _step_text(progress: Any) -> str:
