@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -134,6 +135,8 @@ def download(
                 if form and out is None and each == "stylized.ply":
                     target = Path(packed_name(each, form))
                 written.append(str(client.download(job, target, each, progress, chosen)))
+            if not as_json:
+                _tell_loss(client, job, chosen)
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
 
@@ -258,7 +261,20 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
         raise typer.Exit(_JOB_FAILED)
     with _transfer(out.name) as progress:
         client.download(job.id, out, progress=progress, form=_packed_form(out))
+    if not as_json:
+        _tell_loss(client, job.id, _packed_form(out))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
+
+
+def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
+    """Say what a packed result has lost."""
+    if form is None:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        name = f"{packed_name('stylized.ply', form)}.json"
+        found = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
+    psnr = "the same pictures as" if found["psnr_db"] is None else f"{found['psnr_db']:.1f} dB PSNR against"
+    error_console.print(f"{form}, {found['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
 
 
 def _packed_form(out: Path) -> PackedForm | None:

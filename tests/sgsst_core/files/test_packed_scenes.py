@@ -23,6 +23,7 @@ from gsply.writer import write_compressed
 from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene, write_packed, write_scene, write_stylized
 from sgsst_core.files.scene_headers import PackedForm, form_of_name, read_scene_header
 from sgsst_core.quality.packed import measure_packed
@@ -221,6 +222,19 @@ def test_pictures_of_what_is_written_are_nearly_the_same(tmp_path: Path, form: P
         "views": ["test", "test"],
         "psnr_db": round(loss.psnr, 2),
     }
+
+
+@pytest.mark.parametrize(("form", "bound"), [("compressed.ply", 48), ("spz", 53)])
+def test_a_real_scene_loses_little(shared_data: Path, tmp_path: Path, form: PackedForm, bound: float) -> None:
+    """The plush toy: 47,974 Gaussians of degree 3, trained from photos."""
+    folder = shared_data / "scenes" / "snowmiku_plush"
+    scene = read_scene(next(folder.glob("*.ply"))).scene
+    path = tmp_path / "plush"
+    write_packed(path, scene, form)
+    loss = measure_packed(path, scene, read_cameras(folder / "cameras.json"), near=0.01)
+    assert loss.psnr is not None
+    assert loss.psnr > bound
+    assert loss.size < 3e6
 
 
 def test_the_loss_is_that_of_pictures(tmp_path: Path) -> None:
