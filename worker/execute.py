@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import torch
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.ply import write_stylized
+from sgsst_core.files.ply import write_packed, write_stylized
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
+from sgsst_core.quality.packed import PackedLoss, measure_packed
 from sgsst_core.report.charts import write_loss_chart
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import bought, build_report, plan_json, sent_json
@@ -39,6 +42,7 @@ class Result:
         before, after: loss on the evaluation views; both are empty where the job was interrupted.
         bought: what error the time bought (`report.bought`).
         report_error: why report, contact sheet or curves are missing; None if they are not.
+        packed: what the packed file loses that lies beside the PLY; None where there is none.
     """
 
     stopped: Stopped
@@ -48,6 +52,7 @@ class Result:
     after: Evaluation
     bought: dict[str, Any] | None = None
     report_error: str | None = None
+    packed: PackedLoss | None = None
 
 
 def execute(
@@ -129,17 +134,32 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.collectives.rank == 0
     stylizer.collectives.broadcast(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
+    packed = stylizer.collectives.broadcast(lambda: _write_packed(job))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     measure.at_the_end()
     # Now that the views are prepared; before the first step it would have been waited for.
     before, after = measure.evaluate(unstylized=True), measure.evaluate()
-    error = _write_reports(job, stopped, before, after) if first else None
+    error = _write_reports(job, stopped, before, after, packed) if first else None
     found = bought(stylizer, before)
-    return Result(stopped, stylizer.step, stylizer.total, before, after, found, str(error) if error else None)
+    problem = str(error) if error else None
+    return Result(stopped, stylizer.step, stylizer.total, before, after, found, problem, packed)
 
 
-def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evaluation) -> Exception | None:
+def _write_packed(job: Job) -> PackedLoss | None:
+    """Write the stylized scene in a packed form beside the PLY, and measure what that loses."""
+    path, form, stylizer = job.outputs.packed, job.outputs.packed_form, job.stylizer
+    if path is None or form is None:
+        return None
+    scene = replace(job.scene_file.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
+    write_packed(path, scene, form)
+    settings = stylizer.settings
+    return measure_packed(path, scene, stylizer.views.cameras, background=settings.background, near=settings.near)
+
+
+def _write_reports(
+    job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, packed: PackedLoss | None
+) -> Exception | None:
     """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
@@ -148,6 +168,7 @@ def _write_reports(job: Job, stopped: Stopped, before: Evaluation, after: Evalua
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         sent = sent_json(stylizer.history)
+        report["packed"] = packed and packed.as_dict()
         report["workers"] = {**job.workers, "bytes_sent": sent, "seconds_lost": round(lost, 3)}
         write_json(outputs.report, report)
         write_contact_sheet(outputs.sheet, stylizer)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sgsst_core.errors import CameraError, OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.scene_headers import PackedForm, form_of_name
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, ViewOptions
@@ -16,7 +17,7 @@ class SceneRequest(ViewOptions):
     """A scene and the cameras to see it with, as the user names them.
 
     Attributes:
-        scene: 3DGS PLY.
+        scene: 3DGS scene: PLY, compressed PLY, SPZ or .splat.
         cameras: camera file or folder; None for an orbit.
     """
 
@@ -38,7 +39,7 @@ class StylizeRequest:
         source: scene and cameras.
         style: style image.
         images: folder of photos for the content term; None for unstylized renders.
-        out: PLY to write.
+        out: PLY to write, or packed file to write beside one: see `Outputs.of`.
         backbone: feature network.
         resume: go on from the checkpoint beside `out`.
         settings: everything else.
@@ -55,9 +56,34 @@ class StylizeRequest:
 
 @dataclass(frozen=True)
 class Outputs:
-    """The files of a job, named after its PLY so that jobs can share a folder."""
+    """The files of a job, named after its PLY so that jobs can share a folder.
+
+    Attributes:
+        ply: the stylized scene.
+        packed: the same in a packed form, which its name's ending tells; None where nobody wants it.
+    """
 
     ply: Path
+    packed: Path | None = None
+
+    @staticmethod
+    def of(out: Path) -> Outputs:
+        """By the name that the user gave: a PLY's own, or that of a packed file beside it.
+
+        Raises:
+            OutputError: it has another ending.
+        """
+        form = form_of_name(out.name)
+        if form is None:
+            raise OutputError(f"{out}: does not end in .ply, .compressed.ply or .spz. Name the scene file to write.")
+        if form == "ply":
+            return Outputs(out)
+        return Outputs(out.with_name(out.name[: -len(form) - 1] + ".ply"), out)
+
+    @property
+    def packed_form(self) -> PackedForm | None:
+        """Form of the packed file."""
+        return None if self.packed is None else "spz" if form_of_name(self.packed.name) == "spz" else "compressed.ply"
 
     def _beside(self, suffix: str) -> Path:
         return self.ply.with_name(self.ply.stem + suffix)
@@ -95,7 +121,8 @@ class Outputs:
     @property
     def all(self) -> list[Path]:
         """Every file, but for the older checkpoint, which is never written itself."""
-        return [self.ply, self.report, self.page, self.plan, self.sheet, self.curves, self.checkpoint]
+        found = [self.ply, self.report, self.page, self.plan, self.sheet, self.curves, self.checkpoint]
+        return found if self.packed is None else [*found, self.packed]
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -158,12 +185,13 @@ def check_request(request: StylizeRequest) -> Outputs:
     out = request.out
     if out.is_dir():
         raise OutputError(f"{out}: is a folder. Name the PLY file to write, such as {out / 'stylized.ply'}.")
-    if out.suffix.lower() != ".ply":
-        raise OutputError(f"{out}: does not end in .ply. Name the PLY file to write.")
-    if out.exists() and request.source.scene.exists() and out.samefile(request.source.scene):
-        raise OutputError(f"{out}: is the scene itself, which would be lost. Name another file.")
+    outputs = Outputs.of(out)
+    for path in (outputs.ply, outputs.packed):
+        if path and path.exists() and request.source.scene.exists() and path.samefile(request.source.scene):
+            beside = "" if path == out else f" (the PLY beside {out.name})"
+            raise OutputError(f"{path}{beside}: is the scene itself, which would be lost. Name another file.")
     check_folder(out.parent)
-    return Outputs(out)
+    return outputs
 
 
 def check_folder(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -18,6 +19,7 @@ from rich.table import Table
 from api.cli.options import with_options
 from api.cli.progress_bars import clock
 from service.parameters import JobParameters
+from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm, form_of_name, packed_name
 
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
@@ -47,7 +49,10 @@ def add_to(app: typer.Typer) -> None:
 
 @with_options(JobParameters)
 def submit(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)],
+    scene: Annotated[
+        Path,
+        typer.Argument(metavar="SCENE", help="3DGS scene: .ply, .compressed.ply, .spz or .splat.", show_default=False),
+    ],
     style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
     cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
@@ -55,7 +60,9 @@ def submit(
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
     webhook: Annotated[str | None, typer.Option(help="URL that is told when the job has ended.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Wait for the end, and write the stylized PLY here.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Wait for the end, and write the scene here: .ply, .compressed.ply or .spz.")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and plan, but queue nothing.")] = False,
     as_json: JsonOption = False,
     url: UrlOption = None,
@@ -109,6 +116,9 @@ def download(
         "stylized.ply"
     ),
     out: Annotated[Path | None, typer.Option(help="File to write, or folder for all. [the file's own name]")] = None,
+    form: Annotated[
+        PackedForm | None, typer.Option("--format", help="Of stylized.ply: another form. [that of --out's ending]")
+    ] = None,
     as_json: JsonOption = False,
     url: UrlOption = None,
     key: KeyOption = None,
@@ -121,7 +131,12 @@ def download(
             target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
             target.parent.mkdir(parents=True, exist_ok=True)
             with _transfer(each) as progress:
-                written.append(str(client.download(job, target, each, progress)))
+                chosen = (form or _packed_form(target)) if each == "stylized.ply" else None
+                if form and out is None and each == "stylized.ply":
+                    target = Path(packed_name(each, form))
+                written.append(str(client.download(job, target, each, progress, chosen)))
+            if not as_json:
+                _tell_loss(client, job, chosen)
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
 
@@ -245,8 +260,27 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
         error_console.print(_job_text(job))
         raise typer.Exit(_JOB_FAILED)
     with _transfer(out.name) as progress:
-        client.download(job.id, out, progress=progress)
+        client.download(job.id, out, progress=progress, form=_packed_form(out))
+    if not as_json:
+        _tell_loss(client, job.id, _packed_form(out))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
+
+
+def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
+    """Say what a packed result has lost."""
+    if form is None:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        name = f"{packed_name('stylized.ply', form)}.json"
+        found = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
+    psnr = "the same pictures as" if found["psnr_db"] is None else f"{found['psnr_db']:.1f} dB PSNR against"
+    error_console.print(f"{form}, {found['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
+
+
+def _packed_form(out: Path) -> PackedForm | None:
+    """The packed form that a file's name asks for."""
+    form = form_of_name(out.name)
+    return form if form in PACKED_FORMS else None
 
 
 def _step_text(progress: Any) -> str:

@@ -53,7 +53,10 @@ client_commands.add_to(app)
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
-SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="3DGS scene, PLY.", show_default=False)]
+SceneArgument = Annotated[
+    Path,
+    typer.Argument(metavar="SCENE", help="3DGS scene: .ply, .compressed.ply, .spz or .splat.", show_default=False),
+]
 CamerasOption = Annotated[
     Path | None,
     typer.Option(
@@ -80,7 +83,13 @@ def stylize(
     context: typer.Context,
     scene: SceneArgument,
     style: StyleOption,
-    out: Annotated[Path, typer.Option(help="Stylized PLY to write; report and pictures go beside it.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Stylized PLY to write; report and pictures go beside it. A .compressed.ply or .spz is written beside "
+            "a PLY of the same name."
+        ),
+    ],
     cameras: CamerasOption = None,
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
     *,
@@ -199,6 +208,9 @@ def _conclude(outputs: Outputs, result: Result, command: str) -> None:
     for line in _time_bought(result):
         out_console.print(f"{'time bought:':<22}{line}")
     paths = [("stylized scene", outputs.ply)]
+    if outputs.packed is not None and result.packed is not None:
+        out_console.print(f"{'packed:':<22}{result.packed.text}")
+        paths.append(("packed scene", outputs.packed))
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
         paths += [("the same as JSON", outputs.report)]

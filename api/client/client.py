@@ -159,15 +159,24 @@ class JobMethods(Methods):
 
     @Operation
     def download(
-        self, job_id: str, target: str | Path, name: str = "stylized.ply", progress: Progress = no_progress
+        self,
+        job_id: str,
+        target: str | Path,
+        name: str = "stylized.ply",
+        progress: Progress = no_progress,
+        form: str | None = None,
     ) -> Steps[Path]:
         """Download a file of a job; a part that is there goes on, and the whole is checked by its SHA-256.
+
+        Args:
+            form: of stylized.ply, "compressed.ply" or "spz": the service makes it where it is first asked for.
 
         Raises:
             RequestError: there is no such file (yet).
         """
         target = Path(target)
-        yield Fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}", target, progress))
+        query = f"?format={form}" if form else ""
+        yield Fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}{query}", target, progress))
         return target
 
     @Operation

@@ -25,6 +25,7 @@ from api.http.submission import JobFromUploads
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.inspection.inspector import Inspector
+from service.inspection.packer import Packer
 from service.settings import ServiceSettings
 from service.store import open_store
 
@@ -45,12 +46,15 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = open_store(settings)
+        blobs = BlobFolder(settings.folder, store.inputs, settings.min_free_bytes)
+        results = Artifacts(settings.artifacts_url)
         context = Context(
             settings=settings,
             store=store,
-            blobs=BlobFolder(settings.folder, store.inputs, settings.min_free_bytes),
-            artifacts=Artifacts(settings.artifacts_url),
+            blobs=blobs,
+            artifacts=results,
             inspector=Inspector(settings, store),
+            packer=Packer(settings, store, blobs, results),
             hub=Hub(store),
             metrics=Metrics(store),
         )
@@ -60,6 +64,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         yield
         await context.hub.close()
         await context.inspector.close()
+        await context.packer.close()
         store.close()
 
     app = FastAPI(title="sgsst", version=_version(), description=_DESCRIPTION, lifespan=lifespan)

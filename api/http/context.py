@@ -17,6 +17,7 @@ from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.inspection.inspector import Inspector
+from service.inspection.packer import Packer
 from service.settings import ServiceSettings
 from service.store import Store
 
@@ -46,6 +47,7 @@ class Context:
     blobs: BlobFolder
     artifacts: Artifacts
     inspector: Inspector
+    packer: Packer
     hub: Hub
     metrics: Metrics
 

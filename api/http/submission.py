@@ -36,7 +36,7 @@ class JobFromUploads(BaseModel):
         },
     )
 
-    scene: str = Field(description="Id of the upload with the 3DGS PLY.")
+    scene: str = Field(description="Id of the upload with the 3DGS scene: PLY, compressed PLY, SPZ or .splat.")
     style: str = Field(description="Id of the upload with the style image.")
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
@@ -49,7 +49,7 @@ _FORM = {
     "type": "object",
     "required": ["scene", "style"],
     "properties": {
-        "scene": {**_FILE, "description": "3DGS PLY; or the id of an upload, as text."},
+        "scene": {**_FILE, "description": "3DGS scene: PLY, compressed PLY, SPZ or .splat; or the id of an upload."},
         "style": {**_FILE, "description": "Style image; or the id of an upload."},
         "cameras": {
             "type": "array",

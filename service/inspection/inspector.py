@@ -27,17 +27,17 @@ from service.store import Store
 #: What is wanted of the inspecting process: prove that a job's inputs can be used, or plan the job as well.
 Work = Literal["validate", "plan"]
 #: Raised when validation changes, so that what older ones found does not count.
-_VERSION = "1"
+_VERSION = "2"
 #: Requests that wait for the inspecting process at most; more are told to come back.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
-_LEFT_SECONDS = 3600.0
+LEFT_SECONDS = 3600.0
 #: What files add to the limits of their inspection, by their bytes. Processor seconds: the slowest readers, of text and
 #: of images, read 30 MB in a second and more; this allows 8. Memory: numbers of text become doubles of four times their
 #: size at most, since each has a digit and a space, and then float32 of twice; a binary file is mapped (once its size),
 #: and becomes float32 of four times its size where it has numbers of one byte.
 _SECONDS_PER_BYTE = 120 / 1e9
-_MEMORY_PER_BYTE = 6
+MEMORY_PER_BYTE = 6
 #: Of all memory, what that comes to at most.
 _MEMORY_SHARE = 0.8
 #: What planning may take on top of its own limit, in processor seconds: for each Gaussian and each pixel of each view.
@@ -142,7 +142,7 @@ class Inspector:
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
         for left in self._folder.iterdir():  # by a process that was killed
-            if time.time() - left.stat().st_mtime > _LEFT_SECONDS:
+            if time.time() - left.stat().st_mtime > LEFT_SECONDS:
                 shutil.rmtree(left, ignore_errors=True)
         self._limits = {
             "gaussians": settings.max_gaussians,
@@ -160,7 +160,7 @@ class Inspector:
             RefusedInputError: they were found to be of no use.
         """
         known = self._store.inputs.inspection(self._key(work, inputs, parameters))
-        return None if known is None else _found_or_refused(known)
+        return None if known is None else found_or_refused(known)
 
     async def inspect(
         self,
@@ -191,7 +191,7 @@ class Inspector:
         if not passing:  # another day it may be otherwise
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
-        return _found_or_refused(answer)
+        return found_or_refused(answer)
 
     async def _ask_process(
         self,
@@ -211,7 +211,7 @@ class Inspector:
             request = {
                 "work": work,
                 "folder": folder,
-                "staged": _as_text(staged),
+                "staged": as_text(staged),
                 "parameters": parameters.model_dump(mode="json"),
                 "limits": self._limits,
                 "seconds": seconds,
@@ -234,7 +234,7 @@ class Inspector:
         size: int = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
         least = self._settings.inspection_bytes
         most = max(least, int(_MEMORY_SHARE * psutil.virtual_memory().total))
-        return min(least + _MEMORY_PER_BYTE * size, most)
+        return min(least + MEMORY_PER_BYTE * size, most)
 
     def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
@@ -254,7 +254,7 @@ def _threads_of_a_job(settings: ServiceSettings) -> int:
     return int(told) if told.isdigit() and int(told) else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
 
 
-def _found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
+def found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
     """What the process found; raises RefusedInputError where that is an error."""
     if "error" in answer:
         error = answer["error"]
@@ -265,5 +265,6 @@ def _found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _as_text(staged: Staged) -> dict[str, str | None]:
+def as_text(staged: Staged) -> dict[str, str | None]:
+    """Paths for a request."""
     return {role: str(path) if path is not None else None for role, path in asdict(staged).items()}

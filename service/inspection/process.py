@@ -1,4 +1,4 @@
-"""The process that looks into users' files: `python -m service.inspection.process`.
+"""The process that looks into users' files, and packs results: `python -m service.inspection.process`.
 
 It imports what takes long once, then forks for each request a child with limits on time and memory, which reads the
 files and dies. So a hostile file can break nothing but the answer to its own request. Requests and answers are lines of
@@ -29,10 +29,12 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.images import check_photos, image_size, load_image
-from sgsst_core.files.ply import read_scene
-from sgsst_core.files.ply_header import element_offsets, read_header
+from sgsst_core.files.ply import read_scene, write_packed
+from sgsst_core.files.ply_header import element_offsets
+from sgsst_core.files.scene_headers import form_of_name, read_scene_header
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
+from sgsst_core.quality.packed import measure_packed
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
@@ -76,9 +78,10 @@ def _read_inputs(
     found: dict[str, Any] = {}
     source = scene_request(staged, parameters)
     with _ErrorsOf("scene"):
-        header = read_header(staged.scene)
-        element_offsets(staged.scene, header)
-        declared = header.vertex.count if "vertex" in header.names else 0
+        header = read_scene_header(staged.scene)
+        if header.ply is not None:
+            element_offsets(staged.scene, header.ply)
+        declared = header.count
         if declared > limits["gaussians"]:
             raise RefusedError(
                 "too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be."
@@ -129,9 +132,23 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     }
 
 
+def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]:
+    """Write a job's result, staged in the place of its scene, to a file whose name's ending tells the form.
+
+    Returns:
+        What that loses: `PackedLoss` as JSON.
+    """
+    source, settings = scene_request(staged, parameters), parameters.settings()
+    scene = read_scene(source.scene).scene
+    write_packed(Path(name), scene, "spz" if form_of_name(name) == "spz" else "compressed.ply")
+    cameras = fit_cameras(read_cameras_of(source, scene), settings)
+    return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
+
+
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {
     "validate": lambda staged, parameters, limits, show: validate(staged, parameters, limits),
     "plan": plan,
+    "pack": lambda staged, parameters, limits, show: pack(staged, parameters, limits["name"]),
 }
 
 
@@ -278,10 +295,10 @@ def _beside_reading(request: dict[str, Any]) -> int:
 
 
 def _limit_text(request: dict[str, Any]) -> str:
-    what = "Reading the files" if request["work"] == "validate" else "Planning the job"
+    what = {"validate": "Reading the files", "plan": "Planning the job"}.get(request["work"], "Packing the result")
     text = f"{what} takes more time ({request['seconds']:.0f} s of a processor) or memory "
     text += f"({request['bytes'] / 1e9:.1f} GB) than allowed for files of this size, or breaks their reader."
-    return text if request["work"] == "validate" else f"{text} Ask for fewer views, or submit it without a dry run."
+    return text if request["work"] != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."
 
 
 def _lines(descriptor: int, deadline: float) -> Iterator[bytes]:

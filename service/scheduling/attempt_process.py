@@ -148,7 +148,7 @@ class AttemptProcess:
 
         request = self._request()
         # a checkpoint that is not there is no error here, as it would be for a user who asks for it
-        request = replace(request, resume=request.resume and Outputs(request.out).checkpoints.exist)
+        request = replace(request, resume=request.resume and Outputs.of(request.out).checkpoints.exist)
         listener = Listener(
             planning=tell_planning,
             prepared=tell_prepared,

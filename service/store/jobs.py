@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from service.errors import ConflictError, NotFoundError, QueueFullError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
+from service.store.leases import Published
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
@@ -221,6 +222,24 @@ class Jobs:
         """One published file."""
         with self._database.reading() as session:
             return session.get(ArtifactRow, (job_id, name))
+
+    def add_made(self, source: ArtifactRow, files: Sequence[Published]) -> list[str]:
+        """Make files visible that were made from a published one, unless that is no longer there.
+
+        Returns:
+            Locations of those that no row refers to: others were faster, or their job is gone.
+        """
+        unused = []
+        with self._database.writing() as session:
+            row = session.get(ArtifactRow, (source.job_id, source.name), with_for_update=True)
+            for file in files:
+                there = session.get(ArtifactRow, (source.job_id, file.name))
+                if row is None or row.location != source.location or there is not None:
+                    unused.append(file.location)
+                    continue
+                made = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
+                session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **made))
+        return unused
 
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
         """What happened to a job after the event of that number."""

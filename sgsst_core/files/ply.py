@@ -1,8 +1,10 @@
-"""3DGS scenes in PLY files: reading them, and writing them back with new colours and nothing else changed.
+"""3DGS scenes in files: reading them, and writing PLYs back with new colours and nothing else changed.
 
 The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
 f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
 They may come in any order and numeric type, among any others.
+
+Packed scenes (`scene_headers`) are read as well; with new colours they become PLYs as trainers write them.
 """
 
 from __future__ import annotations
@@ -13,19 +15,23 @@ import re
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.ply_header import PlyHeader, element_offsets, read_header
+from sgsst_core.files.compressed_ply import read_compressed_ply, write_compressed_ply
+from sgsst_core.files.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, SceneHeader, read_scene_header
+from sgsst_core.files.splat import read_splat
+from sgsst_core.files.spz import read_spz, write_spz
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
@@ -47,7 +53,7 @@ _BASE = {
 }
 #: As messages name them; f_rest_* follow.
 _ORDER = (*itertools.chain(*_BASE.values()), "opacity")
-_REST_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}
+_REST_DEGREES = {3 * number: degree for degree, number in COEFFICIENTS.items()}
 
 
 @dataclass(frozen=True)
@@ -55,18 +61,20 @@ class SceneFile:
     """A scene together with what is needed to write it back.
 
     Attributes:
-        path: the PLY file.
+        path: the file.
         scene: its Gaussians, without dropped ones.
-        header: the file's header.
+        header: the file's header; None of packed files that are no PLY.
         kept: [rows] bool, which rows of the file the scene holds; None where it holds all.
         stamp: size in bytes and time of last change (ns) of the file when it was read.
+        form: of the file.
     """
 
     path: Path
     scene: Scene
-    header: PlyHeader
+    header: PlyHeader | None
     kept: NDArray[np.bool_] | None
     stamp: tuple[int, int]
+    form: Form = "ply"
 
     @property
     def dropped(self) -> int:
@@ -75,7 +83,10 @@ class SceneFile:
 
 
 def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None) -> SceneFile:
-    """Read a 3DGS PLY: SH degree 0 to 3, text or binary, any order and numeric type of the properties.
+    """Read a 3DGS scene of SH degree 0 to 3, its form told by its content.
+
+    PLYs may be text or binary, with any order and numeric type of the properties. Compressed PLY, SPZ and .splat are
+    unpacked into memory.
 
     Args:
         path: the file.
@@ -88,13 +99,17 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
         SceneError: missing, truncated or lying file, not a 3DGS scene, no Gaussians, non-finite values, or the file was
             changed while it was read.
     """
-    header = read_header(path)
+    declared = read_scene_header(path)
+    if declared.form != "ply":
+        return _read_packed(path, declared, drop_invalid)
+    assert declared.ply is not None
+    header = declared.ply
     degree = _check_properties(path, header)
     offset = element_offsets(path, header).get("vertex", 0)
     file = RowFile(path)
     stamp = file.stamp
     stored = _row_layout(path, header, stamp, offset) if stays_in_file(header, held_bytes) else None
-    into = _Columns(header, 0 if stored else degree, stored)
+    into = _Columns(header.vertex.count, 0 if stored else degree, stored)
     if header.text:
         rows = _text_vertices(path, header)
         for start in range(0, len(rows), BLOCK_ROWS):
@@ -108,6 +123,28 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
         arrays["sh_rest"] = StoredHarmonics(stored, file=file)
     scene = Scene(**arrays)
     return SceneFile(path, scene if kept is None else scene.subset(torch.from_numpy(kept)), header, kept, stamp)
+
+
+def _read_packed(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFile:
+    """Read a scene that is no plain PLY."""
+    file = RowFile(path)
+    stamp = file.stamp
+    into = _Columns(header.count, header.sh_degree, None)
+    match header.form:
+        case "compressed.ply":
+            read_compressed_ply(path, file, header, into.arrays)
+        case "spz":
+            read_spz(path, file, header, into.arrays)
+        case _:
+            read_splat(file, header, into.arrays)
+    file.check_unchanged(stamp)
+    for start in range(0, header.count, BLOCK_ROWS):
+        into.check(start, min(BLOCK_ROWS, header.count - start))
+    kept = _finite_rows(path, header.count, into.flaws, drop_invalid)
+    scene = Scene(**{name: torch.from_numpy(array) for name, array in into.arrays.items()})
+    if kept is not None:
+        scene = scene.subset(torch.from_numpy(kept))
+    return SceneFile(path, scene, header.ply, kept, stamp, header.form)
 
 
 def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
@@ -129,7 +166,8 @@ def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
 
 
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
-    """Write the scene's file again with new f_dc_0..2; every other byte comes back as it was.
+    """Write the scene's PLY again with new f_dc_0..2; every other byte comes back as it was. A scene of a packed file
+    becomes a PLY as `write_scene` writes it.
 
     Where a value is still what the file holds (in float32), its bytes stay too. Rows that were dropped at reading
     are absent, which also changes the count in the header. The file appears whole or not at all.
@@ -148,13 +186,16 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
     if _stamp(source.path) != source.stamp:
         raise changed(source.path)
+    if source.form != "ply" or source.header is None:
+        write_scene(target, replace(source.scene, sh_dc=sh_dc.detach().to("cpu", torch.float32)))
+        return
     colours = sh_dc.detach().to("cpu", torch.float32).contiguous().numpy()
     with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
-        output.write(_header_for(source))
+        output.write(_header_for(source, source.header))
         if source.header.text:
-            _write_text(source, colours, file, output)
+            _write_text(source, source.header, colours, file, output)
         else:
-            _write_binary(source, colours, file, output)
+            _write_binary(source, source.header, colours, file, output)
 
 
 def write_scene(path: Path, scene: Scene) -> None:
@@ -165,19 +206,41 @@ def write_scene(path: Path, scene: Scene) -> None:
     """
     sh_rest = held(scene.sh_rest)
     coefficients = int(sh_rest.shape[1])
-    columns = {name: scene.means[:, i] for i, name in enumerate(_BASE["means"])}
-    columns |= dict.fromkeys(("nx", "ny", "nz"), torch.zeros(len(scene)))
-    columns |= {name: scene.sh_dc[:, i] for i, name in enumerate(_DC)}
-    for i in range(3 * coefficients):
-        columns[f"f_rest_{i}"] = sh_rest[:, i % coefficients, i // coefficients]
-    columns["opacity"] = scene.opacities
-    columns |= {name: scene.scales[:, i] for i, name in enumerate(_BASE["scales"])}
-    columns |= {name: scene.quats[:, i] for i, name in enumerate(_BASE["quats"])}
-    rows = np.empty(len(scene), dtype=[(name, "<f4") for name in columns])
-    for name, column in columns.items():
-        rows[name] = column.detach().cpu().numpy()
-    with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+    names = ["x", "y", "z", "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity"]
+    names += [*_BASE["scales"], *_BASE["quats"]]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
+    lines += [f"property float {name}" for name in names]
+    parts = scene.means, torch.zeros(1, 3), scene.sh_dc, sh_rest, scene.opacities, scene.scales, scene.quats
+    with atomic_path(path) as temporary, temporary.open("wb") as output:
+        output.write("\n".join([*lines, "end_header", ""]).encode())
+        for start in range(0, len(scene), BLOCK_ROWS):
+            rows = np.empty((min(BLOCK_ROWS, len(scene) - start), len(names)), "<f4")
+            column = 0
+            for part in parts:
+                width = part[0].numel()
+                block = part[start : start + len(rows)] if len(part) == len(scene) else part
+                if block.ndim == 3:  # channel by channel
+                    block = block.transpose(1, 2)
+                rows[:, column : column + width] = block.detach().cpu().reshape(len(block), width).numpy()
+                column += width
+            output.write(rows.data)
+
+
+def write_packed(path: Path, scene: Scene, form: PackedForm) -> None:
+    """Write a scene in a packed form, without bands of spherical harmonics that are 0 in all Gaussians.
+
+    The file appears whole or not at all. Rows may come in another order than the scene's.
+
+    Raises:
+        OutputError: the file cannot be written, or the form cannot hold the scene.
+    """
+    scene = scene.without_zero_bands()
+    arrays = {field.name: held(getattr(scene, field.name)).detach().cpu().float().numpy() for field in fields(scene)}
+    with atomic_path(path) as temporary, temporary.open("wb") as output:
+        if form == "spz":
+            write_spz(output, arrays, path)
+        else:
+            write_compressed_ply(output, arrays)
 
 
 def _check_properties(path: Path, header: PlyHeader) -> int:
@@ -216,8 +279,6 @@ def _what_else(header: PlyHeader) -> str:
     """Best guess at what a PLY without Gaussians is, and what to do about it."""
     vertex = header.vertex if "vertex" in header.names else None
     names = {prop.name for prop in vertex.properties} if vertex else set()
-    if "packed_position" in names:
-        return "a compressed PLY (decompress it first, for instance with SuperSplat or splat-transform)"
     if "face" in header.names:
         return "a mesh (it has faces)"
     if {"x", "y", "z"} <= names and not names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
@@ -261,9 +322,8 @@ class _Columns:
         flaws: of the blocks that have some.
     """
 
-    def __init__(self, header: PlyHeader, degree: int, stored: RowLayout | None) -> None:
+    def __init__(self, count: int, degree: int, stored: RowLayout | None) -> None:
         self._stored = stored
-        count = header.vertex.count
         coefficients = (degree + 1) ** 2 - 1
         self.arrays: dict[str, NDArray[Any]] = {
             name: np.empty((count, len(names)), np.float32) for name, names in _BASE.items()
@@ -282,18 +342,23 @@ class _Columns:
         with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite, and is counted
             for name, target in self._targets.items():
                 target[part] = rows[name]
+        self.check(start, len(rows), rows)
+
+    def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
+        """Note values that are no numbers in so many rows, which are given where columns stay in the file."""
+        part = slice(start, start + count)
         blocks = [array[part] for array in self.arrays.values()]
-        if self._stored is not None:
+        if self._stored is not None and rows is not None:
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             first = self._stored.column // 4
             blocks.append(table[:, first : first + 3 * self._stored.coefficients])
         if not all(bool(np.isfinite(block).all()) for block in blocks):
-            self.flaws.append(self._flaws_of(start, rows))
+            self.flaws.append(self._flaws_of(start, count, rows))
 
-    def _flaws_of(self, start: int, rows: NDArray[Any]) -> _Flaws:
-        finite, counts = np.ones(len(rows), np.bool_), {}
-        columns = {name: target[start : start + len(rows)] for name, target in self._targets.items()}
-        if self._stored is not None:
+    def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
+        finite, counts = np.ones(count, np.bool_), {}
+        columns = {name: target[start : start + count] for name, target in self._targets.items()}
+        if self._stored is not None and rows is not None:
             columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
         for name, column in columns.items():
             good = np.isfinite(column)
@@ -382,18 +447,19 @@ def _stamp(path: Path) -> tuple[int, int]:
     return status.st_size, status.st_mtime_ns
 
 
-def _header_for(source: SceneFile) -> bytes:
+def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
     """The source's header, with the number of rows left where some were dropped."""
-    raw = source.header.raw
+    raw = header.raw
     if source.kept is None:
         return raw
-    start, stop = source.header.vertex.count_span
+    start, stop = header.vertex.count_span
     return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
 
 
-def _blocks(source: SceneFile, colours: NDArray[Any]) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[Any]]]:
-    """For each block of file rows: their number, which of them are kept, and the colours of those."""
-    rows = source.header.vertex.count
+def _blocks(
+    source: SceneFile, rows: int, colours: NDArray[Any]
+) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[Any]]]:
+    """For each block of the file's so many rows: their number, which of them are kept, and the colours of those."""
     position = 0
     for start in range(0, rows, BLOCK_ROWS):
         count = min(BLOCK_ROWS, rows - start)
@@ -403,13 +469,15 @@ def _blocks(source: SceneFile, colours: NDArray[Any]) -> Iterator[tuple[int, NDA
         position = following
 
 
-def _write_binary(source: SceneFile, colours: NDArray[Any], file: io.BufferedReader, output: BinaryIO) -> None:
-    dtype = source.header.vertex.dtype(source.header.byte_order)
-    before = element_offsets(source.path, source.header)["vertex"] - len(source.header.raw)
-    file.seek(len(source.header.raw))
+def _write_binary(
+    source: SceneFile, header: PlyHeader, colours: NDArray[Any], file: io.BufferedReader, output: BinaryIO
+) -> None:
+    dtype = header.vertex.dtype(header.byte_order)
+    before = element_offsets(source.path, header)["vertex"] - len(header.raw)
+    file.seek(len(header.raw))
     _copy(file, output, before)
-    buffer = bytearray(min(BLOCK_ROWS, source.header.vertex.count) * dtype.itemsize)
-    for count, kept, new in _blocks(source, colours):
+    buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
+    for count, kept, new in _blocks(source, header.vertex.count, colours):
         part = memoryview(buffer)[: count * dtype.itemsize]
         if file.readinto(part) != len(part):
             raise changed(source.path)
@@ -435,17 +503,17 @@ def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
         count = None if count is None else count - len(data)
 
 
-def _write_text(source: SceneFile, colours: NDArray[Any], file: BinaryIO, output: BinaryIO) -> None:
-    vertex = source.header.vertex
-    before = source.header.elements[: source.header.elements.index(vertex)]
+def _write_text(source: SceneFile, header: PlyHeader, colours: NDArray[Any], file: BinaryIO, output: BinaryIO) -> None:
+    vertex = header.vertex
+    before = header.elements[: header.elements.index(vertex)]
     order = [prop.name for prop in vertex.properties]
     slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in _DC]
-    file.seek(len(source.header.raw))
+    file.seek(len(header.raw))
     # latin-1 gives every byte back as it came, newline="" every line end
     lines = io.TextIOWrapper(file, "latin-1", newline="")
     for _ in range(sum(element.count for element in before)):
         output.write(lines.readline().encode("latin-1"))
-    for count, kept, new in _blocks(source, colours):
+    for count, kept, new in _blocks(source, vertex.count, colours):
         values = iter(new)
         for index in range(count):
             line = lines.readline()

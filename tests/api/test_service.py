@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+import torch
 
 from api.client import AsyncClient, Client
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.ply import SceneFile, read_scene, write_packed
+from sgsst_core.files.scene_headers import PACKED_FORMS
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -174,6 +177,72 @@ def test_the_ply_in_ranges(service: Service, files: dict[str, Path], expected: b
         assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
         assert client.get(where).status_code == 404
         assert not (service.data / "artifacts" / job_id).exists()
+
+
+def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+    scene, gaussians = tmp_path / "wall.ply", wall(sh_degree=1)
+    gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at one depth, their order would make the picture
+    write_packed(scene, gaussians, "spz")
+    with service.client() as client:
+        job_id = submit(client, files | {"scene": scene}, steps_sos=5)
+        where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
+        assert client.get(where, params={"format": "spz"}).status_code == 404
+        wait_until(service, client, job_id, "succeeded")
+        ply = read(tmp_path, client.get(where).content)
+        assert ply.form == "ply"
+        assert torch.equal(ply.scene.means, read_scene(scene).scene.means)
+        for form in PACKED_FORMS:
+            first = client.get(where, params={"format": form})
+            assert first.status_code == 200, first.text
+            assert first.headers["content-disposition"] == f'attachment; filename="stylized.{form}"'
+            assert first.headers["content-type"] == "application/octet-stream"
+            found = read(tmp_path, first.content)
+            assert (found.form, len(found.scene)) == (form, len(ply.scene))
+            again = client.get(where, params={"format": form}, headers={"If-None-Match": first.headers["etag"]})
+            assert again.status_code == 304, "it is kept"
+            assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}").content == first.content
+            loss = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}.json").json()
+            assert (loss["name"], loss["format"], loss["bytes"]) == (f"stylized.{form}", form, len(first.content))
+            assert loss["psnr_db"] > 35
+            assert loss["views"] == ["view_0", "view_1", "view_2"]
+        names = {entry["name"] for entry in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
+        assert {"stylized.spz", "stylized.spz.json", "stylized.compressed.ply"} <= names
+        assert client.get(where, params={"format": "ply"}).content == client.get(where).content
+        assert client.get(where, params={"format": "splat"}).json()["code"] == "invalid-request"
+        other = client.get(f"/v1/jobs/{job_id}/artifacts/report.json", params={"format": "spz"})
+        assert (other.status_code, other.json()["code"]) == (422, "invalid-request")
+        assert list((service.data / "packing").iterdir()) == []
+        with Client(service.url) as user:
+            user.download(job_id, tmp_path / "mine", form="spz")
+            assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
+        command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
+        command += ["--out", str(tmp_path / "other.compressed.ply")]
+        ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
+        assert "compressed.ply, " in ended.stderr
+        assert "dB PSNR against the PLY" in ended.stderr
+        assert read_scene(tmp_path / "other.compressed.ply").form == "compressed.ply"
+        assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
+        assert client.get(where, params={"format": "spz"}).status_code == 404
+        assert not (service.data / "artifacts" / job_id).exists()
+
+
+def test_one_packed_result_for_many_who_ask_at_once(service: Service, files: dict[str, Path]) -> None:
+    with service.client() as client:
+        job_id = submit(client, files, steps_sos=5)
+        wait_until(service, client, job_id, "succeeded")
+        where = f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply?format=spz"
+        with ThreadPoolExecutor(6) as pool:
+            answers = list(pool.map(lambda _: httpx.get(where, timeout=120), range(6)))
+        assert {answer.status_code for answer in answers} == {200}
+        assert len({answer.headers["etag"] for answer in answers}) == 1
+        stored = list((service.data / "artifacts" / job_id).rglob("stylized.spz"))
+        assert len(stored) == 1, "nothing was made twice"
+
+
+def read(folder: Path, data: bytes) -> SceneFile:
+    path = folder / hashlib.sha256(data).hexdigest()
+    path.write_bytes(data)
+    return read_scene(path)
 
 
 def test_a_canceled_job_goes_on_where_it_was(service: Service, files: dict[str, Path], expected: bytes) -> None:

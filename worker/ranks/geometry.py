@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneTooLargeError, SgsstError
 from sgsst_core.files.ply import SceneFile, read_scene, stays_in_file
-from sgsst_core.files.ply_header import read_header
+from sgsst_core.files.scene_headers import read_scene_header
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMISER_BYTES
 from sgsst_core.scene.gaussians import Scene
@@ -155,8 +155,12 @@ def _size_by_header(path: Path) -> tuple[int, int, int]:
 
     Memory does not hold what stays in the file.
     """
-    header = read_header(path)
-    if "vertex" not in header.names:
+    declared = read_scene_header(path)
+    if declared.form != "ply":
+        size = declared.count * 4 * declared.float_values
+        return declared.count, size, size
+    header = declared.ply
+    if header is None or "vertex" not in header.names:
         return 0, 0, 0
     # A header may declare anything: no more than what the file can hold is believed.
     count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))

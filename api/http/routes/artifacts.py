@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from pathlib import PurePosixPath
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Header, Path, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from api.http.context import CallerDep, ContextDep
-from api.http.documentation import Responses, headers, links, problems
+from api.http.context import CallerDep, Context, ContextDep
+from api.http.documentation import Responses, headers, invalid, links, problems
 from api.http.routes.jobs import IfNoneMatch, JobId, find
 from api.http.schemas import JOB_ID, SHA256, ArtifactList, artifact_view
-from service.errors import NotFoundError, ServiceError
+from service.errors import BusyError, NoSpaceError, NotFoundError, RefusedInputError, ServiceError
 from service.files.artifacts import media_type
-from service.store.tables import ArtifactRow
+from service.files.names import RESULT
+from service.store.tables import ArtifactRow, JobRow
+
+#: Of a result.
+Form = Literal["ply", "compressed.ply", "spz"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
@@ -89,6 +94,14 @@ _ANSWERS: Responses = {
     **problems(
         NotFoundError(f"Job {JOB_ID} has no file 'stylized.ply' (yet). Its artifacts list has all there are."),
         RangeError("The file has 42301 bytes.", headers={"Content-Range": "bytes */42301"}),
+        invalid("query.format", "Input should be 'ply', 'compressed.ply' or 'spz'"),
+        RefusedInputError(
+            "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
+            "invalid-output",
+        ),
+        RefusedInputError("Packing the result takes more time or memory than allowed.", "inspection-limit"),
+        BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10),
+        NoSpaceError("The service's disk is too full to take this in. Try again later."),
     ),
 }
 
@@ -102,7 +115,7 @@ _ANSWERS: Responses = {
     response_class=StreamingResponse,
     responses=_ANSWERS,
 )
-def get_artifact(
+async def get_artifact(
     request: Request,
     job_id: JobId,
     name: Annotated[str, Path(description="As the list of artifacts has it.", examples=["stylized.ply"])],
@@ -116,12 +129,20 @@ def get_artifact(
         Header(alias="If-Range", description="An ETag; for another one all is sent.", examples=[f'"{SHA256}"']),
     ] = None,
     if_none_match: IfNoneMatch = None,
+    form: Annotated[
+        Form | None,
+        Query(
+            alias="format",
+            description="Of `stylized.ply`: another form of it. It is made when it is first asked for, which takes "
+            "some ten seconds for a million Gaussians, and is kept beside the PLY; `stylized.spz.json` or "
+            "`stylized.compressed.ply.json` then says what it loses, as PSNR of the job's views.",
+            examples=["spz"],
+        ),
+    ] = None,
 ) -> Response:
     """Download a file, whole or in ranges, to be resumed with `Range` and `If-Range`."""
-    job = find(context, caller, job_id)
-    row = None if name.startswith(".") else context.store.jobs.artifact(job_id, name)
-    if row is None:
-        raise NotFoundError(f"Job {job_id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")
+    job = await asyncio.to_thread(find, context, caller, job_id)
+    row = await _find_artifact(context, job, name, form)
     tag = f'"{row.sha256}"'
     sent = _headers(row, tag, job.name)
     if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
@@ -133,9 +154,21 @@ def get_artifact(
         sent["Content-Range"] = f"bytes {start}-{stop - 1}/{row.size}"
     status = 206 if span else 200
     if request.method == "HEAD":
-        return Response(status_code=status, headers=sent, media_type=media_type(name))
+        return Response(status_code=status, headers=sent, media_type=media_type(row.name))
     body = context.artifacts.read(row.location, start, stop)
-    return StreamingResponse(body, status, sent, media_type(name))
+    return StreamingResponse(body, status, sent, media_type(row.name))
+
+
+async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | None) -> ArtifactRow:
+    """A published file, or another form of the result."""
+    if form is not None and form != "ply":
+        if name != RESULT:
+            raise RefusedInputError(f"Only {RESULT} has other forms. Leave 'format' out.", "invalid-request")
+        return await context.packer.packed(job, form)
+    row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
+    if row is None:
+        raise NotFoundError(f"Job {job.id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")
+    return row
 
 
 def _headers(row: ArtifactRow, tag: str, job_name: str) -> dict[str, str]:

@@ -26,7 +26,8 @@ from plyfile import PlyData
 from api.cli.main import main
 from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
-from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files.scene_headers import PackedForm
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -62,6 +63,42 @@ def second_reader(path: Path) -> dict[str, np.ndarray]:
     count = next(int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element"))
     values = np.array(struct.unpack(f"<{count * len(names)}f", body), dtype=np.float32).reshape(count, len(names))
     return {name: values[:, i] for i, name in enumerate(names)}
+
+
+@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
+def test_stylize_reads_and_writes_packed_scenes(
+    files: Files, capsys: pytest.CaptureFixture[str], form: PackedForm
+) -> None:
+    write_packed(files.ply, read_scene(files.ply).scene, form)
+    source = read_scene(files.ply).scene
+    files.out = files.out.with_name(f"wall.{form}")
+    assert main(files.stylize("--steps-sos", "3")) == 0
+    shown = capsys.readouterr().out
+    assert f"packed:               {form}, " in shown
+    assert "dB PSNR against the PLY" in shown
+    assert str(files.out) in shown
+    assert str(files.out.with_name("wall.ply")) in shown
+    ply, packed = read_scene(files.out.with_name("wall.ply")), read_scene(files.out)
+    assert (ply.form, packed.form) == ("ply", form)
+    assert torch.equal(ply.scene.means, source.means)
+    assert not torch.equal(ply.scene.sh_dc, source.sh_dc)
+    report = json.loads(files.out.with_name("wall.report.json").read_text())
+    assert (report["packed"]["name"], report["packed"]["bytes"]) == (files.out.name, files.out.stat().st_size)
+    assert report["packed"]["psnr_db"] > 35
+    for command in ("render", "check"):
+        options = ["--out", str(files.out.parent / "renders")] if command == "render" else []
+        assert main([command, str(files.out), "--cameras", str(files.cameras), *options]) == 0
+
+
+def test_a_packed_result_never_takes_the_scenes_place(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files.ply.read_bytes()
+    files.out = files.ply.with_suffix(".spz")
+    assert main(files.stylize()) == 2
+    assert "(the PLY beside scene.spz): is the scene itself" in capsys.readouterr().err
+    files.out = files.ply.with_suffix(".splat")
+    assert main(files.stylize()) == 2
+    assert "does not end in .ply, .compressed.ply or .spz" in capsys.readouterr().err
+    assert files.ply.read_bytes() == before
 
 
 def test_stylize_writes_a_scene_that_differs_in_f_dc_only(files: Files, capsys: pytest.CaptureFixture[str]) -> None:

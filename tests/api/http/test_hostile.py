@@ -30,6 +30,8 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.tables import UploadRow
+from sgsst_core.files.ply import write_packed
+from sgsst_core.files.scene_headers import PACKED_FORMS
 from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
@@ -50,6 +52,19 @@ Make = Callable[[Files], bytes]
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
     return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    """The scene in other forms."""
+    folder, scene = tmp_path_factory.mktemp("packed"), wall()
+    found: Files = {}
+    for form in PACKED_FORMS:
+        write_packed(folder / form, scene, form)
+        found[form] = (folder / form).read_bytes()
+    colour = bytes([200, 100, 50, 255, 255, 128, 128, 128])
+    rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + colour for mean in scene.means.tolist()]
+    return {**found, "splat": b"".join(rows)}
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +252,50 @@ SCENES: list[tuple[str, Make]] = [
     ("text with words for numbers", lambda f: text_scene(f["scene"], "lots")),
     ("text with too few numbers", lambda f: text_scene(f["scene"], "")),
     ("text with one endless number", lambda f: text_scene(f["scene"], "1" * MB)),
+    ("compressed, more Gaussians than bytes", lambda f: header(f["compressed.ply"], VERTEX, "element vertex 700")),
+    ("compressed, too few chunks", lambda f: header(f["compressed.ply"], "element chunk 3", "element chunk 2")),
+    ("compressed, one byte short", lambda f: f["compressed.ply"][:-1]),
+    ("compressed, no bounds", lambda f: header(f["compressed.ply"], "property float max_z", "property int max_z")),
+    ("compressed, infinite bounds", lambda f: with_bound(f["compressed.ply"], float("inf"))),
+    ("SPZ, half of it", lambda f: f["spz"][: len(f["spz"]) // 2]),
+    ("SPZ, wrong checksum", lambda f: f["spz"][:-8] + bytes(8)),
+    ("SPZ of 4 billion Gaussians", lambda f: spz(2**32 - 1, b"")),
+    ("SPZ of 5,001 Gaussians", lambda f: spz(5001, bytes(5001 * 20))),
+    ("SPZ, fewer than it says", lambda f: spz(4000, bytes(3999 * 20))),
+    ("SPZ, a gigabyte behind it", lambda f: spz_bomb()),
+    ("SPZ of version 9", lambda f: spz(1, bytes(20), version=9)),
+    ("SPZ of degree 200", lambda f: spz(1, bytes(20), degree=200)),
+    ("SPZ 4, streams beyond the file", lambda f: spz_4(2**63)),
+    ("splat, one byte more", lambda f: f["splat"] + b"x"),
+    ("splat with infinite places", lambda f: f["splat"] + struct.pack("<6f8B", *[float("inf")] * 3, 1, 1, 1, *[9] * 8)),
+    ("splat with sizes of 0", lambda f: f["splat"][:-32] + f["splat"][-32:-20] + bytes(12) + f["splat"][-8:]),
+    ("SOG", lambda f: zipped("meta.json", b'{"version": 2, "means": {"files": ["means_l.webp"]}}')),
 ]
+
+
+def with_bound(scene: bytes, value: float) -> bytes:
+    """A compressed PLY whose first bound is that."""
+    start = scene.index(b"end_header\n") + 11
+    return scene[:start] + struct.pack("<f", value) + scene[start + 4 :]
+
+
+def spz(count: int, data: bytes, *, version: int = 3, degree: int = 0) -> bytes:
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, 12, 0, 0) + data)
+
+
+def spz_bomb() -> bytes:
+    """One Gaussian, and a gigabyte of zeros behind it."""
+    deflate = zlib.compressobj(9, wbits=31)
+    data = deflate.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20))
+    for _ in range(64):
+        data += deflate.compress(bytes(16 * MB))
+    return data + deflate.flush()
+
+
+def spz_4(size: int) -> bytes:
+    sizes = [9, 1, 3, 3, 4]
+    head = b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12)
+    return head + b"".join(struct.pack("<QQ", size, becomes) for becomes in sizes)
 
 
 def zipped(name: str, data: bytes) -> bytes:
@@ -256,13 +314,31 @@ def text_scene(scene: bytes, first: str) -> bytes:
 
 
 @pytest.mark.parametrize("make", [case[1] for case in SCENES], ids=[case[0] for case in SCENES])
-def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, make: Make) -> None:
+def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, packed: Files, make: Make) -> None:
     before = count_jobs(store)
-    answer = client.post("/v1/jobs", files=form(files, scene=make(files)))
+    answer = client.post("/v1/jobs", files=form(files, scene=make({**files, **packed})))
     problem = refused(answer, 422, "invalid-scene", "too-many-gaussians", "inspection-limit")
     if problem["code"] != "inspection-limit":
         assert problem["input"] == "scene"
     assert count_jobs(store) == before
+
+
+@pytest.mark.parametrize("what", ["compressed.ply", "spz", "splat"])
+def test_packed_scenes_are_told_by_their_content(
+    client: httpx.Client, store: Store, files: Files, packed: Files, what: str
+) -> None:
+    """Whatever their names; as a file of the form, and by tus."""
+    answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
+    assert answer.status_code == 202, answer.text
+    headers = {**TUS, "Upload-Length": str(len(packed[what]))}
+    where = client.post("/v1/uploads", headers=headers).headers["location"]
+    headers = {**TUS, "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
+    assert client.patch(where, headers=headers, content=packed[what]).status_code == 204
+    parts = [("scene", (None, where.rpartition("/")[2])), *form(files, scene=None)]
+    answer = client.post("/v1/jobs", files=parts)
+    assert answer.status_code == 202, answer.text
+    inputs = client.get(answer.headers["location"]).json()["inputs"]
+    assert [entry["size"] for entry in inputs if entry["role"] == "scene"] == [len(packed[what])]
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:

@@ -331,7 +331,7 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
             header("element vertex 1", "property float x", "element face 1", "property list uchar int i"),
             "a mesh .*missing: y, z, rot_0",
         ),
-        (header("element vertex 1", "property uint packed_position"), "a compressed PLY"),
+        (header("element vertex 1", "property uint packed_position"), "no compressed PLY that can be read"),
         (
             header("element vertex 1", *(line for line in GAUSSIAN if "scale_2" not in line)),
             "something else; missing: scale_2",

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError, SceneTooLargeError
 from sgsst_core.files import ply
-from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.scene.camera import orbit
 from sgsst_core.scene.gaussians import Scene
@@ -23,6 +24,7 @@ from sgsst_core.scene.spherical_harmonics import rest_colours
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
+from worker.ranks import geometry
 from worker.ranks.geometry import read_shared_scene
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
@@ -65,6 +67,26 @@ def test_one_rank_reads_and_all_have_the_same(tmp_path: Path, drop: bool) -> Non
     assert [rank[2] for rank in found] == [int(drop)] * 3
     assert all(rank[3] >= 1 for rank in found), "not mapped"
     assert [rank[4] for rank in found] == [0, 0, 0], "left behind"
+
+
+@linux
+@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
+def test_a_packed_scene_is_read_once_too(tmp_path: Path, form: PackedForm) -> None:
+    path = tmp_path / "scene"
+    write_packed(path, wall(sh_degree=1), form)
+    found = on_ranks(2, shared, path, False)
+    assert [rank[0] for rank in found] == [digest(read_scene(path).scene)] * 2
+    assert [rank[1] for rank in found] == [True, False]
+
+
+def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path) -> None:
+    """By its header, before it is unpacked."""
+    path = tmp_path / "scene"
+    for form in PACKED_FORMS:
+        write_packed(path, wall(sh_degree=3), form)
+        little = patch.object(geometry, "available_memory", return_value=616 * 4 * 59)
+        with little, pytest.raises(SceneTooLargeError, match="616 Gaussians need"):
+            read_shared_scene(path, ALONE)
 
 
 def shared_colours(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:

@@ -1,0 +1,322 @@
+"""What scene files declare, told by their content and checked against their size before anything is read or allocated.
+
+Beside PLY these are PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 4) and antimatter15's .splat. Only headers
+are read, and no PyTorch is needed for them. The layouts follow the programs that define them:
+https://github.com/playcanvas/splat-transform, https://github.com/nianticlabs/spz, https://github.com/antimatter15/splat.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.ply_header import PlyElement, PlyHeader, element_offsets, read_header
+
+Form = Literal["ply", "compressed.ply", "spz", "splat"]
+#: Files that are written beside a PLY, as names end.
+PackedForm = Literal["compressed.ply", "spz"]
+PACKED_FORMS: tuple[PackedForm, ...] = ("compressed.ply", "spz")
+
+#: Coefficients of one colour above degree 0, by the degree of the spherical harmonics.
+COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+#: Gaussians that share the bounds of a compressed PLY.
+CHUNK_ROWS = 256
+#: Bytes of a Gaussian in a .splat file.
+SPLAT_BYTES = 32
+
+#: What a byte of a deflate stream can become at most: 258 bytes of each two bits.
+_DEFLATE_RATIO = 1032
+_CONVERT = "Convert it first: `splat-transform scene.{form} scene.ply` (https://github.com/playcanvas/splat-transform)."
+_SPZ_MAGIC = b"NGSP"
+#: Bytes that tell the form of a file: all records of .splat that are looked at.
+_HEAD_BYTES = 256 * SPLAT_BYTES
+_KSPLAT_HEADER_BYTES = 4096
+
+
+def form_of_name(name: str) -> Form | None:
+    """The form that a file to be written has by its name's ending; None for those that are not written."""
+    lower = name.lower()
+    packed: Form | None = next((form for form in PACKED_FORMS if lower.endswith(f".{form}")), None)
+    return packed or ("ply" if lower.endswith(".ply") else None)
+
+
+def packed_name(ply: str, form: PackedForm) -> str:
+    """Name of the packed file beside a PLY."""
+    return f"{ply.removesuffix('.ply')}.{form}"
+
+
+@dataclass(frozen=True)
+class SpzSection:
+    """A stream of an SPZ file of version 4: where its bytes are, and how many they become."""
+
+    offset: int
+    compressed: int
+    size: int
+
+
+@dataclass(frozen=True)
+class SpzHeader:
+    """What an SPZ file says of itself.
+
+    Attributes:
+        version: 1 to 4.
+        fractional_bits: of the positions' fixed point numbers; version 1 has 16-bit floats instead.
+        sections: bytes of positions, alphas, colours, scales, rotations and spherical harmonics, when decompressed.
+        streams: of version 4, one for each section that is not empty; the others are one gzip stream.
+    """
+
+    version: int
+    fractional_bits: int
+    sections: tuple[int, ...]
+    streams: tuple[SpzSection, ...] = ()
+
+
+@dataclass(frozen=True)
+class SceneHeader:
+    """What a scene file declares.
+
+    Attributes:
+        form: of the file.
+        count: Gaussians; 0 for a PLY without any, which `read_scene` refuses.
+        sh_degree: of the spherical harmonics, 0 to 3; of a PLY it is not looked at here, and 0.
+        size: bytes of the file.
+        ply: the header, of the two forms of PLY.
+        spz: the header, of SPZ.
+    """
+
+    form: Form
+    count: int
+    sh_degree: int
+    size: int
+    ply: PlyHeader | None = None
+    spz: SpzHeader | None = None
+
+    @property
+    def float_values(self) -> int:
+        """Numbers that a Gaussian of a packed form becomes."""
+        return 14 + 3 * COEFFICIENTS[self.sh_degree]
+
+
+def read_scene_header(path: Path) -> SceneHeader:
+    """Tell a scene file's form by its content. Packed ones are proved to hold what they declare, as far as their size
+    can tell; of a PLY nothing but the header is looked at: see `element_offsets`.
+
+    Raises:
+        SceneError: missing file, truncated or lying file, or none of the forms that can be read.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+        size = path.stat().st_size
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    if head.startswith(b"ply"):
+        return _ply(path, size)
+    if head.startswith(b"\x1f\x8b"):
+        return _gzipped_spz(path, head, size)
+    if head.startswith(_SPZ_MAGIC):
+        return _spz_4(path, head, size)
+    _refuse_others(path, head, size)
+    if _looks_like_splat(head):
+        return _splat(path, size)
+    raise SceneError(
+        f"{path}: has no PLY header (it does not start with 'ply'), and is neither SPZ nor .splat. Give a 3DGS scene "
+        "as .ply, .compressed.ply, .spz or .splat file."
+    )
+
+
+# --- PLY -----------------------------------------------------------------------------------------------------------
+
+
+def _ply(path: Path, size: int) -> SceneHeader:
+    header = read_header(path)
+    vertex = header.vertex if "vertex" in header.names else None
+    if vertex is None or "packed_position" not in {prop.name for prop in vertex.properties}:
+        return SceneHeader("ply", vertex.count if vertex else 0, 0, size, ply=header)
+    if header.text:
+        raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
+    _check_kinds(path, vertex, "u4", ("packed_position", "packed_rotation", "packed_scale", "packed_color"))
+    chunk = header.elements[header.names.index("chunk")] if "chunk" in header.names else None
+    if chunk is None:
+        raise SceneError(f"{path}: is a compressed PLY without element 'chunk', its bounds. Export it again.")
+    _check_kinds(path, chunk, "f4", (*bounds("", "xyz"), *bounds("scale_", "xyz")))
+    if "min_r" in {prop.name for prop in chunk.properties}:
+        _check_kinds(path, chunk, "f4", bounds("", "rgb"))
+    if not vertex.count:
+        raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
+    expected = -(-vertex.count // CHUNK_ROWS)
+    if chunk.count != expected:
+        raise SceneError(
+            f"{path}: the header declares {chunk.count} chunks, but {vertex.count} Gaussians make {expected}: it is "
+            "wrong. Export the scene again."
+        )
+    degree = _sh_degree(path, header, vertex.count)
+    element_offsets(path, header)
+    return SceneHeader("compressed.ply", vertex.count, degree, size, ply=header)
+
+
+def bounds(prefix: str, axes: str) -> tuple[str, ...]:
+    """Names of a compressed PLY's lower and upper bounds: all lower ones first."""
+    return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
+
+
+def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
+    found = {prop.name: prop.kind for prop in element.properties if not prop.length_kind}
+    wrong = [name for name in names if found.get(name) != kind]
+    if wrong or element.has_lists:
+        what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
+        raise SceneError(
+            f"{path}: is no compressed PLY that can be read: element {element.name!r} has {what}. Export it again."
+        )
+
+
+def _sh_degree(path: Path, header: PlyHeader, count: int) -> int:
+    """Degree that a compressed PLY has spherical harmonics of, in an element of their own."""
+    if "sh" not in header.names:
+        return 0
+    element = header.elements[header.names.index("sh")]
+    degree = {3 * number: degree for degree, number in COEFFICIENTS.items()}.get(len(element.properties), 0)
+    if not degree or element.count != count:
+        raise SceneError(
+            f"{path}: element 'sh' has {element.count} rows of {len(element.properties)} properties; there should be "
+            f"{count} of 9, 24 or 45. Export the scene again."
+        )
+    _check_kinds(path, element, "u1", tuple(f"f_rest_{i}" for i in range(len(element.properties))))
+    return degree
+
+
+# --- SPZ -----------------------------------------------------------------------------------------------------------
+
+
+def _gzipped_spz(path: Path, head: bytes, size: int) -> SceneHeader:
+    """Versions 1 to 3: header and sections in one gzip stream."""
+    try:
+        start = zlib.decompressobj(31).decompress(head, 16)
+    except zlib.error as error:
+        raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
+    if not start.startswith(_SPZ_MAGIC):
+        raise SceneError(f"{path}: is a gzip file, but no SPZ scene. Unpack it first (gunzip), and give what is in it.")
+    version, count, degree, fractional_bits, sections = _spz_header(path, start, (1, 2, 3))
+    needed = 16 + sum(sections)
+    if needed > _DEFLATE_RATIO * size:
+        raise SceneError(
+            f"{path}: the header declares {count} Gaussians, which take {needed} bytes, more than the file's {size} "
+            "compressed bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
+        )
+    return SceneHeader("spz", count, degree, size, spz=SpzHeader(version, fractional_bits, sections))
+
+
+def _spz_4(path: Path, head: bytes, size: int) -> SceneHeader:
+    """Version 4: a plain header, and a zstd stream for each section."""
+    version, count, degree, fractional_bits, sections = _spz_header(path, head, (4,))
+    if len(head) < 32:
+        raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
+    number, table = head[15], int.from_bytes(head[16:20], "little")
+    expected = [section for section in sections if section]
+    if number != len(expected) or table < 32 or table + 16 * number > size:
+        raise SceneError(
+            f"{path}: the SPZ header declares {number} streams, listed at byte {table}; there should be "
+            f"{len(expected)} in the {size} bytes. The file is truncated or its header is wrong. Copy it again."
+        )
+    with path.open("rb") as file:
+        file.seek(table)
+        listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
+    streams, position = [], table + 16 * number
+    for (compressed, becomes), wanted in zip(listed, expected, strict=True):
+        if becomes != wanted or position + compressed > size:
+            raise SceneError(
+                f"{path}: the SPZ header declares a stream of {compressed} bytes that become {becomes}; {wanted} "
+                f"belong to {count} Gaussians, and {size - position} bytes are left. The file is truncated or its "
+                "header is wrong. Copy or export it again."
+            )
+        streams.append(SpzSection(position, compressed, becomes))
+        position += compressed
+    header = SpzHeader(version, fractional_bits, sections, tuple(streams))
+    return SceneHeader("spz", count, degree, size, spz=header)
+
+
+def _spz_header(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
+    """Version, Gaussians, degree, fractional bits, and the bytes of all sections."""
+    if len(head) < 16:
+        raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
+    version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
+    convert = _CONVERT.format(form="spz")
+    if version not in versions:
+        raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {convert}")
+    if degree not in COEFFICIENTS:
+        raise SceneError(f"{path}: has SH degree {degree}; 0 to 3 can be read. {convert}")
+    if not count:
+        raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
+    if version > 1 and not fractional_bits <= 24:
+        raise SceneError(
+            f"{path}: positions have {fractional_bits} fractional bits of 24: the SPZ header is wrong. Export it again."
+        )
+    sections = (
+        (6 if version == 1 else 9) * count,
+        count,
+        3 * count,
+        3 * count,
+        (3 if version < 3 else 4) * count,
+        3 * COEFFICIENTS[degree] * count,
+    )
+    return version, count, degree, fractional_bits, sections
+
+
+# --- .splat, and forms that are not read -----------------------------------------------------------------------------
+
+
+def _looks_like_splat(head: bytes) -> bool:
+    """Whether records of .splat fit: it has no header. Nearly all have finite places, positive sizes that are not
+    absurd, and rotations of length 1.
+    """
+    rows = splat_rows(head[: len(head) // SPLAT_BYTES * SPLAT_BYTES])
+    if not len(rows):
+        return False
+    length = np.linalg.norm((rows["rotation"].astype(np.float64) - 128) / 128, axis=1)
+    fits = np.isfinite(rows["position"]).all(axis=1) & (np.abs(length - 1) < 0.05)
+    fits &= ((rows["scale"] >= 0) & (rows["scale"] < 1e9)).all(axis=1)
+    return bool(fits.mean() > 0.9)
+
+
+def splat_rows(data: bytes | np.ndarray) -> np.ndarray:
+    """Records of .splat: position and scale [3] float32, colour with alpha [4] and rotation (wxyz) [4] bytes."""
+    kinds = [("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)]
+    return np.frombuffer(data, np.dtype(kinds))
+
+
+def _splat(path: Path, size: int) -> SceneHeader:
+    if size % SPLAT_BYTES:
+        raise SceneError(
+            f"{path}: is a .splat file of {size // SPLAT_BYTES} Gaussians of {SPLAT_BYTES} bytes and "
+            f"{size % SPLAT_BYTES} bytes more: it is truncated. Copy or export it again."
+        )
+    return SceneHeader("splat", size // SPLAT_BYTES, 0, size)
+
+
+def _refuse_others(path: Path, head: bytes, size: int) -> None:
+    """Name the converter of forms that are known but not read."""
+    convert = _CONVERT.format(form="sog")
+    if head.startswith(b"PK\x03\x04"):
+        raise SceneError(f"{path}: is a ZIP archive, as .sog scenes are, which cannot be read. {convert}")
+    if head.lstrip().startswith(b"{") and b'"means"' in head and b".webp" in head:
+        convert = convert.replace("scene.sog", "meta.json")
+        raise SceneError(f"{path}: is the meta.json of a SOG scene, which cannot be read. {convert}")
+    if _looks_like_ksplat(head, size):
+        raise SceneError(f"{path}: is a .ksplat scene, which cannot be read. {_CONVERT.format(form='ksplat')}")
+
+
+def _looks_like_ksplat(head: bytes, size: int) -> bool:
+    """Version 0.x, as many sections as fit, Gaussians, one of three levels of compression."""
+    if size < _KSPLAT_HEADER_BYTES or head[0] != 0 or head[1] < 1:
+        return False
+    sections, filled, _, count, level = struct.unpack_from("<IIIIH", head, 4)
+    centre = struct.unpack_from("<3f", head, 24)
+    fits = 0 < sections <= (size - _KSPLAT_HEADER_BYTES) // 1024 and filled <= sections and 0 < count <= size
+    return fits and level <= 2 and all(map(math.isfinite, centre))

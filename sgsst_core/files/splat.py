@@ -1,0 +1,34 @@
+"""antimatter15's .splat: 32 bytes for a Gaussian, without spherical harmonics above degree 0.
+
+Position and standard deviations are float32; colour, opacity and rotation (wxyz) have 8 bits each.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sgsst_core.files.compressed_ply import Arrays
+from sgsst_core.files.quantised import OPACITY_LOGITS, SH_C0
+from sgsst_core.files.scene_headers import SPLAT_BYTES, SceneHeader, splat_rows
+from sgsst_core.scene.stored_harmonics import RowFile
+
+_BLOCK_ROWS = 1 << 16
+
+
+def read_splat(file: RowFile, header: SceneHeader, into: Arrays) -> None:
+    """Fill the arrays of a scene (float32, by the names of `Scene`'s tensors). A size of 0 becomes minus infinity.
+
+    Raises:
+        SceneError: the file was changed since its header was read.
+    """
+    for start in range(0, header.count, _BLOCK_ROWS):
+        part = slice(start, min(start + _BLOCK_ROWS, header.count))
+        data = np.empty((part.stop - start) * SPLAT_BYTES, np.uint8)
+        file.read(start * SPLAT_BYTES, data)
+        rows = splat_rows(data)
+        into["means"][part] = rows["position"]
+        with np.errstate(divide="ignore", invalid="ignore"):  # found afterwards
+            into["scales"][part] = np.log(rows["scale"].astype(np.float64))
+        into["sh_dc"][part] = (rows["colour"][:, :3] / 255 - 0.5) / SH_C0
+        into["opacities"][part] = OPACITY_LOGITS[rows["colour"][:, 3]]
+        into["quats"][part] = (rows["rotation"].astype(np.float64) - 128) / 128
