@@ -131,6 +131,8 @@ def check_choice(source: SceneRequest, images: Path | None = None) -> None:
         )
     if source.cameras is not None and source.orbit is not None:
         raise CameraError("Both --cameras and --orbit are given. Give one of them.")
+    if source.orbit is None and (source.elevation is not None or source.radius is not None):
+        raise CameraError("--elevation and --radius are those of an --orbit. Give one, or leave them out.")
     if images is not None and source.orbit is not None:
         raise CameraError(
             "--images are photos of known cameras, which an --orbit has not. Give --cameras, or no --images."

@@ -243,6 +243,7 @@ def plan(
     style: StyleOption,
     out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
     cameras: CamerasOption = None,
+    sheet: Annotated[Path | None, typer.Option(help="Pictures of the views to write, JPEG.")] = None,
     *,
     options: StylizeOptions,
 ) -> None:
@@ -253,7 +254,7 @@ def plan(
     settings = options.settings()
     source = SceneRequest.of(scene, cameras, options)
     with job_bar(error_console) as bar:
-        made = make_plan(source, style, options.backbone, settings, out, bar.show_planning)
+        made = make_plan(source, style, options.backbone, settings, out, bar.show_planning, sheet)
     table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
         saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
@@ -268,6 +269,8 @@ def plan(
         gpu = f", of the GPU's {on_device / 1e9:.1f} GB" if on_device is not None else ""
         expected = f"{seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
         out_console.print(f"Expected: {expected}")
+    if sheet is not None:
+        out_console.print(f"{'views:':<22}{sheet}")
     out_console.print(f"{'plan:':<22}{out}")
 
 

@@ -17,8 +17,8 @@ from sgsst_core.errors import SceneError, SceneTooLargeError
 from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.scene.camera import orbit
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import rest_colours
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
