@@ -37,10 +37,10 @@ class ViewOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    orbit: Annotated[Views | None, Option(unit="views", metavar="N|auto", default="cameras from files")] = Field(
+    orbit: Annotated[Views | None, Option(unit="views", metavar="N", default="cameras from files")] = Field(
         None,
-        description="Instead of camera files: N views around the scene, or as many as its surface needs; in rings at "
-        "as many elevations as it needs.",
+        description="Instead of camera files: N views around the scene, or auto, as many as its surface needs; in "
+        "rings at as many elevations as it needs.",
     )
     up: Up = Field("auto", description="Axis that points up in the scene, for an orbit; auto: as the scene shows it.")
     elevation: Annotated[float | None, Option(unit="degrees", metavar="E", default="by need")] = Field(

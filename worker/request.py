@@ -83,6 +83,11 @@ class Outputs:
         return self._beside(".before_after.jpg")
 
     @property
+    def views(self) -> Path:
+        """The views of an orbit, before the start."""
+        return self._beside(".views.jpg")
+
+    @property
     def curves(self) -> Path:
         """The loss curves."""
         return self._beside(".loss.png")
@@ -95,7 +100,7 @@ class Outputs:
     @property
     def all(self) -> list[Path]:
         """Every file, but for the older checkpoint, which is never written itself."""
-        return [self.ply, self.report, self.page, self.plan, self.sheet, self.curves, self.checkpoint]
+        return [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
 
     @property
     def checkpoints(self) -> Checkpoints:

@@ -199,6 +199,7 @@ def _conclude(outputs: Outputs, result: Result, command: str) -> None:
     for line in _time_bought(result):
         out_console.print(f"{'time bought:':<22}{line}")
     paths = [("stylized scene", outputs.ply)]
+    paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
         paths += [("the same as JSON", outputs.report)]

@@ -86,7 +86,7 @@ def test_the_picture_ends_beyond_the_object() -> None:
     for view in orbit(scene, 5, elevations=[10.0, 45.0]):
         coverage = rasterizer.coverage(resized(view, 256))
         border = torch.cat([coverage[0], coverage[-1], coverage[:, 0], coverage[:, -1]])
-        assert float(border.amax()) < 0.05
+        assert float(border.amax()) < 0.1
         assert float(coverage.mean()) > 0.35
 
 
