@@ -24,7 +24,7 @@ from sgsst_core.scene.up import Up, find_up
 _ABOVE, _BELOW = (40.0, 70.0), (-20.0,)
 #: A ring is added where it shows so much more of the surface.
 _LITTLE = 0.03
-#: Views of a level ring whose number is left to need: with all rings, less than 64.
+#: Views of a level ring whose number is left to need: 49 with all rings.
 _AROUND = 16
 #: Views of a ring, at least, where there are several.
 _LEAST_VIEWS = 6

@@ -125,7 +125,8 @@ def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
     middle = torch.tensor([quantile(points[:, axis], weights, 0.5) for axis in range(3)], dtype=torch.float64)
     distances = (points - middle).norm(dim=1)
     median = quantile(distances, weights, 0.5)
-    kept = distances <= _REACH * median if median > 0 else distances <= quantile(distances, weights, 0.99)
+    reach = _REACH * median if median > 0 else quantile(distances, weights, 0.99)
+    kept: Tensor = distances <= reach
     while True:  # without what lies far away, the grid is finer and shows more
         rows = kept.nonzero()[:, 0]
         whole = _pieces(points[rows], weights[rows])

@@ -78,9 +78,9 @@ def outside(option: Declared) -> list[float]:
     for item in option.limits:
         if isinstance(item, Ge | Le):
             bound, away = (item.ge, -1) if isinstance(item, Ge) else (item.le, 1)
-            found.append(bound + away * max(1, abs(bound) * 1e-9))
+            found.append(bound + away * max(1, abs(bound) * 1e-9))  # type: ignore[operator, arg-type]
         else:
-            found.append(item.gt if isinstance(item, Gt) else item.lt)
+            found.append(item.gt if isinstance(item, Gt) else item.lt)  # type: ignore[arg-type]
     return found
 
 
