@@ -26,8 +26,9 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.scene.camera import Camera, orbit, resized
+from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 

@@ -33,8 +33,9 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.raster_lists import build_raster_lists, lists_of_subset
-from sgsst_core.scene.camera import Camera, orbit, spread
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import reference_rest_colours, rest_colours
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings

@@ -27,8 +27,9 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene.camera import Camera, orbit
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 
 WIDTH, HEIGHT = 1280, 720

@@ -6,7 +6,9 @@ word for stands beside them in `Annotated[..., Option(...)]`.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import Annotated, Any, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, GetJsonSchemaHandler
@@ -66,14 +68,20 @@ class Declared:
         return self.info.description or ""
 
     @property
+    def limits(self) -> list[Any]:
+        """What bounds a number; of one that may be a word instead, this stands inside the union."""
+        inside = [kind.__metadata__ for kind in get_args(self.info.annotation) if get_origin(kind) is Annotated]
+        return [item for item in itertools.chain(self.info.metadata, *inside) if isinstance(item, Ge | Gt | Le | Lt)]
+
+    @property
     def bounds(self) -> str:
         """The values that a number may have, such as "0<=x<1" or "x>=1"; empty where it may have all."""
         low = high = above = ""
-        for item in self.info.metadata:
+        for item in self.limits:
             if isinstance(item, Ge | Gt):
                 bound, sign = (item.ge, "=") if isinstance(item, Ge) else (item.gt, "")
                 low, above = f"{_plain(bound)}<{sign}", f"x>{sign}{_plain(bound)}"
-            elif isinstance(item, Le | Lt):
+            else:
                 high = f"<={_plain(item.le)}" if isinstance(item, Le) else f"<{_plain(item.lt)}"
         return f"{low}x{high}" if high else above
 

@@ -17,7 +17,7 @@ from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.quality.packed import PackedLoss, measure_packed
 from sgsst_core.report.charts import write_loss_chart
-from sgsst_core.report.contact_sheet import write_contact_sheet
+from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import bought, build_report, plan_json, sent_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
@@ -83,6 +83,8 @@ def execute(
     if first:
         _make_room(job.outputs)
     stylizer.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.plan)))
+    if first:
+        _write_views(job, warn)
     checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
     callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds)
     if first:
@@ -102,6 +104,18 @@ def _make_room(outputs: Outputs) -> None:
     outputs.ply.parent.mkdir(parents=True, exist_ok=True)
     for path in outputs.all:
         remove_leftovers(path)
+
+
+def _write_views(job: Job, warn: Warn) -> None:
+    """The views of an orbit as pictures, so that it can be seen at once whether they are the right ones."""
+    path = job.outputs.views
+    if job.request.source.orbit is None or (job.resumed and path.exists()):
+        return
+    settings, cameras = job.stylizer.settings, job.stylizer.views.cameras
+    try:
+        write_views(path, job.scene_file.scene, cameras, background=settings.background, near=settings.near)
+    except OutputError as error:
+        warn(f"No pictures of the views could be written: {error}")
 
 
 class _CheckpointWriter:
@@ -173,7 +187,7 @@ def _write_reports(
         write_json(outputs.report, report)
         write_contact_sheet(outputs.sheet, stylizer)
         write_loss_chart(outputs.curves, report)
-        write_page(outputs.page, report, outputs.sheet)
+        write_page(outputs.page, report, outputs.sheet, outputs.views if outputs.views.exists() else None)
     except Exception as error:  # whatever it is, it must not look as if the job itself had failed
         return error
     return None

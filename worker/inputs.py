@@ -19,9 +19,10 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit
 from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
-from sgsst_core.scene.camera import Camera, fit_cameras, orbit, resized, spread
+from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import fingerprint
 from worker.ranks.geometry import read_shared_scene
@@ -39,6 +40,7 @@ class Inputs:
         style: [H, W, 3] in 0..1.
         scene_file: the scene, and what was left out of its file.
         cameras: at the sizes that they are stylized at.
+        orbit: how they were chosen; None for those of files.
         photos: content image of each camera; None for unstylized renders.
         fingerprint: of all of it, and of the settings: equal for the same job.
     """
@@ -47,6 +49,7 @@ class Inputs:
     style: Tensor
     scene_file: SceneFile
     cameras: list[Camera]
+    orbit: Orbit | None
     photos: list[Path] | None
     fingerprint: str
 
@@ -67,39 +70,60 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_image(request.style))
     scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
-    cameras = together(collectives, lambda: fit_cameras(read_cameras_of(source, scene_file.scene), settings))
+    found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
+    cameras = fit_cameras(found, settings)
     photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
     stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
     own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps) if reader else None
-    return Inputs(weights, style, scene_file, cameras, photos, _same_fingerprint(own, collectives))
+    return Inputs(weights, style, scene_file, cameras, made, photos, _same_fingerprint(own, collectives))
 
 
-def read_scene_and_cameras(source: SceneRequest) -> tuple[SceneFile, list[Camera]]:
-    """Read a scene and the cameras that were asked for.
+def _cameras_on_all_ranks(
+    source: SceneRequest, scene: Scene, collectives: Collectives
+) -> tuple[list[Camera], Orbit | None]:
+    """`read_cameras_of`, the same on every rank: each reads a file, but processors may round an orbit differently."""
+    if source.cameras is None:
+        return collectives.broadcast(lambda: read_cameras_of(source, scene))
+    return together(collectives, lambda: read_cameras_of(source, scene))
+
+
+def read_scene_and_cameras(source: SceneRequest) -> tuple[SceneFile, list[Camera], Orbit | None]:
+    """Read a scene and the cameras that were asked for; see `read_cameras_of`.
 
     Raises:
         SceneError, CameraError: they cannot be used.
     """
     file = read_scene(source.scene, drop_invalid=source.drop_invalid)
-    return file, read_cameras_of(source, file.scene)
+    return file, *read_cameras_of(source, file.scene)
 
 
-def read_cameras_of(source: SceneRequest, scene: Scene) -> list[Camera]:
-    """The cameras that were asked for, at their resolution.
+def read_cameras_of(source: SceneRequest, scene: Scene) -> tuple[list[Camera], Orbit | None]:
+    """The cameras that were asked for, at their resolution, and the orbit that they are of, where they are.
 
     Raises:
         CameraError: they cannot be used.
     """
+    made = None
     if source.cameras is not None:
         cameras = read_cameras(source.cameras)
     else:
-        axis = [float(name == source.up[-1]) * (-1.0 if source.up.startswith("-") else 1.0) for name in "xyz"]
-        cameras = orbit(scene, source.orbit or 0, up=axis, near=source.near)
+        made = make_orbit(scene, _orbit_request(source))
+        cameras = made.cameras
     if source.views is not None:
         cameras = spread(cameras, source.views)
     if source.resolution is not None:
         cameras = [resized(camera, source.resolution) for camera in cameras]
-    return cameras
+    return cameras, made
+
+
+def _orbit_request(source: SceneRequest) -> OrbitRequest:
+    """The orbit that was asked for."""
+    up = None
+    if source.up != "auto":
+        x, y, z = (float(name == source.up[-1]) * (-1.0 if source.up.startswith("-") else 1.0) for name in "xyz")
+        up = (x, y, z)
+    count = None if source.orbit in (None, "auto") else int(source.orbit)
+    return OrbitRequest(count, up, source.elevation, source.radius, source.near)
 
 
 def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:

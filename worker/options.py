@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from annotated_types import Ge, Le
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from sgsst_core.constants import NEAR
@@ -24,7 +25,9 @@ from sgsst_core.settings import (
 )
 
 Backbone = Literal["auto", "vgg19", "vgg16"]
-Up = Literal["x", "-x", "y", "-y", "z", "-z"]
+Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
+#: How many views an orbit has.
+Views = Annotated[int, Ge(1), Le(2000)] | Literal["auto"]
 #: Settings that no preset changes, and that answers of the API have always shown.
 _SHOWN = ("preset", "seed", "precision")
 
@@ -34,10 +37,18 @@ class ViewOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    orbit: Annotated[int | None, Option(unit="views", metavar="N", default="cameras from files")] = Field(
-        None, ge=1, le=2000, description="Instead of camera files: N views around the scene."
+    orbit: Annotated[Views | None, Option(unit="views", metavar="N", default="cameras from files")] = Field(
+        None,
+        description="Instead of camera files: N views around the scene, or auto, as many as its surface needs; in "
+        "rings at as many elevations as it needs.",
     )
-    up: Up = Field("-y", description="Axis that points up in the scene, for an orbit.")
+    up: Up = Field("auto", description="Axis that points up in the scene, for an orbit; auto: as the scene shows it.")
+    elevation: Annotated[float | None, Option(unit="degrees", metavar="E", default="by need")] = Field(
+        None, gt=-90, lt=90, description="Put all cameras of an orbit into one ring, E degrees above the horizon."
+    )
+    radius: Annotated[float | None, Option(unit="world units", metavar="R", default="by the scene's size")] = Field(
+        None, gt=0, allow_inf_nan=False, description="Distance of an orbit's cameras from the scene's middle."
+    )
     views: Annotated[int | None, Option(unit="views", metavar="N", default="all")] = Field(
         None, ge=1, le=1_000_000, description="Take N of the cameras, spread evenly."
     )

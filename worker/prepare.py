@@ -95,6 +95,7 @@ def prepare(
             measured=True,
             show=show_planning,
             timer=timer,
+            orbit=inputs.orbit,
         )
     with timer("preparing"):
         stylizer = Stylizer(

@@ -57,7 +57,7 @@ class Previews:
         views = stylizer.views
         index = stylizer.evaluation_views[0]
         camera = views.cameras[index]
-        if max(camera.width, camera.height) > _SIDE:
+        if camera.side > _SIDE:
             camera = resized(camera, _SIDE)
         path = self._folder / f"step_{stylizer.step:07d}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -109,6 +109,11 @@ class Outputs:
         return self._beside(".before_after.jpg")
 
     @property
+    def views(self) -> Path:
+        """The views of an orbit, before the start."""
+        return self._beside(".views.jpg")
+
+    @property
     def curves(self) -> Path:
         """The loss curves."""
         return self._beside(".loss.png")
@@ -121,7 +126,7 @@ class Outputs:
     @property
     def all(self) -> list[Path]:
         """Every file, but for the older checkpoint, which is never written itself."""
-        found = [self.ply, self.report, self.page, self.plan, self.sheet, self.curves, self.checkpoint]
+        found = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
         return found if self.packed is None else [*found, self.packed]
 
     @property
@@ -158,6 +163,8 @@ def check_choice(source: SceneRequest, images: Path | None = None) -> None:
         )
     if source.cameras is not None and source.orbit is not None:
         raise CameraError("Both --cameras and --orbit are given. Give one of them.")
+    if source.orbit is None and (source.elevation is not None or source.radius is not None):
+        raise CameraError("--elevation and --radius are those of an --orbit. Give one, or leave them out.")
     if images is not None and source.orbit is not None:
         raise CameraError(
             "--images are photos of known cameras, which an --orbit has not. Give --cameras, or no --images."

@@ -75,7 +75,7 @@ class _Inputs:
         check_folder(request.out)
         weights = load_network_weights(request.backbone)
         style = load_image(request.style)
-        file, cameras = read_scene_and_cameras(request.source)
+        file, cameras, _ = read_scene_and_cameras(request.source)
         ensure_writable_folder(request.out)
         return _Inputs(file, cameras, style, weights, variants)
 

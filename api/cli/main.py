@@ -211,6 +211,7 @@ def _conclude(outputs: Outputs, result: Result, command: str) -> None:
     if outputs.packed is not None and result.packed is not None:
         out_console.print(f"{'packed:':<22}{result.packed.text}")
         paths.append(("packed scene", outputs.packed))
+    paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
         paths += [("the same as JSON", outputs.report)]
@@ -255,6 +256,7 @@ def plan(
     style: StyleOption,
     out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
     cameras: CamerasOption = None,
+    sheet: Annotated[Path | None, typer.Option(help="Pictures of the views to write, JPEG.")] = None,
     *,
     options: StylizeOptions,
 ) -> None:
@@ -265,7 +267,7 @@ def plan(
     settings = options.settings()
     source = SceneRequest.of(scene, cameras, options)
     with job_bar(error_console) as bar:
-        made = make_plan(source, style, options.backbone, settings, out, bar.show_planning)
+        made = make_plan(source, style, options.backbone, settings, out, bar.show_planning, sheet)
     table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
         saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
@@ -280,6 +282,8 @@ def plan(
         gpu = f", of the GPU's {on_device / 1e9:.1f} GB" if on_device is not None else ""
         expected = f"{seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
         out_console.print(f"Expected: {expected}")
+    if sheet is not None:
+        out_console.print(f"{'views:':<22}{sheet}")
     out_console.print(f"{'plan:':<22}{out}")
 
 

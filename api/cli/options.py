@@ -97,10 +97,11 @@ def _parameter(option: Declared) -> inspect.Parameter:
 
 
 def kind_of(option: Declared) -> Any:
-    """The type of its values, without None."""
+    """The type of its values, without None; the first of several, and without its bounds."""
     found = option.info.annotation
     kinds = [kind for kind in get_args(found) if kind is not type(None)]
-    return kinds[0] if type(None) in get_args(found) else found
+    first = kinds[0] if type(None) in get_args(found) else found
+    return get_args(first)[0] if get_origin(first) is Annotated else first
 
 
 def is_switch(option: Declared) -> bool:

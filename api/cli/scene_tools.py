@@ -19,6 +19,7 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.quality.findings import Finding, findings_of
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
@@ -36,10 +37,12 @@ def make_plan(
     settings: Settings,
     out: Path,
     show_planning: ShowPlanning | None = None,
+    sheet: Path | None = None,
 ) -> Plan:
     """Plan a job as `sgsst stylize` would, and write the plan as JSON; no step is made.
 
     Args:
+        sheet: JPEG of the views to write, before the plan is made; None for none.
         show_planning: shows how far the survey of the views has come.
 
     Raises:
@@ -51,10 +54,19 @@ def make_plan(
     if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
         raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
     check_folder(out.parent)
-    file, cameras = read_scene_and_cameras(source)
+    if sheet is not None:
+        if sheet.is_dir() or sheet.suffix.lower() not in (".jpg", ".jpeg"):
+            raise OutputError(f"{sheet}: is not the name of a JPEG file. Name one to write, such as views.jpg.")
+        check_folder(sheet.parent)
+    file, cameras, orbit = read_scene_and_cameras(source)
     weights = load_network_weights(backbone)
     load_image(style)  # a style that cannot be used is told before the work, too
-    plan, _ = planner.make_plan(file.scene, cameras, settings, weights=weights, measured=True, show=show_planning)
+    if sheet is not None:
+        sheet.parent.mkdir(parents=True, exist_ok=True)
+        write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
+    plan, _ = planner.make_plan(
+        file.scene, cameras, settings, weights=weights, measured=True, show=show_planning, orbit=orbit
+    )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))
     return plan
@@ -71,7 +83,7 @@ def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]
     """
     check_choice(source)
     image = load_image(style) if style else None
-    file, cameras = read_scene_and_cameras(source.model_copy(update={"drop_invalid": True}))
+    file, cameras, _ = read_scene_and_cameras(source.model_copy(update={"drop_invalid": True}))
     return findings_of(file, cameras, image, near=source.near)
 
 
@@ -91,7 +103,7 @@ def render_views(
     """
     check_choice(source)
     check_folder(out)
-    file, cameras = read_scene_and_cameras(source)
+    file, cameras, _ = read_scene_and_cameras(source)
     scene = file.scene
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
     check_something_seen(cameras, rasterizer)

@@ -32,6 +32,7 @@ from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
+from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
 from sgsst_core.quality.packed import measure_packed
@@ -70,8 +71,8 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
 
 def _read_inputs(
     staged: Staged, parameters: JobParameters, limits: dict[str, Any]
-) -> tuple[dict[str, Any], Scene, list[Camera]]:
-    """What `validate` finds, and what it has read: the scene and the cameras."""
+) -> tuple[dict[str, Any], Scene, list[Camera], Orbit | None]:
+    """What `validate` finds, and what it has read: the scene, the cameras, and the orbit that these are of."""
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
@@ -95,7 +96,8 @@ def _read_inputs(
     with _ErrorsOf("cameras"):
         if source.cameras is not None:
             _check_frames_have_sizes(source.cameras)
-        cameras = fit_cameras(read_cameras_of(source, file.scene), settings)
+        unfitted, orbit = read_cameras_of(source, file.scene)
+        cameras = fit_cameras(unfitted, settings)
         if len(cameras) > limits["views"]:
             raise RefusedError("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
         pixels = sum(camera.width * camera.height for camera in cameras)
@@ -109,15 +111,15 @@ def _read_inputs(
             _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
-    return found, file.scene, cameras
+    return found, file.scene, cameras, orbit
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
-    found, scene, cameras = _read_inputs(staged, parameters, limits)
+    found, scene, cameras, orbit = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
-    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True, show=show)
+    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True, show=show, orbit=orbit)
     seconds = memory = on_device = None
     if made.prediction:
         memory, on_device = made.prediction.peak_bytes, made.prediction.device_bytes
@@ -141,7 +143,7 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
     source, settings = scene_request(staged, parameters), parameters.settings()
     scene = read_scene(source.scene).scene
     write_packed(Path(name), scene, "spz" if form_of_name(name) == "spz" else "compressed.ply")
-    cameras = fit_cameras(read_cameras_of(source, scene), settings)
+    cameras = fit_cameras(read_cameras_of(source, scene)[0], settings)
     return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 
 

@@ -50,6 +50,7 @@ class Publisher:
         stem = Path(RESULT).stem
         files = {
             "plan.json": self._out / f"{stem}.plan.json",
+            "views.jpg": self._out / f"{stem}.views.jpg",
             CHECKPOINT: self._out / f"{stem}.checkpoint.safetensors",
         }
         previews = self._out / "previews"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import at_scale
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.orbit import Orbit, orbit_decisions
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Workshop, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
@@ -32,6 +34,7 @@ def make_plan(
     measured: bool = False,
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
+    orbit: Orbit | None = None,
 ) -> tuple[Plan, Workshop]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
@@ -43,6 +46,7 @@ def make_plan(
         measured: see `decide`.
         show: told how far the survey has come.
         timer: counts the seconds of `survey`, and of all else as `planning`.
+        orbit: that the cameras are of, for the plan to tell of it; None for those of files.
 
     Returns:
         The plan, and what was built to make it, for a `Stylizer` to go on with.
@@ -65,4 +69,6 @@ def make_plan(
         link = probe_link(collectives, workshop.network.device)
         # Timings differ from rank to rank: one decides for all.
         plan = collectives.broadcast(lambda: decide(measure(workshop, looked, link), settings, measured=measured))
+        if orbit is not None:
+            plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, looked), *plan.decisions))
     return plan, workshop

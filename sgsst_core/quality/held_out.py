@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -35,7 +35,7 @@ from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.arguments import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera, between, resized
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 
 #: Views whose Gram distance is measured, and pairs of each range that are compared, at most.
@@ -295,22 +295,9 @@ class HeldOut:
         return find_warp(other, self.cameras[j], depth, self.cameras[i])
 
 
-def sampled(scene: Scene, count: int) -> Scene:
-    """At most `count` Gaussians of a scene, one of each so many, enlarged by the root of how many it stands for.
-
-    Which one is chance, seeded: files may hold Gaussians in an order that every so-manyth would keep to. The area that
-    a Gaussian covers grows with the square of its size, so that together they cover about as much.
-    """
-    step = -(-len(scene) // count)
-    first = torch.arange(0, len(scene), step)
-    chosen = first + torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
-    part = scene.subset(chosen.clamp_max(len(scene) - 1))
-    return replace(part, scales=part.scales + math.log(step) / 2)
-
-
 def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[float, float | None]:
     """Mean coverage of a view, 0 if nothing can be seen, and median depth where it is known."""
-    small = resized(camera, min(_OUTLOOK_SIDE, max(camera.width, camera.height)))
+    small = resized(camera, min(_OUTLOOK_SIDE, camera.side))
     coverage = rasterizer.coverage(small)
     seen = sees_something(coverage)
     depth = expected_depth(scene, small, rasterizer)

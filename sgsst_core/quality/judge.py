@@ -93,7 +93,7 @@ class Judge:
         pixels = self._style.reshape(-1, 3)
         self._palette = _moments(pixels, torch.ones(len(pixels), device=pixels.device))
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
-        small = [resized(camera, min(JUDGED_SIDE, max(camera.width, camera.height))) for camera in cameras]
+        small = [resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras]
         self.cameras = [
             camera
             for camera in small

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,9 +10,13 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from sgsst_core.constants import NEAR
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.palette import INK, PAPER
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, resized, spread
+from sgsst_core.scene.gaussians import Scene, sampled
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Pixels of the sheet: height of a picture, the style's width at most, gaps, and the labels' text.
@@ -19,6 +24,8 @@ _CELL_HEIGHT = 330
 _MAX_CELL_WIDTH = 520
 _GAP = 12
 _LABEL = 18
+#: Sheet of the views alone: how many at most, their resolution, width over height of the whole, and Gaussians.
+_MOST_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
 
 
 def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
@@ -38,6 +45,41 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
             renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
     sheet = _sheet(_picture(stylizer.style), pairs)
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="JPEG", quality=88)
+
+
+def write_views(
+    path: Path,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    near: float = NEAR,
+) -> None:
+    """Write a JPEG of what some cameras see of a scene, small, at most 48 of them, spread evenly over the list.
+
+    Of large scenes, some Gaussians stand for all (`sampled`).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    part = sampled(scene, _VIEW_GAUSSIANS)
+    rasterizer = make_rasterizer("cpu", part, background=background, near=near)
+    pictures = []
+    for camera in spread(cameras, _MOST_VIEWS):
+        small = resized(camera, min(camera.side, _VIEW_SIDE))
+        colours = view_colours(part.sh_dc, rest_colours(part.sh_rest, part.means, small))
+        pictures.append((camera.name, _picture(rasterizer.render(colours, small))))
+    width = max(picture.width for _, picture in pictures) + _GAP
+    height = max(picture.height for _, picture in pictures) + _GAP + _LABEL
+    columns = min(len(pictures), max(1, round(math.sqrt(_SHEET_SHAPE * len(pictures) * height / width))))
+    rows = -(-len(pictures) // columns)
+    sheet = Image.new("RGB", (columns * width + _GAP, rows * height + _GAP), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for place, (name, picture) in enumerate(pictures):
+        row, column = divmod(place, columns)
+        _place(sheet, draw, picture, _GAP + column * width, _GAP + _LABEL + row * height, name)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 

@@ -68,12 +68,13 @@ _ENVIRONMENT = Environment(
 )
 
 
-def render_page(report: dict[str, Any], sheet: bytes | None) -> str:
+def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None = None) -> str:
     """The page as HTML; nothing in it refers to anything outside, and no script runs.
 
     Args:
         report: of version 2, as `build_report` makes it or as it is read from report.json.
         sheet: the contact sheet, JPEG; None leaves it out.
+        views: all views, JPEG; None leaves them out.
     """
     figures = draw_figures(report)
     return _ENVIRONMENT.get_template("report.html").render(
@@ -83,6 +84,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None) -> str:
         result=_result(report),
         bought=_bought(report),
         sheet=base64.b64encode(sheet).decode("ascii") if sheet else None,
+        views=base64.b64encode(views).decode("ascii") if views else None,
         colours=PAGE,
         on_dark=ON_DARK,
         against=AGAINST,
@@ -105,25 +107,30 @@ def render_page(report: dict[str, Any], sheet: bytes | None) -> str:
     )
 
 
-def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None) -> None:
+def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, views_path: Path | None = None) -> None:
     """Write the page; the file appears whole or not at all.
 
     Args:
         sheet_path: the contact sheet, JPEG; None leaves it out.
+        views_path: all views, JPEG; None leaves them out.
 
     Raises:
-        OutputError: the file cannot be written, or the sheet cannot be read.
+        OutputError: the file cannot be written, or a sheet cannot be read.
     """
-    try:
-        sheet = sheet_path.read_bytes() if sheet_path else None
-    except OSError as error:
-        raise OutputError(
-            f"{sheet_path}: the contact sheet cannot be read: {error.strerror}. Write it before the page."
-        ) from error
-    page = render_page(report, sheet)
+    page = render_page(report, _sheet_bytes(sheet_path), _sheet_bytes(views_path))
     with atomic_path(path) as temporary:
         # A file name that is no valid Unicode shows question marks; it must not cost the page.
         temporary.write_bytes(page.encode("utf-8", errors="replace"))
+
+
+def _sheet_bytes(path: Path | None) -> bytes | None:
+    """A sheet's file; None where there is none."""
+    try:
+        return path.read_bytes() if path else None
+    except OSError as error:
+        raise OutputError(
+            f"{path}: the contact sheet cannot be read: {error.strerror}. Write it before the page."
+        ) from error
 
 
 # --- heading -------------------------------------------------------------------------------------------------------

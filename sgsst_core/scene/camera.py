@@ -1,8 +1,7 @@
-"""Pinhole cameras: the type, and making new ones from old ones or from nothing but the scene."""
+"""Pinhole cameras: the type, and making new ones from old ones."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -13,24 +12,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
-from sgsst_core.scene.gaussians import Scene
 
 if TYPE_CHECKING:
     from sgsst_core.settings import Settings
-
-#: Focal length of an orbit's cameras in widths: a field of view of 49 degrees, about that of a phone's main camera.
-ORBIT_FOCAL = 1.1
-#: Points that place an orbit. A few ten thousand give its distance to well under a percent.
-_ORBIT_SAMPLE = 20_000
-#: Directions from which the framing is tried at most: one each 10 degrees, so that long orbits cost no more.
-_ORBIT_TRIALS = 36
-#: Share of the scene's weight that an orbit's framing looks at: the rest are floaters.
-_ORBIT_QUANTILE = 0.99
-#: A point farther from the centre than this many weighted median distances is background. An object's own points lie
-#: within 3 (a long thin stick reaches 2); a room or a sky behind an object reaches 10 to 1000.
-_ORBIT_REACH = 4.0
-#: Room left around the framed points, because Gaussians have an extent and pictures a margin.
-_ORBIT_MARGIN = 1.1
 
 
 @dataclass(frozen=True)
@@ -42,6 +26,8 @@ class Camera:
         width, height: pixels.
         fx, fy, cx, cy: pixels.
         world_to_camera: [4, 4] float64 rigid transform.
+        resolution: of a camera whose shape was chosen for what it shows, the longer side of the 4:3 view with as many
+            pixels; None for the camera's own longer side.
     """
 
     name: str
@@ -52,6 +38,12 @@ class Camera:
     cx: float
     cy: float
     world_to_camera: Tensor  # [4, 4] float64
+    resolution: int | None = None
+
+    @property
+    def side(self) -> int:
+        """What a resolution is compared with: `resolution`, or the longer side."""
+        return self.resolution or max(self.width, self.height)
 
     @property
     def centre(self) -> Tensor:
@@ -60,7 +52,7 @@ class Camera:
         return -rotation.T @ self.world_to_camera[:3, 3]
 
 
-def resized(camera: Camera, longer_side: int) -> Camera:
+def resized(camera: Camera, side: int) -> Camera:
     """The same camera with another number of pixels; the field of view stays exactly the same.
 
     Sizes are integers, so that the aspect changes by up to half a pixel; each axis' intrinsics scale with its own
@@ -68,27 +60,33 @@ def resized(camera: Camera, longer_side: int) -> Camera:
 
     Args:
         camera: any camera.
-        longer_side: pixels, at least 1; larger than the camera's own is allowed.
+        side: pixels of the longer side, or the new `Camera.resolution` of a camera that has one; at least 1. Larger
+            than the camera's own is allowed.
 
     Raises:
-        SettingsError: longer_side below 1.
+        SettingsError: side below 1.
     """
-    if longer_side < 1:
-        raise SettingsError(f"The resolution is {longer_side} pixels; give at least 1 for the longer side.")
-    scale = longer_side / max(camera.width, camera.height)
+    if side < 1:
+        raise SettingsError(f"The resolution is {side} pixels; give at least 1 for the longer side.")
+    scale = side / camera.side
     width, height = (max(1, round(side * scale)) for side in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height
     return replace(
-        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * x,
+        fy=camera.fy * y,
+        cx=camera.cx * x,
+        cy=camera.cy * y,
+        resolution=side if camera.resolution else None,
     )
 
 
 def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
     """The cameras, those with more pixels than `settings.max_resolution` on their longer side brought down to it."""
     limit = settings.max_resolution
-    return [
-        resized(camera, limit) if limit and max(camera.width, camera.height) > limit else camera for camera in cameras
-    ]
+    return [resized(camera, limit) if limit and camera.side > limit else camera for camera in cameras]
 
 
 def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
@@ -122,7 +120,15 @@ def between(first: Camera, second: Camera) -> Camera:
 
 
 def look_at(
-    name: str, position: Tensor, target: Tensor, up: Tensor, *, width: int, height: int, focal: float
+    name: str,
+    position: Tensor,
+    target: Tensor,
+    up: Tensor,
+    *,
+    width: int,
+    height: int,
+    focal: float,
+    resolution: int | None = None,
 ) -> Camera:
     """A camera at `position` [3] that looks at `target` [3], `up` [3] towards its upper edge.
 
@@ -131,6 +137,7 @@ def look_at(
         position, target, up: [3]; `up` need not be a unit vector, and must not point along the view.
         width, height: pixels.
         focal: pixels, both axes; the principal point is the middle.
+        resolution: see `Camera`.
 
     Raises:
         CameraError: position and target coincide, or `up` points along the view.
@@ -145,95 +152,4 @@ def look_at(
     world_to_camera = torch.eye(4, dtype=torch.float64)
     world_to_camera[:3, :3] = rotation
     world_to_camera[:3, 3] = -rotation @ position.to(torch.float64)
-    return Camera(name, width, height, focal, focal, width / 2, height / 2, world_to_camera)
-
-
-def orbit(
-    scene: Scene,
-    count: int,
-    *,
-    width: int = 1024,
-    height: int = 768,
-    up: Sequence[float] = (0.0, -1.0, 0.0),
-    elevation: float = 10.0,
-    near: float = 0.2,
-) -> list[Camera]:
-    """A ring of cameras around the scene's robust centre, all of the same distance, with the object in full view.
-
-    The centre and the distance weigh every Gaussian with its opacity and leave floaters and background out: see
-    the constants above. The distance is the smallest at which every camera of the ring sees what is left, and a margin.
-
-    Args:
-        scene: what to look at.
-        count: number of cameras, evenly spaced.
-        width, height: pixels.
-        up: world direction of up; captures processed by COLMAP have y pointing down, so that -y is up.
-        elevation: degrees above the scene's horizon, below 90.
-        near: near plane of the rasterizer, world units: the cameras stay that far from the object.
-
-    Raises:
-        SettingsError: count or size below 1, `up` without direction, elevation out of range.
-    """
-    axis = torch.tensor(up, dtype=torch.float64)
-    if count < 1 or width < 1 or height < 1:
-        raise SettingsError(
-            f"An orbit of {count} views of {width} x {height} pixels is empty; give at least 1 of each."
-        )
-    if not (bool(torch.isfinite(axis).all()) and axis.norm() > 0 and abs(elevation) < 90):
-        raise SettingsError(f"An orbit with up = {list(up)} and elevation = {elevation} degrees has no direction.")
-    axis = axis / axis.norm()
-    centre, offsets = _robust_points(scene)
-    tilt = math.radians(elevation)
-    focal = ORBIT_FOCAL * width
-    origin = torch.zeros(3, dtype=torch.float64)
-    distance = 0.0
-    for direction in _ring(min(count, _ORBIT_TRIALS), axis, tilt):
-        turned = look_at("", direction, origin, axis, width=width, height=height, focal=focal).world_to_camera[:3, :3]
-        x, y, z = (offsets @ turned.T).unbind(1)
-        # in view: |x| focal <= (distance + z) width / 2, and the same for y; in front: distance + z >= near
-        needed = torch.stack([x.abs() * 2 * focal / width, y.abs() * 2 * focal / height, torch.full_like(z, near)])
-        distance = max(distance, float((_ORBIT_MARGIN * needed.amax(0) - z).max()))
-    return [
-        look_at(f"orbit_{i:04d}", centre + distance * d, centre, axis, width=width, height=height, focal=focal)
-        for i, d in enumerate(_ring(count, axis, tilt))
-    ]
-
-
-def _ring(count: int, axis: Tensor, elevation: float) -> list[Tensor]:
-    """Unit vectors [3] from the centre to the cameras."""
-    start = torch.zeros(3, dtype=torch.float64)
-    start[2 if abs(float(axis[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) up
-    start = start - (start @ axis) * axis
-    start = start / start.norm()
-    side = torch.linalg.cross(axis, start)
-    angles = [2 * math.pi * i / count for i in range(count)]
-    return [
-        math.cos(elevation) * (math.cos(a) * start + math.sin(a) * side) + math.sin(elevation) * axis for a in angles
-    ]
-
-
-def _robust_points(scene: Scene) -> tuple[Tensor, Tensor]:
-    """The scene's robust centre [3] and its points [P, 3] relative to it, floaters and background left out; float64."""
-    step = max(1, len(scene) // _ORBIT_SAMPLE)
-    points = scene.means[::step].to(torch.float64)
-    weights = torch.sigmoid(scene.opacities[::step].to(torch.float64))
-    # a scene of which all Gaussians are invisible (weights 0) is still looked at
-    weights = weights + 1e-12
-    median = torch.stack([_quantile(points[:, i], weights, 0.5) for i in range(3)])
-    distances = (points - median).norm(dim=1)
-    reach = min(
-        float(_quantile(distances, weights, _ORBIT_QUANTILE)),
-        _ORBIT_REACH * float(_quantile(distances, weights, 0.5)),
-    )
-    near_points = points[distances <= reach]
-    # framing: the middle of the box, because the median of a standing figure is not its middle
-    centre = (near_points.amin(0) + near_points.amax(0)) / 2
-    return centre, near_points - centre
-
-
-def _quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
-    """The smallest of `values` [P] at which the running sum of `weights` [P] reaches `share` of the whole."""
-    ordered, order = values.sort()
-    running = weights[order].cumsum(0)
-    index = torch.searchsorted(running, share * running[-1])
-    return ordered[index.clamp(max=len(values) - 1)]
+    return Camera(name, width, height, focal, focal, width / 2, height / 2, world_to_camera, resolution)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 
+import torch
 from torch import Tensor
 
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
@@ -65,6 +67,19 @@ class Scene:
         if isinstance(self.sh_rest, StoredHarmonics):
             return replace(self, sh_rest=self.sh_rest.first(coefficients))
         return replace(self, sh_rest=self.sh_rest[:, :coefficients].contiguous())
+
+
+def sampled(scene: Scene, count: int) -> Scene:
+    """At most `count` Gaussians of a scene, one of each so many, enlarged by the root of how many it stands for.
+
+    Which one is chance, seeded: files may hold Gaussians in an order that every so-manyth would keep to. The area that
+    a Gaussian covers grows with the square of its size, so that together they cover about as much.
+    """
+    step = -(-len(scene) // count)
+    first = torch.arange(0, len(scene), step)
+    chosen = first + torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
+    part = scene.subset(chosen.clamp_max(len(scene) - 1))
+    return replace(part, scales=part.scales + math.log(step) / 2)
 
 
 def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:

@@ -193,7 +193,37 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
     assert main(command[:at] + command[at + 2 :]) == 0
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert report["cameras"]["form"] == "orbit"
+    assert [decision["item"] for decision in report["plan"]["decisions"][:3]] == ["up", "cameras", "frames"]
+    with Image.open(files.out.with_name("stylized.views.jpg")) as views:
+        assert views.format == "JPEG"
+    assert "The orbit's views" in files.out.with_name("stylized.report.html").read_text()
     assert report["position_weights"]["used"] is True
+
+
+def test_a_plan_shows_the_views_of_an_orbit_before_the_start(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scene(files.ply, ball())
+    sheet, out = files.ply.with_name("views.jpg"), files.ply.with_name("plan.json")
+    command = ["plan", str(files.ply), "--style", str(files.style), "--backbone", "vgg16", "--out", str(out)]
+    command += ["--orbit", "4", "--elevation", "30", "--radius", "5", "--up", "z", "--resolution", "64"]
+    assert main([*command, "--sheet", str(sheet)]) == 0
+    assert str(sheet) in capsys.readouterr().out
+    with Image.open(sheet) as views:
+        assert views.width > 4 * 30
+    decisions = {each["item"]: each for each in json.loads(out.read_text())["decisions"]}
+    assert decisions["up"]["decision"] == "z"
+    assert decisions["cameras"]["decision"] == "4 views in a ring at 30 degrees, 5 from the middle"
+    assert main([*command, "--sheet", str(out)]) == 2
+    assert "views.jpg" in capsys.readouterr().err
+
+
+def test_an_orbit_may_choose_its_number_of_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scene(files.ply, ball())
+    out = files.ply.with_name("renders")
+    assert main(["render", str(files.ply), "--orbit", "auto", "--resolution", "32", "--out", str(out)]) == 0
+    assert 12 <= len(list(out.iterdir())) <= 64
+    capsys.readouterr()
+    assert main(["render", str(files.ply), "--cameras", str(files.cameras), "--radius", "3", "--out", str(out)]) == 2
+    assert "--radius" in capsys.readouterr().err
 
 
 def test_invalid_gaussians_are_dropped_on_demand(files: Files, capsys: pytest.CaptureFixture[str]) -> None:

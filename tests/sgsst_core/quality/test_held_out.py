@@ -24,12 +24,12 @@ from sgsst_core.loss.sos_reference import box_average_reference, features_refere
 from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
-from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbours, sampled
+from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbours
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 

@@ -29,8 +29,9 @@ from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.raster_lists import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
 from sgsst_core.rasterizer.vectors import as_float
-from sgsst_core.scene.camera import Camera, orbit, resized
+from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (

@@ -1,0 +1,233 @@
+"""Cameras in rings around a scene's subject, each with a frame that the subject fills."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.scene.camera import Camera, look_at
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.subject import Subject, find_subject
+from sgsst_core.scene.up import USUAL_UP
+
+#: Resolution of an orbit that none is given for: its views have as many pixels as 1024x768.
+RESOLUTION = 1024
+#: Height of the 4:3 view whose pixels are counted, in widths.
+_PIXELS = 3 / 4
+#: Elevation of a ring that none is given for, degrees.
+ELEVATION = 10.0
+#: Focal length in longer sides, for which the cameras' distance is chosen: a view of 37 degrees, as by a 50 mm lens.
+#: From nearer, what is in front would hide more of the rest.
+_FOCAL = 1.5
+#: Room left around the subject, as a factor of its extent in the frame.
+_MARGIN = 1.03
+#: Shapes (width over height) are steps of a fourth of an octave apart, so that an orbit has few sizes, and no farther
+#: than so many steps from a square: 4 to 1.
+_STEP, _MOST_STEPS = 2**0.25, 8
+#: Area of the smallest frame as a share of the largest, so that strokes are of one size to within half an octave.
+_SMALLEST = 0.5
+#: The nearest point of the subject is farther than so many times the near plane.
+_NEAR_MARGIN = 1.1
+#: Half of the field of view of a frame, at most, for cameras that a given radius puts into the subject.
+_WIDEST = math.tan(math.radians(50))
+#: Spreads of the subject to two sides that differ by less than this show no front.
+_ROUND = 0.9
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Where a camera stands, where it looks, and the half sides of what it must show at depth 1."""
+
+    position: Tensor
+    target: Tensor
+    half: tuple[float, float]
+
+
+def orbit(
+    scene: Scene | Subject,
+    count: int,
+    *,
+    up: Sequence[float] = USUAL_UP,
+    elevations: Sequence[float] = (ELEVATION,),
+    radius: float | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    near: float = 0.2,
+) -> list[Camera]:
+    """Cameras around the robust middle of a scene, all at one distance, each with a frame that its subject fills.
+
+    Strays and background are left out (`find_subject`). The cameras look at the middle of what they see of the
+    subject. Their frames follow its shape and have as many pixels each as 1024x768.
+
+    Args:
+        scene: what to look at.
+        count: number of cameras, shared out among the rings so that neighbours are about equally far apart.
+        up: world direction of up; captures processed by COLMAP have y pointing down, so that -y is up.
+        elevations: of the rings above the scene's horizon, degrees, between -90 and 90.
+        radius: distance of the cameras from the middle, world units; None for the smallest from which the longer side
+            of every frame is seen within 37 degrees.
+        width, height: pixels, for frames of one shape.
+        near: near plane of the rasterizer, world units: the cameras stay that far from the subject.
+
+    Raises:
+        SettingsError: count or size below 1, `up` without direction, elevation or radius out of range.
+    """
+    axis = _checked(count, up, elevations, radius, (width, height))
+    subject = scene if isinstance(scene, Subject) else find_subject(scene)
+    directions, middle = ring_directions(subject, count, axis, elevations), middle_of(subject, axis)
+    if radius is None:
+        radius = _distance(subject.hull - middle, directions, axis, near)
+    frames = [_frame(subject, middle, radius * direction, axis, near) for direction in directions]
+    shapes = [width / height if width and height else _shape(frame.half) for frame in frames]
+    halves = [_widened(frame.half, shape) for frame, shape in zip(frames, shapes, strict=True)]
+    least = _SMALLEST * max(x * y for x, y in halves)
+    cameras = []
+    for i, (frame, shape, (x, y)) in enumerate(zip(frames, shapes, halves, strict=True)):
+        wider = math.sqrt(max(1.0, least / (x * y)))
+        pixels = _PIXELS * RESOLUTION**2
+        columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
+        focal = min(columns / (2 * x * wider), rows / (2 * y * wider))
+        camera = look_at(
+            f"orbit_{i:04d}",
+            frame.position,
+            frame.target,
+            axis,
+            width=columns,
+            height=rows,
+            focal=focal,
+            resolution=None if width else RESOLUTION,
+        )
+        cameras.append(camera)
+    return cameras
+
+
+def share_out(count: int, elevations: Sequence[float]) -> list[int]:
+    """How many of `count` cameras each ring has: by its circumference, one at least, as far as there are enough."""
+    around = [math.cos(math.radians(elevation)) for elevation in elevations]
+    shares = [count * length / sum(around) for length in around]
+    counts = [max(1, math.floor(share)) for share in shares]
+    order = sorted(range(len(shares)), key=lambda ring: math.floor(shares[ring]) - shares[ring])
+    for ring in order:
+        counts[ring] += sum(counts) < count
+    while sum(counts) > count:  # more rings than cameras
+        counts[max(range(len(counts)), key=lambda ring: (counts[ring], ring))] -= 1
+    return counts
+
+
+def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
+    """Unit vectors [3] from the middle to the cameras, ring by ring; each ring is turned by half a step more."""
+    start, side, _ = _level_frame(subject, up).T
+    found = []
+    for ring, (number, elevation) in enumerate(zip(share_out(count, elevations), elevations, strict=True)):
+        tilt = math.radians(elevation)
+        for place in range(number):
+            turn = 2 * math.pi * (place + 0.5 * (ring % 2)) / number
+            level = math.cos(turn) * start + math.sin(turn) * side
+            found.append(math.cos(tilt) * level + math.sin(tilt) * up)
+    return found
+
+
+def middle_of(subject: Subject, up: Tensor) -> Tensor:
+    """[3]: the middle of the upright box around a subject, since the median of a standing figure is not its middle."""
+    frame = _level_frame(subject, up)
+    local = subject.hull @ frame
+    return frame @ ((local.amin(0) + local.amax(0)) / 2)
+
+
+def _level_frame(subject: Subject, up: Tensor) -> Tensor:
+    """[3, 3]: the level direction to the first camera, another level one, and up, as columns."""
+    front = _front(subject, up)
+    return torch.stack([front, torch.linalg.cross(up, front), up], dim=1)
+
+
+def _checked(
+    count: int,
+    up: Sequence[float],
+    elevations: Sequence[float],
+    radius: float | None,
+    size: tuple[int | None, int | None],
+) -> Tensor:
+    """Up as a unit vector, once everything has been found to be of use."""
+    axis = torch.tensor(up, dtype=torch.float64)
+    if count < 1 or any(side is not None and side < 1 for side in size) or not elevations:
+        raise SettingsError(
+            f"An orbit of {count} views of {size[0]} x {size[1]} pixels is empty; give at least 1 of each."
+        )
+    if not (bool(torch.isfinite(axis).all()) and axis.norm() > 0 and all(abs(angle) < 90 for angle in elevations)):
+        angles = ", ".join(f"{angle:g}" for angle in elevations)
+        raise SettingsError(f"An orbit with up = {list(up)} and elevation = {angles} degrees has no direction.")
+    if radius is not None and not (radius > 0 and math.isfinite(radius)):
+        raise SettingsError(f"An orbit's radius is {radius:g}; give a number above 0.")
+    unit: Tensor = axis / axis.norm()
+    return unit
+
+
+def _front(subject: Subject, up: Tensor) -> Tensor:
+    """The level direction [3] to the first camera: at the broad side, where there is one."""
+    start = torch.zeros(3, dtype=torch.float64)
+    start[2 if abs(float(up[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) up
+    start = torch.nn.functional.normalize(start - (start @ up) * up, dim=0)
+    frame = torch.stack([start, torch.linalg.cross(up, start)], dim=1)
+    flat = (subject.points - subject.points[0]) @ frame
+    flat = flat - (subject.weights[:, None] * flat).sum(0)
+    flat = flat / flat.abs().amax().clamp_min(1e-300)
+    spreads, axes = torch.linalg.eigh((subject.weights[:, None] * flat).T @ flat)
+    if not float(spreads[0]) < _ROUND**2 * float(spreads[1]):
+        return start
+    # of the two broad sides, the one to which more stands out; of two alike, the one that looks where z does
+    skew = float((subject.weights * (flat @ axes[:, 0]) ** 3).sum()) / max(float(spreads[0]), 1e-100) ** 1.5
+    sense = skew if abs(skew) > 0.05 else float(axes[0, 0]) or 1.0
+    level: Tensor = math.copysign(1.0, sense) * (frame @ axes[:, 0])
+    return level
+
+
+def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
+    """The smallest distance from the middle from which every camera sees what lies at offsets [D, 3]."""
+    origin = torch.zeros(3, dtype=torch.float64)
+    distance = 0.0
+    for direction in directions:
+        turned = look_at("", direction, origin, up, width=1, height=1, focal=1.0).world_to_camera[:3, :3]
+        x, y, z = (offsets @ turned.T).unbind(1)
+        # in view: |x| focal <= (distance + z) / 2, and the same for y; in front: distance + z >= near
+        needed = (2 * _FOCAL * _MARGIN * torch.maximum(x.abs(), y.abs())).clamp_min(_NEAR_MARGIN * near)
+        distance = max(distance, float((needed - z).max()))
+    return distance
+
+
+def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float) -> _Frame:
+    """The frame of a camera at an offset from the middle, turned to the middle of what it sees of the subject."""
+    position, target = middle + offset, middle
+    half = (0.0, 0.0)
+    for _ in range(5):
+        pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
+        local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
+        seen = local[local[:, 2] > near]
+        if not len(seen):
+            break
+        slopes = (seen[:, :2] / seen[:, 2:]).clamp(-_WIDEST, _WIDEST)
+        low, high = slopes.amin(0), slopes.amax(0)
+        half = (float(slopes[:, 0].abs().amax()), float(slopes[:, 1].abs().amax()))
+        aim = torch.cat([(low + high) / 2, torch.ones(1, dtype=torch.float64)])
+        if float(aim[:2].abs().amax()) < 1e-3 * max(half):
+            break
+        target = position + float(offset.norm()) * (pose[:3, :3].T @ aim)
+    # a single point has no extent; as large as the blur, it would be seen from any distance
+    least = 1e-3 * subject.size / float(offset.norm()) + 1e-6
+    return _Frame(position, target, (_MARGIN * max(half[0], least), _MARGIN * max(half[1], least)))
+
+
+def _shape(half: tuple[float, float]) -> float:
+    """Width over height of the frame of something with these half sides: the nearest of a few shapes."""
+    steps = round(math.log(half[0] / half[1]) / math.log(_STEP))
+    return float(_STEP ** max(-_MOST_STEPS, min(_MOST_STEPS, steps)))
+
+
+def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:
+    """Half sides of the smallest frame of a shape that holds one with these half sides."""
+    x, y = half
+    return (max(x, y * shape), max(y, x / shape))

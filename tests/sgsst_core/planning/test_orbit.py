@@ -1,0 +1,163 @@
+"""Orbits by need: rings where they show more of the surface, what was asked for obeyed, and all of it told."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from sgsst_core.files.ply import read_scene
+from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit, orbit_decisions
+from sgsst_core.planning.plan import Decision
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.survey import survey
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import middle_of
+from sgsst_core.scene.subject import find_subject
+from sgsst_core.settings import make_settings
+from tests.sgsst_core.scene.objects import ball, box, figure, ground, joined, scene_of
+
+
+def elevations(scene: Scene, made: Orbit) -> list[float]:
+    """Of each camera above the horizon, degrees."""
+    up = made.up.direction
+    middle = middle_of(find_subject(scene), up)
+    offsets = [camera.centre - middle for camera in made.cameras]
+    return [math.degrees(math.asin(float(offset @ up / offset.norm()))) for offset in offsets]
+
+
+def told(scene: Scene, made: Orbit) -> dict[str, Decision]:
+    """Lines of the plan by their item."""
+    cameras = [resized(camera, 64) for camera in made.cameras]
+    looked = survey(scene, cameras, make_rasterizer("cpu", scene))
+    return {decision.item: decision for decision in orbit_decisions(made, cameras, looked)}
+
+
+def table() -> Scene:
+    """A wide flat thing on a ground, most of which is seen from above."""
+    return joined(ground(4.0), scene_of(box((-0.5, -0.5, -0.5), (0.5, 0.0, 0.5))))
+
+
+def test_a_wide_flat_scene_is_seen_from_above_and_never_from_under_its_ground() -> None:
+    made = make_orbit(table(), OrbitRequest(count=24))
+    assert made.up.ground
+    assert made.elevations[0] == 10
+    assert max(made.elevations) >= 40
+    assert min(made.tried) > 0
+    assert made.shown > 0.9
+    assert len(made.cameras) == 24
+
+
+def test_a_pole_needs_no_views_from_above() -> None:
+    pole = scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01)
+    made = make_orbit(pole, OrbitRequest(count=24))
+    assert max(made.elevations) == 10
+    assert max(made.tried) == 70
+    assert made.next is not None
+    assert made.next < 0.03
+
+
+def test_views_by_need_are_bounded_and_more_where_there_are_more_rings() -> None:
+    pole = make_orbit(scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01), OrbitRequest())
+    wide = make_orbit(table(), OrbitRequest())
+    for made in (pole, wide):
+        assert 16 * len(made.elevations) / 3 < len(made.cameras) <= 16 * len(made.elevations)
+    assert len({camera.name for camera in wide.cameras}) == len(wide.cameras)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 11])
+def test_few_views_are_one_ring(count: int) -> None:
+    made = make_orbit(table(), OrbitRequest(count=count))
+    assert len(made.cameras) == count
+    assert made.elevations == (10,)
+
+
+def test_what_was_asked_for_is_obeyed() -> None:
+    scene = figure()
+    made = make_orbit(scene, OrbitRequest(count=14, up=(0.0, 0.0, 1.0), elevation=35.0, radius=6.5))
+    assert len(made.cameras) == 14
+    assert made.up.direction.tolist() == [0, 0, 1]
+    assert elevations(scene, made) == pytest.approx([35.0] * 14)
+    assert made.radius == pytest.approx(6.5)
+    decisions = told(scene, made)
+    assert (decisions["up"].decision, decisions["up"].reason) == ("z", "as asked for")
+    assert decisions["cameras"].decision == "14 views in a ring at 35 degrees, 6.5 from the middle"
+    assert decisions["cameras"].reason == "as asked for"
+
+
+def test_an_orbit_tells_why_it_is_as_it_is() -> None:
+    scene = figure()
+    made = make_orbit(scene, OrbitRequest(count=24))
+    decisions = told(scene, made)
+    assert decisions["up"].decision == "-y"
+    assert "times as tall as wide" in decisions["up"].reason
+    assert decisions["cameras"].decision.startswith(f"24 views in {len(made.elevations)} rings at 10")
+    assert f"{made.shown:.0%} of the surface" in decisions["cameras"].reason
+    assert "% of their pixels" in decisions["frames"].reason
+    assert "subject" not in decisions
+
+
+@pytest.mark.parametrize(
+    ("room", "what"),
+    [
+        (scene_of(box((-4, -4, -4), (4, 4, 4), 1000), 0.05), "around what is framed"),
+        (scene_of(box((-1, -1, -1), (1, 1, 1), 3000), 0.05), "lies inside"),
+    ],
+)
+def test_a_room_is_no_subject_and_that_is_said(room: Scene, what: str) -> None:
+    scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), room)
+    made = make_orbit(scene, OrbitRequest(count=12))
+    warning = told(scene, made)["subject"]
+    assert warning.decision.startswith("warning: ")
+    assert what in warning.decision
+    assert "--cameras" in warning.reason
+    assert len(made.cameras) == 12
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        scene_of(torch.ones(1, 3)),
+        scene_of(torch.ones(3, 3), opacities=torch.full((3,), -100.0)),
+        scene_of(torch.ones(300, 3)),
+        scene_of(torch.zeros(1, 3), torch.tensor([[1e-4, 2.0, 1e-4]])),
+    ],
+)
+def test_what_is_hardly_a_scene_has_an_orbit(scene: Scene) -> None:
+    for request in (OrbitRequest(), OrbitRequest(count=3)):
+        made = make_orbit(scene, request)
+        assert all(bool(torch.isfinite(camera.world_to_camera).all()) for camera in made.cameras)
+        assert 0 <= made.shown <= 1 + 1e-9
+
+
+def test_the_plan_begins_with_the_orbit(tiny_weights) -> None:  # type: ignore[no-untyped-def]
+    scene = figure()
+    made = make_orbit(scene, OrbitRequest(count=3))
+    cameras = [resized(camera, 64) for camera in made.cameras]
+    plan, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights, orbit=made)
+    assert [decision.item for decision in plan.decisions[:3]] == ["up", "cameras", "frames"]
+    without, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights)
+    assert "up" not in {decision.item for decision in without.decisions}
+
+
+def test_the_orbit_repeats() -> None:
+    first, second = (make_orbit(figure(), OrbitRequest(count=12)) for _ in range(2))
+    for one, other in itertools.zip_longest(first.cameras, second.cameras):
+        assert torch.equal(one.world_to_camera, other.world_to_camera)
+        assert (one.width, one.height, one.fx) == (other.width, other.height, other.fx)
+
+
+@pytest.mark.parametrize(("name", "reason"), [("biker", "foot"), ("playbot_synthetic_sh2", "flat layer")])
+def test_real_object_scans_stand_upright(shared_data: Path, name: str, reason: str) -> None:
+    scene = read_scene(shared_data / "scenes" / name / "point_cloud.ply").scene
+    made = make_orbit(scene, OrbitRequest(count=12))
+    assert made.up.name == "-y"
+    assert made.up.sure
+    assert reason in made.up.reason
+    assert made.outside < 0.01
+    assert made.hidden == 0

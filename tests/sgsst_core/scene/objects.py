@@ -1,0 +1,85 @@
+"""Made objects and rooms for cameras to go around, y pointing down as in captures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from sgsst_core.scene.gaussians import Scene
+
+UP = (0.0, -1.0, 0.0)
+
+
+def scene_of(means: Tensor, size: float | Tensor = 0.02, opacities: Tensor | None = None) -> Scene:
+    """Gaussians of standard deviations `size` (one, or [N, 3])."""
+    n = len(means)
+    sizes = torch.full((n, 3), float(size)) if not isinstance(size, Tensor) else size
+    return Scene(
+        means.float(),
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        sizes.float().log(),
+        torch.full((n,), 3.0) if opacities is None else opacities,
+        torch.zeros(n, 3),
+        torch.zeros(n, 0, 3),
+    )
+
+
+def joined(*scenes: Scene) -> Scene:
+    """All Gaussians of several scenes."""
+    names = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
+    return Scene(*(torch.cat([getattr(scene, name) for scene in scenes]) for name in names))
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float], count: int = 1500, seed: int = 0) -> Tensor:
+    """[count, 3] points on the faces of a box, by their areas."""
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.tensor(low, dtype=torch.float32)
+    sides = torch.tensor(high, dtype=torch.float32) - corner
+    areas = torch.tensor([sides[1] * sides[2], sides[0] * sides[2], sides[0] * sides[1]])
+    axis = torch.multinomial(areas, count, replacement=True, generator=generator)
+    points = torch.rand(count, 3, generator=generator)
+    points[torch.arange(count), axis] = (torch.rand(count, generator=generator) < 0.5).float()
+    return corner + points * sides
+
+
+def ball(centre: tuple[float, float, float], radius: float, count: int = 800, seed: int = 0) -> Tensor:
+    """[count, 3] points on a sphere."""
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    return torch.tensor(centre, dtype=torch.float32) + radius * directions
+
+
+def figure() -> Scene:
+    """Somebody who stands with feet apart, 1.8 tall, in the middle of the floor at y = 0."""
+    parts = [
+        box((-0.30, -0.08, -0.12), (-0.12, 0.0, 0.16), 400, 1),  # feet
+        box((0.12, -0.08, -0.12), (0.30, 0.0, 0.16), 400, 2),
+        box((-0.26, -0.90, -0.08), (-0.10, -0.08, 0.08), 900, 3),  # legs
+        box((0.10, -0.90, -0.08), (0.26, -0.08, 0.08), 900, 4),
+        box((-0.28, -1.50, -0.12), (0.28, -0.90, 0.12), 1500, 5),
+        ball((0.0, -1.66, 0.0), 0.14, 700, 6),
+    ]
+    return scene_of(torch.cat(parts))
+
+
+def ground(width: float = 2.0, count: int = 3000) -> Scene:
+    """A flat rough patch under y = 0."""
+    generator = torch.Generator().manual_seed(9)
+    points = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([width, 0.01, width])
+    return scene_of(points, torch.tensor([0.03, 0.005, 0.03]).repeat(count, 1))
+
+
+def moved(scene: Scene, turn: Rotation, factor: float = 1.0, shift: tuple[float, float, float] = (0, 0, 0)) -> Scene:
+    """The scene turned, then enlarged, then shifted."""
+    matrix = torch.from_numpy(turn.as_matrix())
+    quats = (turn * Rotation.from_quat(scene.quats.double().roll(-1, 1).numpy())).as_quat()
+    return replace(
+        scene,
+        means=(factor * scene.means.double() @ matrix.T + torch.tensor(shift)).float(),
+        quats=torch.from_numpy(quats).roll(1, 1).float(),
+        scales=scene.scales + math.log(factor),
+    )

@@ -1,0 +1,200 @@
+"""Rings of cameras: the subject is whole in every frame and fills it; they turn and grow with the scene."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.files.ply import read_scene
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import RESOLUTION, middle_of, orbit, share_out
+from sgsst_core.scene.subject import find_subject
+from tests.sgsst_core.scene.objects import UP, box, figure, joined, moved, scene_of
+
+PIXELS = RESOLUTION**2 * 3 / 4
+TURN = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)
+
+
+def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """[P, 2] places in the picture, 0 to 1 each, and [P] depths of points [P, 3]."""
+    local = points.double() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    lens = torch.tensor([[view.fx, view.fy], [view.cx, view.cy]], dtype=torch.float64)
+    size = torch.tensor([view.width, view.height], dtype=torch.float64)
+    return (local[:, :2] / local[:, 2:] * lens[0] + lens[1]) / size, local[:, 2]
+
+
+def in_view(view: Camera, points: Tensor) -> Tensor:
+    places, depths = project(view, points)
+    return (depths > 0.2) & (places > 0).all(1) & (places < 1).all(1)
+
+
+def elevation(view: Camera, middle: Tensor, up: Tensor) -> float:
+    offset = view.centre - middle
+    return math.degrees(math.asin(float(offset @ up / offset.norm())))
+
+
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (1, 0, 0), (0.3, -2, 0.9)])
+@pytest.mark.parametrize("size", [0.01, 1.0, 300.0])
+@pytest.mark.parametrize("shape", [None, (360, 480)])
+def test_the_whole_object_fills_every_frame(
+    up: tuple[float, float, float], size: float, shape: tuple[int, int] | None
+) -> None:
+    means = box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000) * size + torch.tensor([5.0, -7.0, 2.0]) * size
+    width, height = shape or (None, None)
+    views = orbit(scene_of(means, 0.01 * size), 7, width=width, height=height, up=up, elevations=[15.0])
+    assert len({view.name for view in views}) == 7
+    middle = torch.tensor([5.0, -7.0, 2.0], dtype=torch.float64) * size
+    axis = torch.tensor(up, dtype=torch.float64) / torch.tensor(up, dtype=torch.float64).norm()
+    distances = torch.stack([(view.centre - middle).norm() for view in views])
+    assert torch.allclose(distances, distances[0].expand(7), rtol=0.02)
+    for view in views:
+        assert view.fx == view.fy
+        assert bool(in_view(view, means).all())
+        assert elevation(view, middle, axis) == pytest.approx(15, abs=1)
+        places, _ = project(view, torch.stack([middle, middle + 0.1 * size * axis]))
+        assert float(places[1, 1]) < float(places[0, 1])  # up is up in the picture
+        places, _ = project(view, means)
+        if shape is None:
+            assert view.width * view.height == pytest.approx(PIXELS, rel=2e-3)
+            assert float((places.amax(0) - places.amin(0)).amin()) > 0.65
+        else:
+            assert (view.width, view.height) == shape
+        assert float((places.amax(0) - places.amin(0)).amax()) > 0.55
+        assert torch.allclose(places.amax(0) + places.amin(0), torch.ones(2, dtype=torch.float64), atol=0.03)
+
+
+def test_frames_are_of_few_shapes_that_follow_the_object() -> None:
+    standing = orbit(figure(), 12)
+    assert all(view.height > 2 * view.width for view in standing)
+    assert len({view.width for view in standing}) <= 4
+    lying = orbit(scene_of(box((-2, -0.2, -2), (2, 0.2, 2), 3000)), 12, elevations=[0.0])
+    assert all(view.width > 2 * view.height for view in lying)
+
+
+def test_the_picture_ends_beyond_the_object() -> None:
+    """Rendered, not computed: nothing is cut off, and the object takes most of its box's share of the picture."""
+    scene = figure()
+    rasterizer = make_rasterizer("cpu", scene)
+    for view in orbit(scene, 5, elevations=[10.0, 45.0]):
+        coverage = rasterizer.coverage(resized(view, 256))
+        border = torch.cat([coverage[0], coverage[-1], coverage[:, 0], coverage[:, -1]])
+        assert float(border.amax()) < 0.1
+        assert float(coverage.mean()) > 0.35
+
+
+def test_rings_share_the_cameras_by_their_circumference() -> None:
+    assert share_out(24, [10.0]) == [24]
+    assert share_out(24, [0.0, 60.0]) == [16, 8]
+    assert share_out(2, [0.0, 40.0, 70.0]) == [1, 1, 0]
+    assert share_out(5, [0.0, 80.0]) == [4, 1]
+    middle, axis = middle_of(find_subject(figure()), torch.tensor(UP).double()), torch.tensor(UP, dtype=torch.float64)
+    views = orbit(figure(), 24, up=UP, elevations=[10.0, 40.0, -20.0])
+    counts = share_out(24, [10.0, 40.0, -20.0])
+    expected = [angle for angle, count in zip([10.0, 40.0, -20.0], counts, strict=True) for _ in range(count)]
+    assert [elevation(view, middle, axis) for view in views] == pytest.approx(expected, abs=1e-6)
+
+
+def test_turning_the_scene_turns_the_cameras_and_enlarging_it_moves_them_away() -> None:
+    scene, matrix = figure(), torch.from_numpy(TURN.as_matrix())
+    before = orbit(scene, 9, up=UP, elevations=[10.0, 40.0])
+    after = orbit(moved(scene, TURN, 3.0, (5, -2, 7)), 9, up=TURN.apply(UP).tolist(), elevations=[10.0, 40.0])
+    shift = torch.tensor([5.0, -2.0, 7.0], dtype=torch.float64)
+    size = 3 * find_subject(scene).size
+    for old, new in zip(before, after, strict=True):
+        assert (new.width, new.height) == (old.width, old.height)
+        assert float((3 * matrix @ old.centre + shift - new.centre).norm()) < 0.01 * size
+        turned = old.world_to_camera[:3, :3] @ matrix.T
+        assert torch.allclose(turned, new.world_to_camera[:3, :3], atol=0.02)
+        assert new.fx == pytest.approx(old.fx, rel=0.02)
+
+
+def test_the_first_camera_looks_at_the_broad_side() -> None:
+    scene = scene_of(box((-1, -1, -0.2), (1, 1, 0.2), 3000))
+    turned = moved(scene, Rotation.from_euler("y", 37, degrees=True))
+    offset = orbit(turned, 4)[0].centre
+    broad = torch.from_numpy(Rotation.from_euler("y", 37, degrees=True).apply([0, 0, 1]))
+    assert abs(float(offset @ broad) / float(offset.norm())) > 0.97
+
+
+def test_a_radius_is_obeyed() -> None:
+    scene = figure()
+    middle = middle_of(find_subject(scene), torch.tensor(UP, dtype=torch.float64))
+    for radius in (2.5, 40.0):
+        views = orbit(scene, 5, radius=radius)
+        for view in views:
+            assert float((view.centre - middle).norm()) == pytest.approx(radius)
+            assert bool(in_view(view, scene.means).all())
+    for view in orbit(scene, 5, radius=0.05):  # inside: some of it is behind the camera
+        assert bool(torch.isfinite(view.world_to_camera).all())
+        assert view.fx > 0.2 * max(view.width, view.height)
+
+
+ODD = {
+    "a point": scene_of(torch.ones(1, 3)),
+    "an invisible point": scene_of(torch.ones(1, 3), opacities=torch.tensor([-100.0])),
+    "coincident points": scene_of(torch.ones(200, 3)),
+    "a needle": scene_of(torch.zeros(1, 3), torch.tensor([[1e-4, 2.0, 1e-4]])),
+    "a stick": scene_of(torch.linspace(-2, 2, 300)[:, None] * torch.tensor([0.0, 1.0, 0.0])),
+    "a sheet": scene_of(box((-2, 0, -2), (2, 0, 2), 2000)),
+    "a far outlier": joined(figure(), scene_of(torch.tensor([[1e5, 0.0, 0.0]]))),
+    "small": moved(figure(), TURN, 1e-6),
+    "large": moved(figure(), TURN, 1e6),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_scenes_have_cameras_that_see_them(name: str) -> None:
+    scene = ODD[name]
+    subject = find_subject(scene)
+    seen = scene.means[subject.holds(scene.means)] if name == "a far outlier" else scene.means
+    for view in orbit(scene, 6, elevations=[10.0, 40.0]):
+        assert bool(torch.isfinite(view.world_to_camera).all())
+        assert math.isfinite(view.fx)
+        assert 0.24 < view.width / view.height < 4.2
+        assert view.width * view.height == pytest.approx(PIXELS, rel=2e-3)
+        assert bool(in_view(view, seen).all())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"count": 0},
+        {"width": 0, "height": 5},
+        {"up": (0, 0, 0)},
+        {"up": (0, math.nan, 0)},
+        {"elevations": [90.0]},
+        {"elevations": [math.nan]},
+        {"elevations": []},
+        {"radius": 0.0},
+        {"radius": math.inf},
+    ],
+)
+def test_an_orbit_without_sense_is_refused(wrong: dict[str, object]) -> None:
+    arguments = {"count": 3} | wrong
+    with pytest.raises(SettingsError):
+        orbit(scene_of(torch.rand(9, 3)), **arguments)  # type: ignore[arg-type]
+
+
+def fill(scene: Scene, views: list[Camera]) -> list[float]:
+    """Share of each view's pixels that the scene covers."""
+    rasterizer = make_rasterizer("cpu", scene, max_list_bytes=0)
+    return [float(rasterizer.coverage(resized(view, 256)).mean()) for view in views]
+
+
+def test_the_biker_fills_portraits(shared_data: Path) -> None:
+    scene = read_scene(shared_data / "scenes" / "biker" / "point_cloud.ply").scene
+    views = orbit(scene, 8, elevations=[10.0, 40.0])
+    shares = fill(scene, views)
+    assert sum(shares) / len(shares) > 0.45
+    assert min(shares) > 0.38
+    assert all(view.height > 1.5 * view.width for view in views)
+    for view in views:
+        assert float(in_view(view, scene.means).double().mean()) > 0.9999

@@ -1,0 +1,93 @@
+"""Which way is up: by the ground, by the feet of what stands, and else by habit."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.subject import find_subject
+from sgsst_core.scene.up import Up, find_up
+from tests.sgsst_core.scene.objects import UP, ball, box, figure, ground, joined, moved, scene_of
+
+TURNS = [Rotation.identity(), Rotation.from_euler("xyz", [40, 65, -130], degrees=True), Rotation.from_rotvec([2, 1, 1])]
+
+
+def found(scene: Scene) -> Up:
+    return find_up(find_subject(scene))
+
+
+def degrees(up: Up, turn: Rotation) -> float:
+    """Between up and what it should be."""
+    expected = torch.from_numpy(turn.apply(UP))
+    return math.degrees(math.acos(min(1.0, float(up.direction @ expected))))
+
+
+def lamp() -> Scene:
+    """A ball on a thin pole over a ground that is not wide: the ground, not the length, says how it stands."""
+    pole = box((-0.03, -1.0, -0.03), (0.03, 0.0, 0.03), 400)
+    return joined(ground(), scene_of(torch.cat([pole, ball((0, -1.2, 0), 0.3, 900)])))
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_ground_says_it_whichever_way_the_scene_is_turned(turn: Rotation) -> None:
+    up = found(moved(lamp(), turn, 3.0, (5, -2, 7)))
+    assert degrees(up, turn) < 1.5
+    assert up.ground
+    assert up.sure
+    assert "flat layer" in up.reason
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_who_stands_has_feet_below(turn: Rotation) -> None:
+    up = found(moved(figure(), turn, 0.2))
+    assert degrees(up, turn) < 5
+    assert up.sure
+    assert not up.ground
+    assert "times as tall as wide" in up.reason
+
+
+def test_what_lies_on_its_wheels_does_not_stand_on_its_nose() -> None:
+    wheels = [box((x, -0.3, z), (x + 0.6, 0.0, z + 0.2), 300) for x in (-1.9, 1.3) for z in (-0.8, 0.6)]
+    body = ball((0, 0, 0), 1.0, 3000) * torch.tensor([2.2, 0.5, 0.8]) + torch.tensor([0.0, -0.7, 0.0])
+    up = found(scene_of(torch.cat([*wheels, body])))
+    assert up.name == "-y"
+    assert "rests" in up.reason
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        scene_of(ball((1, 2, 3), 1.0)),
+        scene_of(box((-1, -1, -1), (1, 1, 1))),
+        scene_of(torch.ones(1, 3)),
+        scene_of(torch.ones(100, 3)),
+        scene_of(box((-3, -1.0001, -3), (3, -1, 3))),
+        joined(*(scene_of(part) for part in (box((-1, -1, -1), (1, 1, 1), 4000), ball((0, 0, 0), 3.9, 1500)))),
+    ],
+)
+def test_where_nothing_shows_it_habit_says_so(scene: Scene) -> None:
+    up = found(scene)
+    assert up.name == "-y"
+    assert not up.sure
+    assert "most captures" in up.reason
+
+
+@pytest.mark.parametrize(("along", "name"), [(0, "x"), (1, "-y"), (2, "z")])
+def test_a_stick_stands_along_itself_by_habit(along: int, name: str) -> None:
+    points = torch.zeros(400, 3)
+    points[:, along] = torch.linspace(-1, 1, 400)
+    up = found(scene_of(points))
+    assert up.name == name
+    assert not up.sure
+    assert "both ends are alike" in up.reason
+
+
+def test_a_slant_keeps_its_numbers_and_what_is_near_an_axis_becomes_it() -> None:
+    assert found(moved(figure(), Rotation.from_euler("x", 6, degrees=True))).name == "-y"
+    slanted = found(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
+    assert slanted.name.startswith("(")
+    assert float(slanted.direction.norm()) == pytest.approx(1)
