@@ -111,9 +111,9 @@ def _piece(size: Size, scale: int, region: Rectangle | None) -> Piece:
     return Piece(scale, scaled, part)
 
 
-#: Of what a pass on a CPU needs beside the activations that it keeps, when all of them are held (measured: 0.3 to 0.45
-#: between 192x256 and 384x512).
-WORKING_SHARE = 0.5
+#: Of what a pass on a CPU needs beside the activations that it keeps, when all of them are held (measured: 0.4 at
+#: 512x384, where it is 40 MB, and 0.15 at most at 990x742).
+WORKING_SHARE = 0.25
 
 
 @dataclass(frozen=True)
