@@ -24,6 +24,11 @@ MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 LISTS_BESIDE_WEIGHTS = 16
 
 
+def measuring_memory(memory: int) -> int:
+    """Bytes that what is kept of held-out views may take, and the exact twin's views: of a rank's memory."""
+    return memory // 16
+
+
 def default_memory_limit(device: torch.device | None = None) -> int:
     """Bytes that a job may plan with on this machine, now; those of a GPU where it computes on one."""
     if device is not None and device.type == "cuda":

@@ -17,6 +17,8 @@ from api.http.schemas import PlanView
 from service.errors import ServiceError
 
 _EVENTS = "text/event-stream"
+#: For the log alone, as other servers have it.
+_NOBODY_LISTENS = 499
 _EVENT = {
     "type": "object",
     "required": ["event", "data"],
@@ -51,11 +53,28 @@ class Planning(Protocol):
 
 
 async def answer_plan(request: Request, plan: Planning, workers: int | None) -> Response:
-    """The plan as JSON once it is there; or at once a stream of events, where the request accepts that."""
+    """The plan as JSON once it is there; or at once a stream of events, where the request accepts that.
+
+    Who closes the connection ends the planning.
+    """
     if _EVENTS in request.headers.get("accept", ""):
         sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return StreamingResponse(_events(plan, workers), 200, sent, _EVENTS)
-    return JSONResponse(_view(await plan(lambda now: None), workers))
+    planning, leaving = asyncio.create_task(plan(lambda now: None)), asyncio.create_task(_left(request))
+    try:
+        await asyncio.wait((planning, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if not planning.done():
+            return Response(status_code=_NOBODY_LISTENS)
+        return JSONResponse(_view(planning.result(), workers))
+    finally:
+        planning.cancel()
+        leaving.cancel()
+
+
+async def _left(request: Request) -> None:
+    """Return when the client of a request whose body has been read has closed its connection."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 def _view(found: Mapping[str, Any], workers: int | None) -> dict[str, Any]:

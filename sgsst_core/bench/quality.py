@@ -22,11 +22,10 @@ from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.consistency import Consistency
-from sgsst_core.quality.exact import ExactLoss
+from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
 from sgsst_core.quality.held_out import HeldOut, HeldOutMoment
 from sgsst_core.quality.judge import Judge, Judgement
 from sgsst_core.quality.lpips import load_lpips_or_none
-from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.charts import STYLE
 from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.report.palette import INK, colour_of
@@ -183,13 +182,12 @@ def _left_out(curves: Sequence[Curve]) -> dict[str, str]:
 
 def _held_out(stylizer: Stylizer) -> HeldOut:
     """Views between a job's cameras, of its whole scene."""
-    settings, exact = stylizer.settings, ExactLoss(stylizer, "sos")
-    rasterizer = make_rasterizer(stylizer.plan.anew, stylizer.scene, background=settings.background, near=settings.near)
+    exact = ExactLoss(stylizer, "sos")
     return HeldOut(
         stylizer.views.cameras,
         stylizer.views.covered,
         stylizer.scene,
-        rasterizer,
+        rasterizer_beside(stylizer, stylizer.scene),
         exact.loss,
         exact.style_targets,
         weighted=stylizer.plan.weighted,

@@ -22,18 +22,15 @@ from sgsst_core.planning.choices import (
     rendered_gaussians,
 )
 from sgsst_core.planning.cost import (
-    OPTIMISER_BYTES,
-    STEP_BYTES,
+    WORKING_SHARE,
     Work,
     content_bytes,
-    gaussian_bytes,
-    image_bytes,
     nearest_bytes,
     pairs_of,
     pieces_of,
 )
 from sgsst_core.planning.job import of_measuring, whole_job
-from sgsst_core.planning.measuring import LEVELS, RENDERED, held_out_list_bytes
+from sgsst_core.planning.memory import PeakMemory
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
@@ -44,8 +41,6 @@ from sgsst_core.settings import KeptWeights, Settings
 UNCOVERED_SHARE = 0.01
 #: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few per cent.
 LEAST_PASSES = 200
-#: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.
-MEASURING_BYTES = 200 << 20
 
 
 def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
@@ -84,19 +79,32 @@ class _Deciding:
         self.regions: list[Rectangle] | None = None
         if leave_out:
             self.regions = [probe.survey.regions[index] for index in self.base.covered]
-        self.work = Work.of(self.sizes, self.tiling, self.regions)
+        share = WORKING_SHARE if probe.machine.device == "cpu" else 1.0
+        self.work = Work.of(self.sizes, self.tiling, self.regions, working_share=share)
         self.coarse = Work.of(self.sizes, self.tiling, self.regions, coarsest=True)
         content = self._content_bytes(self.base.covered)
         self.visits = Visits.of(self.base, probe, settings, self.work, self.coarse, content)
 
     def plan(self) -> Plan:
         """Decisions and prediction."""
-        expected, ranks, line = self._one_rank() if self.probe.machine.ranks == 1 else self._several_ranks()
+        expected, activations, ranks, line = (
+            self._one_rank() if self.probe.machine.ranks == 1 else self._several_ranks()
+        )
         expected, measured = whole_job(
             expected, self.base, self.probe, self.settings, work=self.work, visits=self.visits
         )
-        peak = expected.peak_bytes + self._held_out_bytes(measured.level)
-        expected = replace(expected, peak_bytes=peak)
+        level = measured.level if self.measured else None
+        memory = PeakMemory(
+            self.base,
+            self.probe,
+            self.settings,
+            self.visits,
+            level,
+            measured.loss_views,
+            activations,
+            self._nearest_bytes(),
+        ).bytes()
+        expected = replace(expected, peak_bytes=memory[0], device_bytes=memory[1])
         plan = replace(
             self.base,
             ranks=ranks,
@@ -202,58 +210,35 @@ class _Deciding:
         sizes = [self.probe.sizes[index] for index in views]
         return content_bytes(sizes, self.tiling, self.probe.network.content_bytes)
 
-    def _peak_bytes(self, activations: int) -> tuple[int, int | None]:
-        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes.
-
-        What grows with the Gaussians is counted where a CPU computes; a GPU's share of it is small beside its tensors.
-        """
-        probe, visits, ranks = self.probe, self.visits, self.probe.machine.ranks
-        # What a graph computes with is its own: the same work without it has a place beside it.
-        computing = image_bytes(probe.sizes) + activations * (2 if self.base.graphs else 1)
-        weights = visits.weights.bytes if visits.weights else 0.0
-        computing += min(int(visits.content.bytes) // ranks, int(visits.content.room))
-        computing += min(int(weights) // ranks, self.budget) + self._nearest_bytes()
-        gaussians = int(self.base.seen.sum())
-        measuring = MEASURING_BYTES if self.measured else 0
-        if probe.machine.device != "cpu":
-            return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMISER_BYTES
-        lists = max(visits.lists.kept_bytes - visits.surveyed.kept_bytes, 0)
-        scene = 0 if bool(self.base.seen.all()) else gaussians * gaussian_bytes(probe.scene.held_degree)
-        optimising = gaussians * (OPTIMISER_BYTES + STEP_BYTES) + visits.colours.kept_bytes
-        return probe.process_bytes + scene + lists + optimising + computing + measuring, None
-
     def _nearest_bytes(self) -> int:
         """What matching features with the style's takes; every rank has all of the style's vectors."""
         network, device = self.probe.network, self.probe.machine.device
         return nearest_bytes(self.sizes, self.tiling, network.vector_channels, 4, device)
 
-    def _held_out_bytes(self, level: int) -> int:
-        """Lists that the held-out views of a level keep."""
-        views = RENDERED * LEVELS[level].views if self.measured else 0
-        return int(min(views * self.probe.raster.lists_bytes, held_out_list_bytes(self.probe.machine.memory)))
-
-    def _one_rank(self) -> tuple[Prediction, int, None]:
+    def _one_rank(self) -> tuple[Prediction, int, int, None]:
+        """What is expected of the only rank, bytes of its activations, how many take part, and why."""
         rate, visits = self.probe.network.rate, self.visits
-        peak, on_device = self._peak_bytes(int(self.work.peak * self.probe.network.held_bytes))
         turns = self.settings.views_per_step
         seconds, seconds_coarse = (
             turns * (work.seconds(rate) + visits.rasterized() + visits.later(coarse=work is self.coarse))
             for work in (self.work, self.coarse)
         )
-        return Prediction(seconds, seconds_coarse, peak, device_bytes=on_device), 1, None
+        return Prediction(seconds, seconds_coarse, 0), int(self.work.peak * self.probe.network.held_bytes), 1, None
 
-    def _several_ranks(self) -> tuple[Prediction, int, Decision]:
-        """What is expected of the ranks that take part, how many that are, and why."""
+    def _several_ranks(self) -> tuple[Prediction, int, int, Decision]:
+        """What is expected of the ranks that take part, bytes of each one's activations, how many they are, and why."""
         available, link = self.probe.machine.ranks, self.probe.link
         samples = [self._sampled(coarsest=True), self._sampled(coarsest=False)]
         phases = list(zip((self.base.steps_coarse, self.settings.steps_sos), samples, strict=True))
         choice = choose_ranks(phases, self.settings.views_per_step, available, link)
         if "ranks" in self.settings.keep:
             choice = replace(choice, ranks=available)
-        expected = self._expected(choice, *samples)
-        return expected, choice.ranks, decisions.of_ranks(choice, available, link)
+        expected, activations = self._expected(choice, *samples)
+        return expected, activations, choice.ranks, decisions.of_ranks(choice, available, link)
 
-    def _expected(self, choice: RanksChoice, coarse: list[IterationWork], sos: list[IterationWork]) -> Prediction:
+    def _expected(
+        self, choice: RanksChoice, coarse: list[IterationWork], sos: list[IterationWork]
+    ) -> tuple[Prediction, int]:
         """Of the ranks that take part; those that form groups take a view each, at the same time."""
         link, network = self.probe.link, self.probe.network
         groups = math.gcd(self.settings.views_per_step, choice.ranks)
@@ -266,15 +251,15 @@ class _Deciding:
         largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
         sharing = self.probe.machine.sharing
         memory = self.activations * sharing / min(choice.ranks, sharing)  # of fewer ranks, each has more
-        peak, on_device = self._peak_bytes(int(min(largest * (network.held_bytes + network.working_bytes), memory)))
-        return Prediction(
+        activations = int(min(largest * (network.held_bytes + network.working_bytes), memory))
+        expected = Prediction(
             mean(work.seconds(each, link, groups) for work in sos),
             mean(work.seconds(each, link, groups) for work in coarse),
-            peak,
+            0,
             mean(work.communication(each, link) for work in sos),
             mean(work.seconds(1, link) for work in sos) * groups,
-            on_device,
         )
+        return expected, activations
 
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:
         """Iterations of some views, for the model of several ranks: of phase 1, or on all scales."""

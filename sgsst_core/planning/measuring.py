@@ -59,11 +59,6 @@ LEVELS = (
 NOTHING = len(LEVELS) - 1
 
 
-def held_out_list_bytes(memory: int) -> int:
-    """Bytes that lists of Gaussians of held-out views may keep, of what a rank may plan with."""
-    return memory // 16
-
-
 @dataclass(frozen=True)
 class Prices:
     """Seconds of measuring.

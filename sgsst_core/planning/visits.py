@@ -20,7 +20,7 @@ KEEPING_RENDERS = 3
 #: A render without its gradient, in renders with it.
 RENDER = 0.5
 #: Bytes of the colours of a Gaussian in a view: what its spherical harmonics add.
-_COLOUR_BYTES = 12
+COLOUR_BYTES = 12
 #: Cutting the survey's lists of a view down to the Gaussians of the job, in making them.
 _CUT = 0.25
 
@@ -102,7 +102,7 @@ class Visits:
         surveyed = Made(0.0, len(probe.sizes) * raster.lists_bytes, weighed)
         room_of_lists = weighed if plan.kept_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
         lists = Made(raster.first_seconds, views * raster.lists_bytes, room_of_lists)
-        colours = views * int(plan.seen.sum()) * _COLOUR_BYTES if probe.scene.used_degree else 0
+        colours = views * int(plan.seen.sum()) * COLOUR_BYTES if probe.scene.used_degree else 0
         weights = None
         if plan.kept_weights != "none":
             size = (raster.bytes if plan.kept_weights == "float32" else raster.half_bytes) or 0

@@ -38,6 +38,8 @@ _FOREIGN_SHARE = 1e-3
 MINIMUM_COMPARED = 0.01
 #: Pixels warped at a time; some twenty values are held for each.
 _BAND_PIXELS = 1 << 20
+#: Gaussians whose depths are computed at a time.
+_GAUSSIANS = 1 << 18
 
 ImageSource = Callable[[int], Tensor]
 
@@ -159,8 +161,12 @@ def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> Dept
     weights have falls out of their ratio. What the background adds is the image of black Gaussians.
     """
     pose = camera.world_to_camera.double()
-    z = scene.means.double() @ pose[2, :3] + pose[2, 3]  # float64: in a world moved far away both terms are large
-    colours = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
+    colours = torch.zeros((len(scene), 3), dtype=rasterizer.dtype)
+    colours[:, 1] = 1
+    for start in range(0, len(scene), _GAUSSIANS):
+        part = slice(start, start + _GAUSSIANS)
+        # float64: in a world moved far away both terms are large
+        colours[part, 0] = (scene.means[part].double() @ pose[2, :3] + pose[2, 3]).to(rasterizer.dtype)
     sums = rasterizer.render(colours, camera) - rasterizer.render(torch.zeros_like(colours), camera)
     weighted, weights = sums[..., 0], sums[..., 1]
     known = (weights > COVERED) & weighted.isfinite() & (weighted > 0)

@@ -18,8 +18,12 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName
 from sgsst_core.stylizing.evaluation import Evaluation, StyleTargets, evaluate
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -36,6 +40,21 @@ def approximations(stylizer: Stylizer) -> list[str]:
     if stylizer.plan.kept_weights == "half" and stylizer.views.rasterizer.name == "cached":
         found.append("half-precision blend weights")
     return found
+
+
+def rasterizer_anew(stylizer: Stylizer) -> Rasterizer:
+    """What computes a job's blend weights anew; kept ones lie above it."""
+    rasterizer = stylizer.views.rasterizer
+    return rasterizer.anew if isinstance(rasterizer, CachedRasterizer) else rasterizer
+
+
+def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
+    """One of another scene with a job's settings, that keeps its lists in the bytes that the job's lists leave."""
+    settings, job = stylizer.settings, rasterizer_anew(stylizer)
+    options: dict[str, Any] = {"background": settings.background, "near": settings.near}
+    if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.anew:
+        options["beside"] = job
+    return make_rasterizer(stylizer.plan.anew, scene, **options)
 
 
 @dataclass(frozen=True)
@@ -108,11 +127,14 @@ class ExactTwin(ExactLoss):
         super().__init__(stylizer, style_loss)
         settings = stylizer.settings
         self.shown = stylizer.plan.survey.total_blend_weights > 0
-        scene = stylizer.scene.subset(self.shown).without_zero_bands()
+        scene, rasterizer = stylizer.views.scene, rasterizer_anew(stylizer)
+        if not (torch.equal(self.shown, stylizer.plan.seen) and rasterizer.name == stylizer.plan.anew):
+            scene = stylizer.scene.subset(self.shown).without_zero_bands()
+            rasterizer = rasterizer_beside(stylizer, scene)
         self.views = Views(
             scene,
             stylizer.views.cameras,
-            make_rasterizer(stylizer.plan.anew, scene, background=settings.background, near=settings.near),
+            rasterizer,
             self.loss,
             covered=stylizer.plan.survey.covered,
             weighted=stylizer.plan.weighted,

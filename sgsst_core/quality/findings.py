@@ -6,7 +6,7 @@ Nothing here is an error. What cannot be used at all is refused where it is read
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -49,6 +49,8 @@ LONG_STYLE = 4.0
 FLAT_STYLE = 1.0 / 255.0
 #: Points that the extent of the scene is taken from.
 _SAMPLE = 50_000
+#: Gaussians that are looked at together: some tens of bytes in float64 for each of them.
+_PART = 1 << 17
 
 Subject = Literal["scene", "views", "style"]
 
@@ -99,32 +101,49 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     ]
 
 
+#: Of one part of a scene, for each question: which of its n Gaussians are extreme [n] bool, and their values [n].
+_Look = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What is asked of every Gaussian; the worst has the largest, or the smallest, value."""
+
+    what: str
+    done: str
+    largest: bool = True
+
+
 class _Scene:
-    """A scene's columns with what several findings need: the extent, and the file's row of each Gaussian."""
+    """A scene, looked at part by part, so that no copy in float64 is made of all of it; and its extent."""
 
     def __init__(self, file: SceneFile) -> None:
         self.file, self.scene = file, file.scene
         self.centre, self.extent = scene_extent(file.scene)
-        self.rows = np.arange(len(file.scene)) if file.kept is None else np.flatnonzero(file.kept)
 
-    def finding(
-        self,
-        what: str,
-        extreme: Tensor,
-        value: Tensor,
-        done: str,
-        *,
-        largest: bool = True,
-        subject: Subject = "scene",
-    ) -> list[Finding]:
-        """A finding for the Gaussians that are `extreme` [N] bool; the worst has the largest (smallest) `value` [N]."""
-        count = int(extreme.sum())
-        if not count:
-            return []
-        order = value.double() if largest else -value.double()
-        index = int(torch.where(extreme, order, -math.inf).argmax())
-        worst = f"Gaussian {self.rows[index]}: {float(value[index]):.3g}"
-        return [Finding(subject, what, count, len(self.scene), worst, done)]
+    def ask(self, look: _Look, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
+        """A finding for each question that some Gaussian is an answer to, from a look at each part of the scene."""
+        counts = [0] * len(questions)
+        worst = [(-math.inf, -1, math.nan)] * len(questions)  # value to compare by, Gaussian, value
+        for part in _parts(len(self.scene)):
+            for place, (extreme, value) in enumerate(look(part)):
+                count = int(extreme.sum())
+                if count:
+                    counts[place] += count
+                    order = value.double() if questions[place].largest else -value.double()
+                    index = int(torch.where(extreme, order, -math.inf).argmax())
+                    found = (float(order[index]), part.start + index, float(value[index]))
+                    if worst[place][1] < 0 or found[0] > worst[place][0]:
+                        worst[place] = found
+        return [
+            Finding(subject, ask.what, count, len(self.scene), f"Gaussian {self._row(at)}: {value:.3g}", ask.done)
+            for ask, count, (_, at, value) in zip(questions, counts, worst, strict=True)
+            if count
+        ]
+
+    def _row(self, index: int) -> int:
+        """The file's row of a Gaussian."""
+        return index if self.file.kept is None else int(np.flatnonzero(self.file.kept)[index])
 
     def invalid(self) -> list[Finding]:
         kept = self.file.kept
@@ -137,71 +156,70 @@ class _Scene:
         ]
 
     def rotations(self) -> list[Finding]:
-        length = self.scene.quats.double().norm(dim=1)
         low, high = QUATERNION_LENGTHS
+
+        def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+            length = self.scene.quats[part].double().norm(dim=1)
+            return [(length == 0, length), ((length > 0) & (length < low), length), (length > high, length)]
+
         normalised = "normalised in float64, as all are"
-        return [
-            *self.finding("quaternion of length 0", length == 0, length, "never drawn: it is no rotation"),
-            *self.finding(
-                f"quaternion shorter than {low:g}", (length > 0) & (length < low), length, normalised, largest=False
-            ),
-            *self.finding(f"quaternion longer than {high:g}", length > high, length, normalised),
-        ]
+        return self.ask(
+            look,
+            _Question("quaternion of length 0", "never drawn: it is no rotation"),
+            _Question(f"quaternion shorter than {low:g}", normalised, largest=False),
+            _Question(f"quaternion longer than {high:g}", normalised),
+        )
 
     def sizes(self) -> list[Finding]:
-        logarithms = self.scene.scales.double().sort(dim=1).values
-        longest, middle = logarithms[:, 2], logarithms[:, 1]
-        beyond = longest > OVERFLOW_SCALE
-        relative = (longest - math.log(self.extent)).clamp(-700, 700).exp()
-        slender = (longest - middle).clamp_max(700).exp()
-        return [
-            *self.finding("size that overflows", beyond, longest, "never drawn (value: the logarithm)"),
-            *self.finding(
+        def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+            logarithms = self.scene.scales[part].double().sort(dim=1).values
+            longest, middle = logarithms[:, 2], logarithms[:, 1]
+            drawn = longest <= OVERFLOW_SCALE
+            relative = (longest - math.log(self.extent)).clamp(-700, 700).exp()
+            slender = (longest - middle).clamp_max(700).exp()
+            return [
+                (~drawn, longest),
+                ((relative > LARGE_SCALE) & drawn, relative),
+                (relative < SMALL_SCALE, relative),
+                ((slender > NEEDLE) & drawn, slender),
+            ]
+
+        return self.ask(
+            look,
+            _Question("size that overflows", "never drawn (value: the logarithm)"),
+            _Question(
                 "longer than the scene's extent (value: how many times)",
-                (relative > LARGE_SCALE) & ~beyond,
-                relative,
                 "drawn; each touches every raster tile of every view, which costs time and memory",
             ),
-            *self.finding(
+            _Question(
                 f"smaller than {SMALL_SCALE:g} of the scene's extent (value: share)",
-                relative < SMALL_SCALE,
-                relative,
                 "drawn as a point of one pixel's blur",
                 largest=False,
             ),
-            *self.finding(
+            _Question(
                 f"needles more than {NEEDLE:g} times longer than thick (value: ratio)",
-                (slender > NEEDLE) & ~beyond,
-                slender,
                 "drawn exactly: the determinant is a sum of positive terms and cannot cancel",
             ),
-        ]
+        )
 
     def opacities(self) -> list[Finding]:
-        opacity = self.scene.opacities.double().sigmoid()
-        return [
-            *self.finding(
-                "opacity below 1/255", opacity < ALPHA_MIN, opacity, "never drawn, not optimised", largest=False
-            ),
-            *self.finding(
-                f"opacity above {ALPHA_MAX:g}",
-                opacity > ALPHA_MAX,
-                opacity,
-                f"drawn with {ALPHA_MAX:g}, as in training",
-            ),
-        ]
+        def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+            opacity = self.scene.opacities[part].double().sigmoid()
+            return [(opacity < ALPHA_MIN, opacity), (opacity > ALPHA_MAX, opacity)]
+
+        return self.ask(
+            look,
+            _Question("opacity below 1/255", "never drawn, not optimised", largest=False),
+            _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with {ALPHA_MAX:g}, as in training"),
+        )
 
     def harmonics(self) -> list[Finding]:
         found = []
         for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
             if values.shape[1]:
-                size = values.largest() if isinstance(values, StoredHarmonics) else _largest(values)
-                found += self.finding(
-                    f"{name} SH coefficients above {LARGE_COEFFICIENT:g}",
-                    size > LARGE_COEFFICIENT,
-                    size,
-                    "kept; gradients grow with their third power, and a job whose gradient exceeds 1e19 stops",
-                )
+                done = "kept; gradients grow with their third power, and a job whose gradient exceeds 1e19 stops"
+                question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done)
+                found += self.ask(_large_coefficients(values), question)
         return found
 
     def place(self) -> list[Finding]:
@@ -293,8 +311,8 @@ def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
 
 def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]:
     """Cameras with Gaussians closer than the near plane."""
-    means = scene.means.double()
-    close = [float(((means - camera.centre).norm(dim=1) < near).sum()) for camera in cameras]
+    centres = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.centre[None].double() for camera in cameras)])
+    close = [float(count) for count in closer(scene.means, centres, near)]
     return _of_views(
         f"camera inside the scene: Gaussians within {near:g} of it (value: how many)",
         close,
@@ -304,6 +322,23 @@ def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]
     )
 
 
+def closer(means: Tensor, centres: Tensor, distance: float) -> list[int]:
+    """How many of the points [N, 3] are closer than a distance to each of some centres [V, 3] float64.
+
+    Points are first held against all centres by their x alone, which hardly any of them passes.
+    """
+    along = centres[:, 0].sort().values.contiguous()
+    counts = [0] * len(centres)
+    for part in _parts(len(means)):
+        points = means[part].double()
+        x = points[:, 0].contiguous()
+        reach = distance * (1 + 1e-9) + 1e-12 * x.abs()  # more than rounding takes away
+        points = points[torch.searchsorted(along, x + reach, right=True) > torch.searchsorted(along, x - reach)]
+        for view in range(len(centres) if len(points) else 0):
+            counts[view] += int(((points - centres[view]).norm(dim=1) < distance).sum())
+    return counts
+
+
 def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -> list[Finding]:
     """Total blend weights, and each view's uncovered share."""
     blend_weights = torch.zeros(len(file.scene), dtype=torch.float64)
@@ -311,15 +346,14 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
     refused: list[str] = []
     for camera in cameras:
         try:
-            coverage = rasterizer.coverage(camera)
+            coverage, weights = rasterizer.survey(camera)
         except TooManyIntersectionsError as error:
             refused.append(str(error))
             uncovered.append(0.0)
             continue
         seen = sees_something(coverage)
         uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
-        ones = torch.ones((camera.height, camera.width, 3), device=coverage.device)
-        blend_weights += rasterizer.colour_gradient(ones, camera)[:, 0].cpu().double()
+        blend_weights += weights.cpu()
     found = (
         [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops a job")]
         if refused
@@ -351,25 +385,24 @@ def _uncovered(shares: list[float], cameras: Sequence[Camera]) -> list[Finding]:
 
 def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
     """Gaussians that no view shows or hardly any, from their total blend weights [N]."""
-    scene = _Scene(file)
-    hardly = (blend_weights > 0) & (blend_weights < HARDLY_SEEN)
-    return [
-        *scene.finding(
+
+    def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+        weights = blend_weights[part]
+        return [(weights == 0, weights), ((weights > 0) & (weights < HARDLY_SEEN), weights)]
+
+    return _Scene(file).ask(
+        look,
+        _Question(
             "in no view",
-            blend_weights == 0,
-            blend_weights,
             "neither drawn nor optimised; at the end they take their neighbours' colour change (`paper`: none)",
-            subject="views",
         ),
-        *scene.finding(
+        _Question(
             "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)",
-            hardly,
-            blend_weights,
             "optimised as all others, and as fast: from other viewpoints their colours may be extreme",
             largest=False,
-            subject="views",
         ),
-    ]
+        subject="views",
+    )
 
 
 def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
@@ -395,7 +428,21 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
     return found
 
 
-def _largest(values: Tensor) -> Tensor:
-    """Largest absolute value of each row of values [N, ...], [N]; without a copy of all of them."""
-    lowest, highest = values.flatten(1).aminmax(dim=1)
-    return torch.maximum(-lowest, highest)
+def _large_coefficients(values: Tensor | StoredHarmonics) -> _Look:
+    """Which Gaussians have large coefficients among theirs of values [N, K, 3]."""
+    if isinstance(values, StoredHarmonics):
+        sizes = values.largest()
+        return lambda part: [(sizes[part] > LARGE_COEFFICIENT, sizes[part])]
+    held = values
+
+    def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+        lowest, highest = held[part].flatten(1).aminmax(dim=1)
+        size = torch.maximum(-lowest, highest)
+        return [(size > LARGE_COEFFICIENT, size)]
+
+    return look
+
+
+def _parts(count: int) -> list[slice]:
+    """So many rows, by parts."""
+    return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, replace
+from functools import partial
 from statistics import median
 from typing import Any
 
 from torch import Tensor
 
+from sgsst_core.budget import measuring_memory
 from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.planning.measuring import (
     LEVELS,
@@ -16,14 +18,13 @@ from sgsst_core.planning.measuring import (
     Level,
     Prices,
     choose_level,
-    held_out_list_bytes,
     held_out_seconds,
 )
-from sgsst_core.quality.exact import ExactLoss, ExactTwin, approximations
+from sgsst_core.quality.exact import ExactLoss, ExactTwin, approximations, rasterizer_beside
 from sgsst_core.quality.held_out import HeldOut
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -54,7 +55,7 @@ class Measurements:
     def exact(self) -> ExactTwin:
         """The exact twin."""
         if self._exact is None:
-            self._exact = ExactTwin(self._stylizer, self._stylizer.memory // 16)
+            self._exact = ExactTwin(self._stylizer, measuring_memory(self._stylizer.memory))
         return self._exact
 
     @property
@@ -218,17 +219,9 @@ class Measurements:
     def _make(self, views: int, lpips: Lpips | None = None) -> HeldOut:
         """Held-out views, at most so many."""
         stylizer = self._stylizer
-        settings = stylizer.settings
-        options: dict[str, Any] = {"background": settings.background, "near": settings.near}
-        if stylizer.plan.anew == "cpu":
-            options["max_list_bytes"] = held_out_list_bytes(stylizer.memory)
-
-        def rasterizer_of(part: Scene) -> Rasterizer:
-            return make_rasterizer(stylizer.plan.anew, part, **options)
-
         if self._seen_by is None:
             scene = stylizer.scene.without_zero_bands()
-            self._seen_by = scene, rasterizer_of(scene)
+            self._seen_by = scene, rasterizer_beside(stylizer, scene)
         scene, rasterizer = self._seen_by
         source = self._source_of_statistics()
         first = stylizer.measured[0]["held_out"] if stylizer.measured else None
@@ -241,8 +234,8 @@ class Measurements:
             source.style_targets,
             weighted=stylizer.plan.weighted,
             lpips=lpips or load_lpips_or_none(stylizer.network.device),
-            memory=stylizer.memory // 16,
+            memory=measuring_memory(stylizer.memory),
             first={int(scale): value for scale, value in first["gram"].items()} if first else None,
             most=views,
-            rasterizer_of=rasterizer_of,
+            rasterizer_of=partial(rasterizer_beside, stylizer),
         )

@@ -40,6 +40,7 @@ class CpuRasterizer:
         near: near plane in world units.
         alpha_max: clamp of alpha.
         max_list_bytes: see above.
+        beside: one in whose bytes for lists this one keeps its own, as far as they are left; in place of the above.
     """
 
     name = "cpu"
@@ -55,13 +56,15 @@ class CpuRasterizer:
         near: float = NEAR,
         alpha_max: float = ALPHA_MAX,
         max_list_bytes: int = DEFAULT_LIST_BYTES,
+        beside: CpuRasterizer | None = None,
     ) -> None:
         self.scene = scene
         self.near = near
         self.alpha_max = alpha_max
         self.background: NDArray[np.float32] = np.asarray(background, dtype=np.float32)
         self._shapes: Shapes | None = None
-        self._lists = KeptLists(self._build, max_list_bytes)
+        host = None if beside is None else beside._lists
+        self._lists: KeptLists[RasterLists] = KeptLists(self._build, max_list_bytes, host=host)
 
     def of_subset(self, scene: Scene, rows: Tensor, *, max_list_bytes: int = DEFAULT_LIST_BYTES) -> CpuRasterizer:
         """A rasterizer of some of the Gaussians. Lists kept here are handed on to it, cut down when a view comes.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
+from weakref import WeakSet
 
 from sgsst_core.rasterizer.arguments import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera
@@ -33,6 +34,8 @@ class KeptLists(Generic[L]):
         before: lists of the same views, which are taken over, one view at a time when it first comes, in place of
             building: they count among the bytes until then.
         adapt: what becomes of lists that are taken over; it makes them no larger.
+        host: lists in whose bytes these are kept, in place of `max_bytes`, as far as they leave any: they come first,
+            and have these go where they need the room.
     """
 
     def __init__(
@@ -41,11 +44,16 @@ class KeptLists(Generic[L]):
         max_bytes: int,
         before: KeptLists[L] | None = None,
         adapt: Callable[[L], L] = lambda lists: lists,
+        host: KeptLists[Any] | None = None,
     ) -> None:
         self._build = build
         self._max_bytes = max_bytes
         self._before = before
         self._adapt = adapt
+        self._host = host
+        self._guests: WeakSet[KeptLists[Any]] = WeakSet()
+        if host is not None:
+            host._guests.add(self)
         self._kept: dict[CameraKey, L] = {}
         self._latest: tuple[CameraKey, L] | None = None
         self._kept_bytes = 0
@@ -67,9 +75,10 @@ class KeptLists(Generic[L]):
             self._latest = None  # free its memory before the next one is built
             given = self._before.take(camera) if self._before else None
             lists = self._build(camera) if given is None else self._adapt(given)
-            if self.kept_bytes + lists.nbytes <= self._max_bytes:
+            if self.kept_bytes + lists.nbytes <= self._bound():
                 self._kept[key] = lists
                 self._kept_bytes += lists.nbytes
+                self._make_room()
             else:
                 self._latest = (key, lists)
             return lists
@@ -96,7 +105,24 @@ class KeptLists(Generic[L]):
         """Keep no more than so many bytes from now on: views that came last are let go first."""
         with self._lock:
             self._max_bytes = max_bytes
-            if self._before is not None:
-                self._before.limit(max(max_bytes - self._kept_bytes, 0))
-            while self._kept_bytes > max_bytes:
-                self._kept_bytes -= self._kept.popitem()[1].nbytes
+            self._let_go(max_bytes)
+            self._make_room()
+
+    def _let_go(self, max_bytes: int) -> None:
+        if self._before is not None:
+            self._before.limit(max(max_bytes - self._kept_bytes, 0))
+        while self._kept_bytes > max_bytes:
+            self._kept_bytes -= self._kept.popitem()[1].nbytes
+
+    def _bound(self) -> int:
+        """Bytes that may be kept now: with a host, what it and its other guests leave."""
+        if self._host is None:
+            return self._max_bytes
+        others = sum(guest.kept_bytes for guest in self._host._guests if guest is not self)
+        return self._host._max_bytes - self._host.kept_bytes - others
+
+    def _make_room(self) -> None:
+        """Have guests keep no more than is left."""
+        for guest in list(self._guests):
+            with guest._lock:
+                guest._let_go(max(guest._bound(), 0))

@@ -78,6 +78,7 @@ class TritonRasterizer:
             is one.
         alpha_max: clamp of alpha.
         max_list_bytes: see above.
+        beside: one in whose bytes for lists this one keeps its own, as far as they are left; in place of the above.
 
     Raises:
         SettingsError: Triton is missing, or cannot run on the device.
@@ -96,6 +97,7 @@ class TritonRasterizer:
         device: torch.device | str | None = None,
         alpha_max: float = ALPHA_MAX,
         max_list_bytes: int = DEFAULT_LIST_BYTES,
+        beside: TritonRasterizer | None = None,
     ) -> None:
         if not near > 0:
             raise ValueError(f"near plane {near}: must be positive")
@@ -108,7 +110,8 @@ class TritonRasterizer:
             tensor.to(self.device).float().contiguous()
             for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
         ]
-        self._lists = KeptLists(self._build, max_list_bytes)
+        host = None if beside is None else beside._lists
+        self._lists: KeptLists[DeviceLists] = KeptLists(self._build, max_list_bytes, host=host)
 
     def lists(self, camera: Camera) -> DeviceLists:
         """The view's Gaussians by raster tile, kept or new.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -10,7 +11,7 @@ import httpx
 import pytest
 from httpx_sse import ServerSentEvent, connect_sse
 
-from tests.api.service import Service, wait_for
+from tests.api.service import PATIENCE, Service, wait_for
 from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
@@ -77,7 +78,35 @@ def test_nobody_plans_for_who_has_left(service: Service, files: dict[str, bytes]
     with service.client() as client:
         events(client, files)
         both = len(service.processes("service.inspection.process"))
-        with connect_sse(client, "POST", "/v1/jobs", **request(files, resolution=1024, seed=1)) as source:
-            next(source.iter_sse())
-        wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
+        begin_and_leave(service, client, files, both, resolution=1024, seed=1)
         assert events(client, files, resolution=96)[-1].event == "plan"
+
+
+def test_nor_for_who_has_left_without_events(service: Service, files: dict[str, bytes]) -> None:
+    with service.client() as client:
+        events(client, files)
+        both = len(service.processes("service.inspection.process"))
+        begin_and_leave(service, client, files, both, resolution=1024, seed=2)  # validated by now, and not planned
+
+    async def leave() -> None:
+        async with httpx.AsyncClient(base_url=service.url, headers=client.headers, timeout=PATIENCE) as waiting:
+            answer = asyncio.create_task(waiting.post("/v1/jobs", **request(files, resolution=1024, seed=2)))
+            await asyncio.to_thread(
+                wait_for, lambda: len(service.processes("service.inspection.process")) >= both, "the planning to begin"
+            )
+            assert not answer.done()
+            answer.cancel()
+
+    asyncio.run(leave())
+    wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
+    with service.client() as client:
+        assert client.post("/v1/jobs", **request(files, resolution=96)).status_code == 200
+
+
+def begin_and_leave(
+    service: Service, client: httpx.Client, files: dict[str, bytes], both: int, **parameters: Any
+) -> None:
+    """Have a job planned until its first event, and wait for one of `both` processes to end."""
+    with connect_sse(client, "POST", "/v1/jobs", **request(files, **parameters)) as source:
+        next(source.iter_sse())
+    wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")

@@ -7,13 +7,12 @@ from typing import Any
 
 import pytest
 
-from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, RasterCost, gaussian_bytes
-from sgsst_core.planning.decide import MEASURING_BYTES, decide
-from sgsst_core.planning.measuring import LEVELS, held_out_list_bytes
+from sgsst_core.planning.cost import RasterCost
+from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.visits import Made
 from sgsst_core.settings import make_settings
-from tests.sgsst_core.planning.test_decide import GIGABYTE, VIEWS, probe
+from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 
 #: Lists take 5 s and fit, colours 0.5 s.
 LARGE = RasterCost(2.0, first_seconds=5.0, lists_bytes=10**8, colours_seconds=0.5)
@@ -79,19 +78,3 @@ def test_weights_that_do_not_fit_save_nothing() -> None:
         for size in (10 * GIGABYTE // 4, 10 * GIGABYTE)
     )
     assert quarter.seconds - fit.seconds == pytest.approx(0.2 * 3 / 4)
-
-
-def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
-    """Five of six Gaussians are rendered, as a copy of the scene of degree 3; its lists take those of the survey's."""
-    lists = 10**8
-    plain = expected(LARGE).peak_bytes
-    whole = expected(LARGE, keep=("unseen",)).peak_bytes
-    own = OPTIMISER_BYTES + STEP_BYTES + 12 * VIEWS
-    assert plain - whole == 5 * (own + gaussian_bytes(3)) - 6 * own
-    assert gaussian_bytes(3) == 4 * 59
-    for steps in (1, 40, 4000):  # nothing, some and all of it
-        plan = plan_of(LARGE, measured=True, steps_sos=steps)
-        held_out = min(4 * LEVELS[plan.measuring].views * lists, held_out_list_bytes(10 * GIGABYTE))
-        assert plan.prediction is not None
-        assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + held_out
-    assert expected(HUGE).peak_bytes == plain, "what does not fit is not kept, and the survey had kept as much"

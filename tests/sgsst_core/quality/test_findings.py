@@ -13,6 +13,7 @@ import torch
 from sgsst_core.constants import NEAR
 from sgsst_core.files.ply import SceneFile, read_scene, write_scene
 from sgsst_core.planning.survey import survey
+from sgsst_core.quality import findings
 from sgsst_core.quality.findings import (
     Finding,
     findings_of,
@@ -97,6 +98,31 @@ def test_extreme_gaussians_are_counted_and_the_worst_is_named(
     assert (finding.count, finding.total) == (len(rows), len(scene))
     assert finding.worst.startswith(worst)
     assert finding.done
+
+
+def test_a_scene_is_looked_at_in_parts_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same findings, and of equal ones the first is named."""
+    scene = wall(sh_degree=1)
+    for column, values in (("quats", (1e-20, 1e20)), ("scales", (200.0, 5.0, -1e6)), ("sh_dc", (-1e4, 1e4))):
+        for place, value in enumerate(values):
+            getattr(scene, column)[5 + place :: 11] = value
+    file, views = stored(tmp_path, scene), cameras()
+    whole = findings_of(file, views, style(), near=0.5)
+    monkeypatch.setattr(findings, "_PART", 7)
+    assert findings_of(file, views, style(), near=0.5) == whole
+    assert len(whole) == 8
+
+
+@pytest.mark.parametrize("far", [0.0, 1e6])
+@pytest.mark.parametrize("distance", [1e-3, 0.3, 10.0])
+def test_gaussians_close_to_cameras_are_those_of_all_distances(distance: float, far: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = (torch.randn((500, 3), generator=generator) + far).float()
+    centres = torch.cat([means[:40].double(), torch.randn((20, 3), generator=generator, dtype=torch.float64) + far])
+    centres[1] += torch.tensor([distance, 0.0, 0.0])  # just not closer, or just closer
+    expected = [int(((means.double() - centre).norm(dim=1) < distance).sum()) for centre in centres]
+    assert findings.closer(means, centres, distance) == expected
+    assert max(expected) > 0
 
 
 def test_needles_are_found_and_discs_are_not(tmp_path: Path) -> None:

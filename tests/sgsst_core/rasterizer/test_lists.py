@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 
 import numpy as np
@@ -137,3 +138,32 @@ def test_lists_beyond_a_new_limit_are_let_go_the_last_ones_first() -> None:
     sizes = [cpu.lists(view).nbytes for view in views]
     cpu.let_go_of_lists(views[0], sizes[1])
     assert [cpu.has_lists(view) for view in views] == [False, True, False]
+
+
+def test_lists_beside_others_keep_what_these_leave_of_their_bytes() -> None:
+    scene = cloud(300, seed=36)
+    views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    sizes = [build_raster_lists(scene, view).nbytes for view in views]
+    host = CpuRasterizer(scene, max_list_bytes=sum(sizes))
+    guests = [CpuRasterizer(scene, beside=host) for _ in range(2)]
+
+    def kept() -> list[list[bool]]:
+        return [[one.has_lists(view) for view in views] for one in (host, *guests)]
+
+    host.lists(views[0])
+    guests[0].lists(views[1])
+    guests[1].lists(views[2])
+    guests[1].lists(views[0])  # all bytes are taken
+    assert kept() == [[True, False, False], [False, True, False], [False, False, True]]
+    check_same(guests[1].lists(views[0]), host.lists(views[0]))
+    host.lists(views[1])
+    host.lists(views[2])
+    assert kept() == [[True] * 3, [False] * 3, [False] * 3]
+    host.let_go_of_lists(views[0], sum(sizes))
+    guests[0].lists(views[0])
+    assert kept()[1] == [True, False, False]
+    host.let_go_of_lists(views[1], sizes[2])
+    assert kept()[:2] == [[False, False, True], [False] * 3]
+    del guests[1]
+    gc.collect()
+    assert len(host._lists._guests) == 1

@@ -1,0 +1,163 @@
+"""The most memory that a rank of a job will hold: what it keeps to the end, and the largest of what comes and goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, measuring_memory
+from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, gaussian_bytes, image_bytes
+from sgsst_core.planning.measuring import LEVELS, RENDERED
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.probe import Probe
+from sgsst_core.planning.visits import COLOUR_BYTES, Visits
+from sgsst_core.settings import Settings
+
+#: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.
+MEASURING_BYTES = 200 << 20
+#: Bytes of each Gaussian of a scene that is projected: of its shape, kept between views, and of its projection, its
+#: depth and their order while a view's lists are built.
+SHAPE_BYTES, BUILDING_BYTES = 32, 104
+#: Of each Gaussian while neighbours of unseen ones are searched: the result, its difference, positions, their tree.
+SEARCH_BYTES = 120
+#: Of a view's lists, what gradients of their entries take in a rasterizer's backward pass.
+SLOTS_SHARE = 0.25
+#: Of a pixel of a held-out view: its coverage, and the two warps that lead to or from it.
+_COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
+
+
+@dataclass(frozen=True)
+class PeakMemory:
+    """What follows for memory from a plan, as far as it is made.
+
+    Attributes:
+        level: how much is measured beside the steps, a place in `LEVELS`; None where nothing is.
+        loss_views: on which the loss is taken before and after.
+        activations: bytes that are held at a time in an iteration.
+        matching: bytes that it takes to match features with the style's.
+    """
+
+    plan: Plan
+    probe: Probe
+    settings: Settings
+    visits: Visits
+    level: int | None
+    loss_views: int
+    activations: int
+    matching: int
+
+    def bytes(self) -> tuple[int, int | None]:
+        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes.
+
+        What grows with the Gaussians is counted where a CPU computes; a GPU's share of it is small beside its tensors.
+        """
+        probe, gaussians = self.probe, int(self.plan.seen.sum())
+        measuring = 0 if self.level is None else MEASURING_BYTES
+        # What a graph computes with is its own: the same work without it has a place beside it.
+        passing = image_bytes(probe.sizes) + self.activations * (2 if self.plan.graphs else 1) + self.matching
+        if probe.machine.device != "cpu":
+            computing = passing + self._content() + self._weights()
+            return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMISER_BYTES
+        everything = probe.scene.gaussians
+        building = everything * BUILDING_BYTES
+        kept = self._scene() + self._lists_and_weights() + self._content() + self._colours() + self._held_out()
+        kept += gaussians * OPTIMISER_BYTES + measuring
+        searching = everything * SEARCH_BYTES if self._unseen_are_searched() else 0
+        rastering = gaussians * STEP_BYTES + int(SLOTS_SHARE * probe.raster.lists_bytes)
+        passing = max(passing + self._exact_activations() + gaussians * COLOUR_BYTES, rastering, searching)
+        return probe.process_bytes + max(building, kept + passing), None
+
+    @property
+    def _ranks(self) -> int:
+        return self.probe.machine.ranks
+
+    def _visited(self, steps: int) -> float:
+        """Share of the views that so many steps come to, and the loss before and after."""
+        looked_at = self.loss_views if self.level is not None else 0
+        return min((steps * self.settings.views_per_step + looked_at) / len(self.plan.covered), 1.0)
+
+    @property
+    def _all_visited(self) -> float:
+        return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
+
+    def _content(self) -> int:
+        """Content features: of the coarsest scale from phase 1 on, of all of them from phase 2 on."""
+        content, coarse = self.visits.content, self.visits.content_coarse
+        whole = self._visited(self.settings.steps_sos)
+        taken = whole * content.bytes + (self._all_visited - whole) * coarse.bytes
+        return int(min(taken / self._ranks, content.room))
+
+    def _weights(self) -> int:
+        weights = self.visits.weights
+        return int(min(self._all_visited * weights.bytes / self._ranks, weights.room)) if weights else 0
+
+    def _colours(self) -> int:
+        colours = self.visits.colours
+        return int(min(self._all_visited * colours.bytes, colours.room))
+
+    def _lists_and_weights(self) -> int:
+        """What they take beside the lists that the survey has kept, all in one budget."""
+        memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
+        room = int(memory * MEMORY_SHARES["rasterizer"]) - weights
+        lists = visits.lists.bytes + self._other_lists()
+        if visits.weights is not None:  # a view's lists go when its weights are there
+            room = max(room, memory // LISTS_BESIDE_WEIGHTS)
+            lists -= visits.weights.kept * self._all_visited * visits.lists.bytes
+        return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
+
+    def _other_lists(self) -> int:
+        """Lists of held-out views, and of the exact twin where it has a scene of its own."""
+        views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
+        if self.level is not None and self._pruned():
+            views += self.loss_views
+        return views * self.probe.raster.lists_bytes
+
+    def _scene(self) -> int:
+        """Copies of some of the scene's Gaussians, and the shapes of those whose lists are built."""
+        probe, gaussians, everything = self.probe, int(self.plan.seen.sum()), self.probe.scene.gaussians
+        each = gaussian_bytes(probe.scene.held_degree)
+        copies = 0
+        if gaussians < everything:
+            copies = gaussians * each - everything * SHAPE_BYTES
+            if self.visits.lists.kept < 1 or self.visits.weights is not None:
+                copies += gaussians * SHAPE_BYTES
+        if self.level is not None and self._pruned():
+            copies += int((self.plan.survey.total_blend_weights > 0).sum()) * (each + SHAPE_BYTES)
+        return copies
+
+    def _held_out(self) -> int:
+        """What is kept of held-out views beside their lists, and of the exact twin's views."""
+        if self.level is None:
+            return 0
+        memory, kept = measuring_memory(self.probe.machine.memory), 0
+        gaussians, pixels = self.probe.scene.gaussians, max(height * width for height, width in self.probe.sizes)
+        views = LEVELS[self.level].views
+        if views:
+            colours = RENDERED * views * gaussians * COLOUR_BYTES if self.probe.scene.used_degree else 0
+            coverage = views * pixels * _COVERAGE_BYTES if self.plan.weighted else 0
+            kept += gaussians * SHAPE_BYTES + min(colours, memory // 8) + min(coverage, memory // 8)
+            kept += min(views * pixels * _WARP_BYTES, memory // 2)
+        if self._approximated():
+            share = self.loss_views / len(self.plan.covered)
+            kept += int(min(share * self._exact_size() * self.visits.content.bytes, memory // 2))
+            kept += int(min(share * self.visits.colours.bytes, memory // 4))
+        return kept
+
+    def _exact_activations(self) -> int:
+        """What activations of the exact twin take beside the job's."""
+        if self.level is None or not self._approximated():
+            return 0
+        budget = int(self.probe.machine.memory * MEMORY_SHARES["activations"])
+        return max(min(int(self.activations * self._exact_size()), budget) - self.activations, 0)
+
+    def _exact_size(self) -> float:
+        """Bytes of a value of the exact twin's network, in those of the job's."""
+        return 2.0 if self.plan.precision == "bfloat16" else 1.0
+
+    def _pruned(self) -> bool:
+        return bool((self.plan.survey.total_blend_weights[~self.plan.seen] > 0).any())
+
+    def _approximated(self) -> bool:
+        return self.plan.precision != "float32" or self.plan.kept_weights == "half" or self._pruned()
+
+    def _unseen_are_searched(self) -> bool:
+        return self.settings.unseen == "neighbours" and not bool(self.plan.seen.all())

@@ -1,0 +1,86 @@
+"""The most memory that a job will hold, term by term."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, gaussian_bytes
+from sgsst_core.planning.decide import decide
+from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.memory import BUILDING_BYTES, MEASURING_BYTES, SEARCH_BYTES, SHAPE_BYTES
+from sgsst_core.settings import make_settings
+from tests.sgsst_core.planning.test_decide import GIGABYTE, HEIGHT, VIEWS, WIDTH, plan_of, probe
+from tests.sgsst_core.planning.test_visits import HUGE, LARGE, expected
+from tests.sgsst_core.planning.test_visits import plan_of as plan_of_raster
+
+#: Bytes that there are for lists and weights.
+ROOM = 10 * GIGABYTE // 4
+
+
+def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
+    """Five of six Gaussians are rendered, as a copy of the scene of degree 3; its lists take those of the survey's."""
+    plain = expected(LARGE).peak_bytes
+    whole = expected(LARGE, keep=("unseen",)).peak_bytes
+    own = OPTIMISER_BYTES + 12 + 12 * VIEWS
+    assert plain - whole == 5 * (own + gaussian_bytes(3)) - 6 * (own + SHAPE_BYTES)
+    assert gaussian_bytes(3) == 4 * 59
+    assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "what does not fit is built anew, and not kept"
+
+
+def test_lists_of_held_out_views_take_what_the_jobs_leave() -> None:
+    plain = expected(LARGE).peak_bytes
+    for steps in (40, 400, 4000):
+        for size in (10**8, 10**9):
+            plan = plan_of_raster(replace(LARGE, lists_bytes=size), measured=True, steps_sos=steps)
+            views = LEVELS[plan.measuring].views
+            lists = min((VIEWS + 4 * views) * size, ROOM) - min(VIEWS * size, ROOM)
+            gaussians = 6 * (SHAPE_BYTES + 12 * 4 * views) if views else 0
+            warps = min(views * HEIGHT * WIDTH * 80, 10 * GIGABYTE // 32)
+            built = 5 * SHAPE_BYTES if VIEWS * size > ROOM else 0
+            assert plan.prediction is not None
+            assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + lists + gaussians + warps + built
+
+
+def test_views_that_no_step_comes_to_take_nothing() -> None:
+    """Of four, one step sees one: a quarter of the content, and of the colours."""
+    every, one = expected(LARGE, keep=("unseen",)), expected(LARGE, steps_sos=1, keep=("unseen",))
+    without = [expected(LARGE, steps_sos=steps, keep=("unseen", "content")) for steps in (40, 1)]
+    colours = 6 * 12 * VIEWS * 3 // 4
+    assert without[0].peak_bytes - without[1].peak_bytes == colours
+    content = expected(LARGE, keep=("unseen",)).peak_bytes - without[0].peak_bytes
+    assert every.peak_bytes - one.peak_bytes == colours + content * 3 // 4
+
+
+def test_weights_take_the_room_of_the_surveys_lists() -> None:
+    """Both have one budget, and what did not fit it has a sixteenth of the memory beside it."""
+    kept = [RasterCost(0.3, 0.1, size, size, lists_bytes=10**8) for size in (10**9, ROOM, 4 * ROOM)]
+    peaks = [plan_of(probe(raster=raster), kept_weights="float32").prediction for raster in kept]
+    base = plan_of(probe(raster=replace(kept[0], bytes=0, lists_bytes=0)), kept_weights="float32").prediction
+    assert base is not None
+    rises = [found.peak_bytes - base.peak_bytes for found in peaks if found is not None]
+    lists = VIEWS * 10**8
+    assert rises == [10**9 - lists, ROOM - lists, ROOM + 300_000_000 - lists]
+
+
+def test_the_largest_of_what_comes_and_goes_counts() -> None:
+    """Of many Gaussians it is a view's lists being built, or the search for unseen ones' neighbours at the end."""
+    few = expected(LARGE)
+    many = plan_of(probe(gaussians=10**8, used_degree=0, held_degree=0)).prediction
+    assert many is not None
+    assert many.peak_bytes - few.peak_bytes > 10**8 * min(BUILDING_BYTES, SEARCH_BYTES) - 10 * GIGABYTE
+
+
+def test_the_exact_twin_computes_in_float32() -> None:
+    """Where the job does not, its activations take as much again, and so does the content of its views."""
+    found = probe(precision_ratio=2.0)
+    rises = []
+    for precision in ("float32", "bfloat16"):
+        plain, measured = (
+            decide(found, make_settings(precision=precision, steps_coarse=0, steps_sos=4000), measured=flag)
+            for flag in (False, True)
+        )
+        assert plain.prediction is not None
+        assert measured.prediction is not None
+        rises.append(measured.prediction.peak_bytes - plain.prediction.peak_bytes)
+    pixels = HEIGHT * WIDTH * (1 + 1 / 4 + 1 / 16)
+    assert rises[1] - rises[0] > HEIGHT * WIDTH * 3000 + 4 * 2 * 2000 * pixels / 64
