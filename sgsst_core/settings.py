@@ -15,6 +15,9 @@ PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
+#: What lies behind the Gaussians in a step: `Settings.background`, a uniform colour, or one of the style's pixels.
+PlannedSurround = Literal["background", "random", "palette"]
+Surround = Literal["auto", "background", "random", "palette"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -80,8 +83,13 @@ class Settings(BaseModel):
     background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
         (0.0, 0.0, 0.0), description="Colour behind the Gaussians."
     )
+    surround: Surround = Field(
+        "auto",
+        description="What is behind the Gaussians in a step: the background, a random colour each time, or that of a "
+        "random pixel of the style; auto: by how much of the views is uncovered.",
+    )
     near: Near = NEAR
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."
     )
@@ -97,9 +105,9 @@ class Settings(BaseModel):
         le=MAX_RESOLUTION,
         description="Shorter side of the coarsest scale in pixels, at most; the method's is 511.",
     )
-    warm_start: Annotated[bool, Option(flags="--warm-start/--cold-start")] = Field(
-        False, description="Begin with the style's mean colour and spread."
-    )
+    warm_start: Annotated[
+        bool | None, Option(flags="--warm-start/--cold-start", default="on for scans without background")
+    ] = Field(None, description="Begin with the style's mean colour and spread.")
     revive: bool = Field(
         False, description="Let colours that fell below black come back, by gradients that would raise them."
     )
@@ -172,6 +180,8 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "learning_rate": 2.5e-3,
         "learning_rate_end": 2.5e-3,
         "position_weights": "off",
+        "surround": "background",
+        "warm_start": False,
         "unseen": "keep",
     },
 }

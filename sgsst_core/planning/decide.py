@@ -17,9 +17,11 @@ from sgsst_core.planning import decisions
 from sgsst_core.planning.choices import (
     GPU_RASTERIZERS,
     LEAST_VISITS,
+    is_scan,
     optimised_gaussians,
     precision_of,
     rendered_gaussians,
+    surround_of,
 )
 from sgsst_core.planning.cost import (
     OPTIMISER_BYTES,
@@ -112,6 +114,7 @@ class _Deciding:
         weighted = settings.position_weights == "on" or (
             settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
         )
+        scan = is_scan(looked, weighted=weighted)
         several = any(self.tiling.scale_count(size) > 1 for size in probe.sizes)
         steps_coarse = settings.steps_coarse if several or settings.preset == "paper" else 0
         views = len(probe.distinct)
@@ -123,6 +126,8 @@ class _Deciding:
             covered=probe.distinct,
             weighted=weighted,
             steps_coarse=steps_coarse,
+            surround=surround_of(settings, scan=scan),
+            warm_start=scan if settings.warm_start is None else settings.warm_start,
             memory_limit=probe.machine.memory_limit,
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
@@ -184,6 +189,7 @@ class _Deciding:
         found = [
             *decisions.of_scene(probe, plan, settings),
             *decisions.of_views(probe, plan, settings, self.work, shared),
+            *decisions.of_surround(plan, settings, self.visits),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
             *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),
@@ -209,7 +215,7 @@ class _Deciding:
         # What a graph computes with is its own: the same work without it has a place beside it.
         computing = image_bytes(probe.sizes) + activations * (2 if self.base.graphs else 1)
         weights = visits.weights.bytes if visits.weights else 0.0
-        computing += min(int(visits.content.bytes) // ranks, int(visits.content.room))
+        computing += min(int(visits.content.bytes) // ranks, int(visits.content.room)) + visits.images.kept_bytes
         computing += min(int(weights) // ranks, self.budget)
         gaussians = int(self.base.seen.sum())
         measuring = MEASURING_BYTES if self.measured else 0
