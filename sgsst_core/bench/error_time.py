@@ -233,7 +233,8 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         count = stylizer.scale_count(index)
         phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
         stylizer.style_targets(stylizer.views.cameras[index])
-        stylizer.views.target(index, sorted({scale for phase in phases for scale in phase.scales(count)}))
+        scales = sorted({scale for phase in phases for scale in phase.scales(count)})
+        stylizer.views.target(index, scales, stylizer.behind(index))
         stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 

@@ -277,6 +277,10 @@ class Stylizer:
         yield
         parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
 
+    def behind(self, index: int) -> Colour | None:
+        """The colour behind a view in the next step; None for the background of the settings."""
+        return drawn_colour(self.plan.surround, self.settings.seed, self.step, index, self.style)
+
     def style_targets(self, camera: Camera) -> StyleTargets:
         """The style's statistics for views of the camera's size."""
         size = (camera.height, camera.width)
@@ -336,7 +340,7 @@ class Stylizer:
         own_views = views[self._team.own_group :: self._team.groups]
         for place, index in enumerate(own_views):
             scales = phase.scales(self.scale_count(index))
-            behind = drawn_colour(self.plan.surround, self.settings.seed, self.step, index, self.style)
+            behind = self.behind(index)
             with self.timer("prepare"):
                 target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)

@@ -246,7 +246,11 @@ class Views:
     def _content_images(self, index: int, scales: Sequence[int]) -> dict[int, Tensor]:
         """The content of a view at some scales, [H >> s, W >> s, 3] on the network's device."""
         whole = functools.cache(lambda: self.content(index).to(self.loss.network.device))
-        return {s: self._images.get((index, s), functools.partial(lambda s: downscale(whole(), s), s)) for s in scales}
+
+        def scaled(scale: int) -> Tensor:
+            return downscale(whole(), scale)
+
+        return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
 
     def _content_behind(self, index: int, image: Tensor, behind: Colour, scale: int) -> Tensor:
         """The content of a view at a scale with another colour behind the Gaussians.
