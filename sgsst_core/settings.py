@@ -18,6 +18,9 @@ KeptWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
 KeptColours = Literal["no", "match"]
 StyleLossName = Literal["sos", "nnfm", "mixed"]
+#: What lies behind the Gaussians in a step: `Settings.background`, a uniform colour, or one of the style's pixels.
+PlannedSurround = Literal["background", "random", "palette"]
+Surround = Literal["auto", "background", "random", "palette"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -93,6 +96,11 @@ class Settings(BaseModel):
     background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
         (0.0, 0.0, 0.0), description="Colour behind the Gaussians."
     )
+    surround: Surround = Field(
+        "auto",
+        description="What is behind the Gaussians in a step: the background, a random colour each time, or that of a "
+        "random pixel of the style; auto: by how much of the views is uncovered.",
+    )
     near: Near = NEAR
     style_scale: Annotated[float, Option(unit="factor", metavar="S")] = Field(
         1.0, ge=0.25, le=4, description="Strokes S times as large as the style image has them in a view."
@@ -103,7 +111,7 @@ class Settings(BaseModel):
     keep_colours: KeptColours = Field(
         "no", description="match: the style image takes the scene's colours first, so that only its strokes are taken."
     )
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."
     )
@@ -119,9 +127,9 @@ class Settings(BaseModel):
         le=MAX_RESOLUTION,
         description="Shorter side of the coarsest scale in pixels, at most; the method's is 511.",
     )
-    warm_start: Annotated[bool, Option(flags="--warm-start/--cold-start")] = Field(
-        False, description="Begin with the style's mean colour and spread."
-    )
+    warm_start: Annotated[
+        bool | None, Option(flags="--warm-start/--cold-start", default="on for scans without background")
+    ] = Field(None, description="Begin with the style's mean colour and spread.")
     revive: bool = Field(
         False, description="Let colours that fell below black come back, by gradients that would raise them."
     )
@@ -195,6 +203,8 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "learning_rate_end": 2.5e-3,
         "feature_scale": "paper",
         "position_weights": "off",
+        "surround": "background",
+        "warm_start": False,
         "unseen": "keep",
     },
 }

@@ -97,6 +97,11 @@ VARIANTS = {
         Variant("one-scale", "the paper's loss at full size alone", _full_size_only),
         Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
         Variant("warm-start", "standard, from the style's mean colour and spread", settings={"warm_start": True}),
+        Variant("cold-start", "standard, from the scene's own colours", settings={"warm_start": False}),
+        Variant(
+            "fixed-surround", "standard, with the background behind every step", settings={"surround": "background"}
+        ),
+        Variant("random-surround", "standard, with a random colour behind each step", settings={"surround": "random"}),
         Variant("warm-no-phase-1", "warm start instead of phase 1", _sos, {"warm_start": True}),
         Variant("no-revive", "standard; colours that fall below 0 stay there", settings={"revive": False}),
         Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
@@ -231,7 +236,8 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         count = stylizer.scale_count(index)
         phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
         stylizer.style_targets(stylizer.views.cameras[index])
-        stylizer.views.target(index, sorted({scale for phase in phases for scale in phase.scales(count)}))
+        scales = sorted({scale for phase in phases for scale in phase.scales(count)})
+        stylizer.views.target(index, scales, stylizer.behind(index))
         stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 

@@ -16,11 +16,16 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
-from sgsst_core.settings import Precision, Settings
+from sgsst_core.settings import PlannedSurround, Precision, Settings
 
 #: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
 #: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
 LEAST_VISITS = 5
+#: With this share of pixels uncovered, views show an object without background. (Those of a room that was captured from
+#: some places only have holes of a few per cent.)
+SCAN_SHARE = 0.2
+#: What is behind such an object in a step, if nothing else was asked for (docs/quality.md).
+SCAN_SURROUND: PlannedSurround = "palette"
 
 
 def optimised_gaussians(looked: Survey, settings: Settings) -> Tensor:
@@ -36,6 +41,18 @@ def optimised_gaussians(looked: Survey, settings: Settings) -> Tensor:
             f"is {float(looked.total_blend_weights.max()):.3g}. Give a smaller one."
         )
     return optimised
+
+
+def is_scan(looked: Survey, *, weighted: bool) -> bool:
+    """Whether views show an object without background, whose statistics leave out what is behind it."""
+    return weighted and looked.uncovered_share > SCAN_SHARE
+
+
+def surround_of(settings: Settings, *, scan: bool) -> PlannedSurround:
+    """What is behind the Gaussians in a step."""
+    if settings.surround == "auto":
+        return SCAN_SURROUND if scan else "background"
+    return settings.surround
 
 
 def rendered_gaussians(optimised: Tensor, settings: Settings) -> Tensor:

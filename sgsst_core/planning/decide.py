@@ -17,9 +17,11 @@ from sgsst_core.planning import decisions
 from sgsst_core.planning.choices import (
     GPU_RASTERIZERS,
     LEAST_VISITS,
+    is_scan,
     optimised_gaussians,
     precision_of,
     rendered_gaussians,
+    surround_of,
 )
 from sgsst_core.planning.cost import (
     WORKING_SHARE,
@@ -122,6 +124,7 @@ class _Deciding:
         weighted = settings.position_weights == "on" or (
             settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
         )
+        scan = is_scan(looked, weighted=weighted)
         several = any(self.tiling.scale_count(size) > 1 for size in probe.sizes)
         steps_coarse = settings.steps_coarse if several or settings.preset == "paper" else 0
         views = len(probe.distinct)
@@ -133,6 +136,8 @@ class _Deciding:
             covered=probe.distinct,
             weighted=weighted,
             steps_coarse=steps_coarse,
+            surround=surround_of(settings, scan=scan),
+            warm_start=scan if settings.warm_start is None else settings.warm_start,
             memory_limit=probe.machine.memory_limit,
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
@@ -194,6 +199,7 @@ class _Deciding:
         found = [
             *decisions.of_scene(probe, plan, settings),
             *decisions.of_views(probe, plan, settings, self.work, shared),
+            *decisions.of_surround(plan, settings, self.visits),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
             *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),

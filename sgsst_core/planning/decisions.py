@@ -13,7 +13,10 @@ from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Wo
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
+from sgsst_core.planning.visits import Visits
 from sgsst_core.settings import Settings
+
+_ANOTHER_LOSS = "it is another loss than the paper's"
 
 
 def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
@@ -98,7 +101,31 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
                 "position weights",
                 "statistics are weighted by coverage",
                 share,
-                error="it is another loss than the paper's",
+                error=_ANOTHER_LOSS,
+            )
+        )
+    return decisions
+
+
+def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision]:
+    """What is behind the Gaussians in a step, and what their colours begin with, where it is not the plain way."""
+    share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
+    decisions = []
+    if plan.surround != "background":
+        colour = {"random": "a random colour", "palette": "the colour of a random pixel of the style"}[plan.surround]
+        reason = f"{share}: colours would be fitted to one that stays" if settings.surround == "auto" else "asked for"
+        cost = visits.content.always + visits.images.always
+        if cost:
+            reason += f"; content features are computed with it, {cost:.2g} s in every iteration"
+        decisions.append(Decision("surround", f"{colour} each time", reason, error=_ANOTHER_LOSS))
+    if plan.warm_start:
+        reason = f"{share}: nothing beside the object tells how bright it should be"
+        decisions.append(
+            Decision(
+                "start",
+                "colours begin with the style's mean and spread",
+                reason if settings.warm_start is None else "asked for",
+                error="it is another start than the paper's",
             )
         )
     return decisions
@@ -270,7 +297,10 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
                 error="the steps, which work on the same loss",
             )
         )
-    if settings.early_stop:
+    if settings.early_stop and plan.surround != "background":
+        reason = "losses with different colours behind the Gaussians do not tell whether they still fall"
+        decisions.append(Decision("early stop", "none: every step is made", reason))
+    elif settings.early_stop:
         decisions.append(
             Decision(
                 "early stop",

@@ -80,11 +80,12 @@ class PeakMemory:
         return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
 
     def _content(self) -> int:
-        """Content features: of the coarsest scale from phase 1 on, of all of them from phase 2 on."""
+        """Content features: of the coarsest scale from phase 1 on, of all of them from phase 2 on; or their images."""
         content, coarse = self.visits.content, self.visits.content_coarse
         whole = self._visited(self.settings.steps_sos)
         taken = whole * content.bytes + (self._all_visited - whole) * coarse.bytes
-        return int(min(taken / self._ranks, content.room))
+        images = min(self._all_visited * self.visits.images.bytes, self.visits.images.room)
+        return int(min(taken / self._ranks, content.room) + images)
 
     def _weights(self) -> int:
         weights = self.visits.weights

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
-from sgsst_core.settings import KeptWeights, Precision
+from sgsst_core.settings import KeptWeights, PlannedSurround, Precision
 
 Device = Literal["cpu", "cuda"]
 
@@ -82,6 +82,8 @@ class Plan:
         seen: [N] bool, Gaussians that are rendered: the optimised ones, or all for comparison.
         covered: indices of the views that are stylized.
         weighted: statistics are weighted by coverage.
+        surround: what is behind the Gaussians in a step.
+        warm_start: the job begins with the style's mean colour and spread.
         steps_coarse: of phase 1; 0 where it is left out.
         memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
         device: on which the feature network computes.
@@ -107,6 +109,8 @@ class Plan:
     weighted: bool
     steps_coarse: int
     memory_limit: int
+    surround: PlannedSurround = "background"
+    warm_start: bool = False
     device: Device = "cpu"
     rasterizer: str = "cpu"
     anew: RasterizerName = "cpu"

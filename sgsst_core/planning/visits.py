@@ -21,6 +21,8 @@ KEEPING_RENDERS = 3
 RENDER = 0.5
 #: Bytes of the colours of a Gaussian in a view: what its spherical harmonics add.
 COLOUR_BYTES = 12
+#: Of a pixel of the content image at all scales, float32, which is kept where steps have different colours behind it.
+_IMAGE_BYTES = 16
 #: Cutting the survey's lists of a view down to the Gaussians of the job, in making them.
 _CUT = 0.25
 
@@ -71,6 +73,7 @@ class Visits:
         colours: of spherical harmonics.
         weights: kept ones; None where none are.
         content: features at all scales, with the render that they are of; `content_coarse`: of the coarsest alone.
+        images: of the content, which features with another colour behind them are computed from.
         raster: seconds of a render and its gradient, weights computed anew; `raster_kept`: with kept ones.
         in_coarse: phase 1 makes lists, colours and weights, so that phase 2 finds them.
         coarse_weights: phase 1 makes weights of its own.
@@ -83,6 +86,7 @@ class Visits:
     weights: Made | None
     content: Made
     content_coarse: Made
+    images: Made
     raster: float
     raster_kept: float
     in_coarse: bool
@@ -112,6 +116,11 @@ class Visits:
         forward = probe.network.rate.forward if settings.content_weight else 0.0
         room_of_content = 0 if "content" in settings.keep else room / 2
         share = coarse.pixels / work.pixels  # of the content's bytes, as of its pixels
+        images = Made(0.0)
+        if plan.surround != "background" and settings.content_weight:  # features are another colour's at every visit
+            pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
+            room_of_images, room_of_content = room_of_content / 2, 0
+            images, rendered = Made(rendered, _IMAGE_BYTES * pixels, room_of_images), 0.0
         return Visits(
             lists=lists,
             surveyed=surveyed,
@@ -120,6 +129,7 @@ class Visits:
             weights=weights,
             content=Made(rendered + work.pixels * forward, content, room_of_content),
             content_coarse=Made(rendered + coarse.pixels * forward, content * share, room_of_content),
+            images=images,
             raster=raster.seconds,
             raster_kept=raster.seconds if raster.kept_seconds is None else raster.kept_seconds,
             in_coarse=plan.steps_coarse > 0,
@@ -135,11 +145,11 @@ class Visits:
 
     def later(self, *, coarse: bool) -> float:
         """Seconds of every visit beside rendering and the network: content that is not kept."""
-        return (self.content_coarse if coarse else self.content).always
+        return (self.content_coarse if coarse else self.content).always + self.images.always
 
     def first(self, *, coarse: bool) -> float:
         """Seconds of a view's first visit in a phase beside those of its later visits."""
-        content = (self.content_coarse if coarse else self.content).once
+        content = (self.content_coarse if coarse else self.content).once + self.images.once
         lists = (1 - self.handed) * self.lists.once + self.colours.once
         keeping = self.weights.once if self.weights else 0.0
         if coarse:

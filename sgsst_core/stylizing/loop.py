@@ -133,9 +133,19 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]
     if settings.target_loss and len(losses) >= stylizer.round_length:  # every view has been visited by then
         target = settings.target_loss * mean_loss(stylizer.start())
+        if stylizer.plan.surround != "background":
+            losses = _losses_on_background(stylizer)
         if has_reached(losses, target, stylizer.round_length):
             return "target-loss"
-    return "converged" if settings.early_stop and has_converged(losses, stylizer.round_length) else None
+    return "converged" if stylizer.stops_early and has_converged(losses, stylizer.round_length) else None
+
+
+def _losses_on_background(stylizer: Stylizer) -> list[float]:
+    """The loss as the start's was taken, once in a round, as often as it has steps: those of steps do not compare."""
+    if stylizer.step % stylizer.round_length:
+        return []
+    with stylizer.measuring():
+        return [mean_loss(stylizer.evaluate(stylizer.evaluation_views))] * stylizer.round_length
 
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:

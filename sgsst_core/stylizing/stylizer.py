@@ -45,6 +45,7 @@ from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.style_picture import prepared_style
+from sgsst_core.stylizing.surround import Colour, drawn_colour
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import Views
@@ -122,7 +123,7 @@ class Stylizer:
         rasterizer, self._coarse = self._rasterizers(seen, workshop)
         self.views = self._views(seen, fit_cameras(cameras, settings), rasterizer)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
-        start = self.transferred() if settings.warm_start else seen.sh_dc
+        start = self.transferred() if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
         self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate)
         self._generator = torch.Generator().manual_seed(settings.seed)
@@ -165,9 +166,11 @@ class Stylizer:
         )
 
     def transferred(self) -> Tensor:
-        """Colours [N, 3] of the Gaussians that are optimised, with the style's mean and spread in closed form."""
-        seen = self.plan.seen
-        return warm_start(self.scene.sh_dc[seen], self.plan.survey.total_blend_weights[seen], self.style)
+        """Colours [N, 3] of the Gaussians that are rendered, with the style's mean and spread in closed form."""
+        seen, own = self.plan.seen, self.scene.sh_dc[self.plan.seen]
+        found = warm_start(own, self.plan.survey.total_blend_weights[seen], self.style)
+        # Of what no view decides, colours follow from what becomes of the others: see `stylized`.
+        return torch.where(self.plan.optimised[seen][:, None], found, own)
 
     def _loss(self) -> SosLoss:
         settings = self.settings
@@ -233,6 +236,8 @@ class Stylizer:
             keep_content="content" not in settings.keep,
             revive=settings.revive,
             regions=plan.survey.regions if plan.weighted else None,
+            background=settings.background,
+            drawn=plan.surround != "background",
             collectives=self.group,
         )
 
@@ -244,6 +249,11 @@ class Stylizer:
     def share_done(self) -> float:
         """How much of the schedule is done, 0 to 1: what the learning rate follows."""
         return self.step / max(self.total - 1, 1)
+
+    @property
+    def stops_early(self) -> bool:
+        """Whether the run ends when its losses have stopped falling, which must be of the same surround for that."""
+        return self.settings.early_stop and self.plan.surround == "background"
 
     @property
     def round_length(self) -> int:
@@ -273,6 +283,10 @@ class Stylizer:
         started, parts = time.perf_counter(), self.seconds_by_part
         yield
         parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
+
+    def behind(self, index: int) -> Colour | None:
+        """The colour behind a view in the next step; None for the background of the settings."""
+        return drawn_colour(self.plan.surround, self.settings.seed, self.step, index, self.style)
 
     def style_targets(self, camera: Camera) -> StyleTargets:
         """The style's statistics for views of the camera's size."""
@@ -333,13 +347,14 @@ class Stylizer:
         own_views = views[self._team.own_group :: self._team.groups]
         for place, index in enumerate(own_views):
             scales = phase.scales(self.scale_count(index))
+            behind = self.behind(index)
             with self.timer("prepare"):
-                target = self.views.target(index, scales)
+                target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])
             assert target.share is not None
             self._cost += target.share.cost(self.group.rank, self.network.halo)
-            own, result = self._gradient(index, style, target, scales)
+            own, result = self._gradient(index, style, target, scales, behind)
             gradient = own if gradient is None else gradient.add_(own)
             results.append(result)
         assert gradient is not None
@@ -440,19 +455,26 @@ class Stylizer:
         return gradient.cpu(), time.perf_counter() - started
 
     def _gradient(
-        self, index: int, style: StyleTargets, target: ViewTarget, scales: Sequence[int]
+        self,
+        index: int,
+        style: StyleTargets,
+        target: ViewTarget,
+        scales: Sequence[int],
+        behind: Colour | None = None,
     ) -> tuple[Tensor, SosResult]:
-        """dE/dsh_dc [n, 3] of one view, and the loss."""
+        """dE/dsh_dc [n, 3] of one view with a colour behind it (None: the settings' background), and the loss."""
         rasterizer = self._rasterizer_for(scales)
         with self.timer("render"), torch.no_grad():
             colours = self.views.colours(index, self.sh_dc.detach())
             image = self.views.render(index, colours, rasterizer)
+            if behind is not None:
+                image = self.views.put_behind(index, image, behind, rasterizer.scale)
         with self.timer("loss"):
             evaluate = self.graphs.evaluate if self.graphs is not None else self.loss.evaluate
             result = evaluate(image, style, target, scales, image_scale=rasterizer.scale)
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
-            return self.views.gradient(index, result.image_gradient.to(image.device), colours, rasterizer), result
+            return self.views.gradient(index, result.image_gradient.to(colours.device), colours, rasterizer), result
 
     def _rasterizer_for(self, scales: Sequence[int]) -> Rasterizer:
         """What renders a view for some scales: at the one coarse scale alone, where its weights are kept."""

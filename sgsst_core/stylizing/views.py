@@ -17,8 +17,10 @@ from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
+from sgsst_core.stylizing.surround import Colour, put_behind
 
 
 class Views:
@@ -40,6 +42,8 @@ class Views:
         revive: let colours that the clamp holds at 0 come back (`view_colours_gradient`).
         keep_content: keep content features that fit; False computes them at each visit, for comparison.
         regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
+        background: what the rasterizer has behind the Gaussians.
+        drawn: steps have other colours behind the Gaussians: images of the content are kept for them, not features.
         collectives: of the ranks that render each view together; `loss` has the same.
     """
 
@@ -57,6 +61,8 @@ class Views:
         keep_content: bool = True,
         revive: bool = False,
         regions: Sequence[Rectangle] | None = None,
+        background: Colour = (0.0, 0.0, 0.0),
+        drawn: bool = False,
         collectives: Collectives = ALONE,
     ) -> None:
         self.scene = scene
@@ -82,11 +88,15 @@ class Views:
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4 - shown, _tensor_bytes)
         self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
         kept = memory // 2 if keep_content else 0
-        self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept)
+        images = kept // 2 if drawn else 0
+        self._images: Shelf[_ImageKey, Tensor] = Shelf(images, _tensor_bytes)
+        self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept - images)
         self._shares: dict[tuple[int, tuple[int, ...]], Share] = {}
         self.covered = covered
         self.weighted = weighted
         self.revive = revive
+        self._background = background
+        self._drawn = drawn
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -193,20 +203,38 @@ class Views:
             self._ahead.end()
 
     def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
-        """Whether content features at some scales of a view have yet to be computed."""
+        """Whether the content of a view at some scales is not kept: its features, or the images that they are of."""
+        if self._drawn:
+            return bool(self.loss.content_weight) and any((index, scale) not in self._images for scale in scales)
         share = self._shares.get((index, tuple(scales)))  # what is kept was shared out before
         kept = share is not None and all((index, scale, share.pieces[scale]) in self._content for scale in scales)
         return bool(self.loss.content_weight) and not kept
 
-    def target(self, index: int, scales: Sequence[int]) -> ViewTarget:
+    def coverage(self, index: int) -> list[Tensor]:
+        """Coverage [H >> k, W >> k] of a view at powers of two, on the network's device; kept where memory allows."""
+        return self._coverage.get(index, lambda: self._position_weights(index))
+
+    def put_behind(self, index: int, image: Tensor, colour: Colour, scale: int = 0) -> Tensor:
+        """Image [h, w, 3] of a view, at a scale, with another colour behind the Gaussians, on the network's device."""
+        return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], colour, self._background)
+
+    def target(self, index: int, scales: Sequence[int], behind: Colour | None = None) -> ViewTarget:
         """What the view is compared with at some scales; kept where memory allows.
 
         Features are computed only of scales that are asked for: phase 1 needs those of one.
+
+        Args:
+            behind: the colour behind the Gaussians, which their content has too; None for the rasterizer's own. Its
+                features are nobody else's: only the images that they are computed from are kept.
         """
-        coverage = self._coverage.get(index, lambda: self._position_weights(index)) if self.weighted else None
+        coverage = self.coverage(index) if self.weighted else None
         share = self._share(index, scales, coverage)
         target = ViewTarget(coverage=coverage, share=share)
-        if self.loss.content_weight:
+        if self.loss.content_weight and behind is not None:
+            for scale, content in self._content_images(index, scales).items():
+                over = self._content_behind(index, content, behind, scale)
+                target.content[scale] = self.loss.content_features(over, 0, share.tiles[scale])
+        elif self.loss.content_weight:
             image = functools.cache(lambda: self.content(index))
             for scale in scales:
                 pieces = share.pieces[scale]
@@ -214,6 +242,25 @@ class Views:
                 size = self.loss.content_bytes(pieces)
                 target.content[scale] = self._content.get((index, scale, pieces), make, size)
         return target
+
+    def _content_images(self, index: int, scales: Sequence[int]) -> dict[int, Tensor]:
+        """The content of a view at some scales, [H >> s, W >> s, 3] on the network's device."""
+        whole = functools.cache(lambda: self.content(index).to(self.loss.network.device))
+
+        def scaled(scale: int) -> Tensor:
+            return downscale(whole(), scale)
+
+        return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
+
+    def _content_behind(self, index: int, image: Tensor, behind: Colour, scale: int) -> Tensor:
+        """The content of a view at a scale with another colour behind the Gaussians.
+
+        What a photo has where no Gaussian is gives way to the colour.
+        """
+        if self._photos is None:
+            return self.put_behind(index, image, behind, scale)
+        coverage = self.coverage(index)[scale]
+        return put_behind(image * coverage[..., None].to(image.dtype), coverage, behind, (0.0, 0.0, 0.0))
 
     def share_anew(self) -> None:
         """Forget what belongs to the present division of the work, because another follows."""
@@ -242,6 +289,8 @@ class Views:
 
 #: View, and scale of the rasterizer.
 _ShownKey = tuple[int, int]
+#: View and scale.
+_ImageKey = tuple[int, int]
 #: View, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
 

@@ -16,7 +16,8 @@ def test_paper_is_the_published_schedule() -> None:
     assert settings.unseen == "keep"
     assert not (settings.revive)
     assert not (settings.early_stop)
-    assert not (settings.warm_start)
+    assert settings.warm_start is False
+    assert (settings.surround, settings.background) == ("background", (0, 0, 0))
     assert not (settings.prune_weight)
 
 

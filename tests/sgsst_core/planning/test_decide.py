@@ -133,6 +133,52 @@ def test_position_weights_are_for_views_with_an_empty_surround(share: float, wan
     assert (line(plan, "position weights") is not None) is weighted
 
 
+@pytest.mark.parametrize(
+    ("share", "values", "surround", "warm"),
+    [
+        (0.0, {}, "background", False),
+        (0.05, {}, "background", False),  # a room with holes
+        (0.5, {}, "palette", True),
+        (0.5, {"position_weights": "off"}, "background", False),
+        (0.5, {"preset": "paper"}, "background", False),
+        (0.5, {"surround": "background", "warm_start": False}, "background", False),
+        (0.5, {"surround": "random"}, "random", True),
+        (0.0, {"surround": "random", "warm_start": True}, "random", True),
+    ],
+)
+def test_what_is_behind_a_scan_and_what_its_colours_begin_with(
+    share: float, values: dict[str, Any], surround: str, warm: bool
+) -> None:
+    plan = plan_of(probe(uncovered_share=share), **values)
+    assert (plan.surround, plan.warm_start) == (surround, warm)
+    behind, start = line(plan, "surround"), line(plan, "start")
+    assert (behind is not None, start is not None) == (surround != "background", warm)
+    for found, setting in ((behind, "surround"), (start, "warm_start")):
+        if found:
+            assert ("asked for" in found.reason) is (setting in values)
+            assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values)
+
+
+def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end() -> None:
+    """Content features are computed with it at every visit, of images that are kept where they fit."""
+    drawn, fixed = (
+        plan_of(probe(uncovered_share=0.5), surround=kind, early_stop=True) for kind in ("random", "background")
+    )
+    assert drawn.prediction is not None
+    assert fixed.prediction is not None
+    pixels = HEIGHT * WIDTH * (1 + 1 / 4)
+    assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 1e-6, rel=0.01)
+    assert drawn.prediction.first_visit < fixed.prediction.first_visit
+    assert "0.6 s in every iteration" in said(drawn, "surround")
+    assert said(drawn, "early stop").startswith("none: every step is made: losses with different colours")
+    without = plan_of(probe(uncovered_share=0.5), surround="random", content_weight=0.0)
+    assert "every iteration" not in said(without, "surround")
+    anew = plan_of(probe(uncovered_share=0.5), surround="random", keep=("content",))
+    assert anew.prediction is not None
+    assert anew.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # a render of the content, too
+    assert drawn.prediction.first_visit - anew.prediction.first_visit == pytest.approx(0.15)
+
+
 def test_uncovered_pixels_do_not_go_through_the_network() -> None:
     scan = probe(uncovered_share=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
     plan, kept = plan_of(scan), plan_of(scan, keep=("uncovered",))
@@ -584,6 +630,8 @@ def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
         "similar views",
         "uncovered pixels",
         "position weights",
+        "surround",
+        "start",
         "network layers",
         "content",
         "partition",

@@ -22,7 +22,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def make(weights: BackboneWeights, scene: object = None, **values: Any) -> Stylizer:
-    given: dict[str, Any] = {"steps_coarse": 0, "steps_sos": 12, **values}
+    given: dict[str, Any] = {
+        "steps_coarse": 0,
+        "steps_sos": 12,
+        "surround": "background",
+        "warm_start": False,
+        **values,
+    }
     settings = make_settings(**given)
     return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
 

@@ -18,7 +18,7 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
-from sgsst_core.settings import make_settings
+from sgsst_core.settings import PlannedSurround, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
@@ -39,7 +39,13 @@ def counts() -> Iterator[Counts]:
 
 
 def make(
-    weights: BackboneWeights, *, graphs: bool, scan: bool = False, rasterizer: str = "triton", **values: Any
+    weights: BackboneWeights,
+    *,
+    graphs: bool,
+    scan: bool = False,
+    rasterizer: str = "triton",
+    surround: PlannedSurround = "background",
+    **values: Any,
 ) -> Stylizer:
     """Of two views in two scales, three steps in each phase unless told otherwise."""
     scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
@@ -52,6 +58,7 @@ def make(
         seen=some,
         covered=tuple(looked.covered),
         weighted=scan,
+        surround=surround,
         steps_coarse=settings.steps_coarse,
         memory_limit=10**9,
         device="cuda",
@@ -82,6 +89,29 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
     assert graphs.stylized().equal(plain.stylized())
     assert graphs.graphs is not None
     assert (graphs.graphs.captured, graphs.graphs.problem) == (2, None)
+
+
+def test_a_colour_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One graph serves every colour, and nothing is waited for or copied because of it."""
+    leave_out_kernels(monkeypatch)
+    options: dict[str, Any] = {"scan": True, "rasterizer": "triton", "steps_coarse": 0, "steps_sos": 8}
+    plain, graphs = (make(tiny_weights, graphs=graphs, surround="random", **options) for graphs in (False, True))
+    fixed = make(tiny_weights, graphs=True, **options)
+    found: dict[str, list[tuple[int, int]]] = {"drawn": [], "fixed": []}
+    for _ in range(plain.total):
+        expected = plain.run_step()
+        for name, stylizer in (("drawn", graphs), ("fixed", fixed)):
+            counts.clear()
+            record = stylizer.run_step()
+            found[name].append((counts.waits.total(), counts.copies.total()))
+            if name == "drawn":
+                assert (record.view, record.loss, record.terms) == (expected.view, expected.loss, expected.terms)
+    assert graphs.graphs is not None
+    assert (graphs.graphs.captured, graphs.graphs.problem) == (1, None)
+    assert found["drawn"][-1] == found["fixed"][-1]
+    assert found["drawn"][-1][0] == 1
 
 
 def test_several_views_a_step_and_a_resumed_run(

@@ -174,6 +174,17 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
     assert expected["losses"] != stylize(ALONE, scene, 5, {**values, "views_per_step": 1})["losses"]
 
 
+def test_ranks_draw_the_same_colours_behind_a_scan() -> None:
+    """One rank's, whatever the groups in which views are taken."""
+    values = {"steps_coarse": 2, "steps_sos": 3, "views_per_step": 2, "learning_rate": 0.01, "surround": "palette"}
+    expected = stylize(ALONE, ball(), 3, values)
+    for ranks in (2, 3):
+        for result in on_ranks(ranks, stylize, ball(), 3, values):
+            assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
+            assert relative_error(result["colours"], expected["colours"]) < 1e-3
+    assert expected["losses"] != stylize(ALONE, ball(), 3, {**values, "surround": "random"})["losses"]
+
+
 def one_view_a_step_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)

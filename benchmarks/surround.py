@@ -1,0 +1,138 @@
+"""What lies behind an object scan, and what its colours begin with: a table of ways, judged by another network.
+
+python -m benchmarks.surround SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
+
+A way is a surround (background, random, palette), with "+warm" from the style's mean and spread. All of them have the
+same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`) on views between
+those. Rows are added to the file benchmarks/results/surround.json, under NAME; the figures of more seeds are means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.machine import RESULTS, write_result
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.quality.judge import Judge
+from sgsst_core.quality.lpips import Lpips
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.contact_sheet import write_rows
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
+from sgsst_core.stylizing.evaluation import mean_loss
+
+WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
+#: Views that are judged, and those of each way on the sheet.
+JUDGED, SHOWN = 6, 3
+COLUMNS = ("style", "palette", "swing", "content", "saturated", "loss", "seconds")
+
+
+def main() -> None:
+    """Run, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("style", type=Path)
+    parser.add_argument("name", help="of the pair, in the results")
+    parser.add_argument("--ways", default=",".join(WAYS))
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--views", type=int, default=12)
+    parser.add_argument("--width", type=int, default=256)
+    parser.add_argument("--height", type=int, default=384)
+    parser.add_argument("--steps", type=int, default=80)
+    parser.add_argument("--up", default="0,-1,0")
+    parser.add_argument("--settings", default="{}", help="JSON, on top of the standard preset's")
+    parser.add_argument("--out", type=Path, help="folder for a sheet of pictures and the colours")
+    arguments = parser.parse_args()
+    scene, style = read_scene(arguments.scene).scene, load_image(arguments.style)
+    up = [float(part) for part in arguments.up.split(",")]
+    ring = orbit(scene, 2 * arguments.views, width=arguments.width, height=arguments.height, up=up)
+    judge = _judge(scene, style, ring[1::2])
+    ways = {"unstylized": _row(judge, scene.sh_dc)}
+    colours = {"unstylized": scene.sh_dc}
+    print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
+    _print("unstylized", ways["unstylized"])
+    base = {"precision": "bfloat16", "steps_coarse": 0, "steps_sos": arguments.steps, "early_stop": False}
+    for way in arguments.ways.split(","):
+        found = []
+        for seed in arguments.seeds.split(","):
+            settings = base | _settings(way) | {"seed": int(seed)} | json.loads(arguments.settings)
+            colours[way], row = _run(judge, scene, ring[::2], style, settings)
+            found.append(row)
+        ways[way] = {name: sum(row[name] for row in found) / len(found) for name in found[0]} | {"seeds": len(found)}
+        _print(way, ways[way])
+        _store(arguments, ways)
+    if arguments.out:
+        _keep(arguments.out, arguments.name, judge, style, colours)
+
+
+def _settings(way: str) -> dict[str, Any]:
+    surround, _, start = way.partition("+")
+    return {"surround": surround, "warm_start": start == "warm"}
+
+
+def _judge(scene: Scene, style: torch.Tensor, between: list[Camera]) -> Judge:
+    """Of some views between those of the job, evenly spread."""
+    step = max(1, len(between) // JUDGED)
+    return Judge(Lpips(), style, scene, make_rasterizer("cpu", scene), between[::step][:JUDGED])
+
+
+def _row(judge: Judge, sh_dc: torch.Tensor) -> dict[str, float]:
+    judgement = judge.judge(sh_dc)
+    assert judgement is not None, "no view can be judged: give larger ones"
+    return asdict(judgement)
+
+
+def _run(
+    judge: Judge, scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
+) -> tuple[torch.Tensor, dict[str, float]]:
+    """Colours [N, 3], and what is said of them: loss on the background, relative to the start; processor seconds."""
+    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
+    start = mean_loss(stylizer.start())
+    before = time.process_time()
+    while stylizer.step < stylizer.total:
+        stylizer.run_step()
+    seconds = time.process_time() - before
+    sh_dc = stylizer.stylized()
+    loss = mean_loss(stylizer.evaluate(stylizer.evaluation_views)) / start
+    return sh_dc, {**_row(judge, sh_dc), "loss": loss, "seconds": seconds}
+
+
+def _print(way: str, row: dict[str, float]) -> None:
+    print(f"{way:28}", *(f"{row[name]:9.3f}" if name in row else " " * 9 for name in COLUMNS), flush=True)
+
+
+def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> None:
+    """Add the rows of a pair to those that are there."""
+    path = RESULTS / "surround.json"
+    pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
+    told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
+    told |= {"size": [arguments.width, arguments.height], "steps": arguments.steps}
+    earlier = pairs.get(arguments.name, {}).get("ways", {})
+    pairs[arguments.name] = {**told, "ways": {**earlier, **ways}}
+    write_result("surround", {"pairs": pairs})
+
+
+def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colours: dict[str, torch.Tensor]) -> None:
+    """A sheet with a row for each way: views on black, and the first one on white. And the colours."""
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = judge.cameras[:SHOWN]
+    rows = []
+    for way, sh_dc in colours.items():
+        pictures = [judge.pictures(sh_dc, camera) for camera in cameras]
+        rows.append((way, [*(pair[0] for pair in pictures), pictures[0][1]]))
+    write_rows(folder / f"{name}.jpg", style, rows)
+    torch.save(colours, folder / f"{name}.pt")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""What lies behind an object in a step: the same colour for the same seed, step and view, and nothing else changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import torch
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import downscale
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.surround import Colour, drawn_colour, put_behind
+from tests.sgsst_core.pictures import picture, relative_error
+from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+COLOUR: Colour = (0.2, 0.9, 0.4)
+
+
+def make(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) -> Stylizer:
+    settings = make_settings(**{"steps_coarse": 3, "steps_sos": 5, "coarsest_side": 24, **values})
+    return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
+
+
+# --- which colour --------------------------------------------------------------------------------------------------
+
+
+def test_a_colour_follows_from_seed_step_and_view_alone() -> None:
+    """One of them is written down: it must be the same on every machine and with every version."""
+    picture_ = style()
+    assert drawn_colour("random", 5, 7, 11, picture_) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
+    colours = {
+        numbers: drawn_colour("random", *numbers, picture_)
+        for numbers in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (2**63 - 1, 10**6, 300), (0, 11, 1), (0, 1, 11))
+    }
+    assert len(set(colours.values())) == len(colours)
+    assert all(drawn_colour("random", *numbers, picture_) == colour for numbers, colour in colours.items())
+    assert drawn_colour("background", 0, 0, 0, picture_) is None
+
+
+def test_random_colours_are_uniform() -> None:
+    drawn = torch.tensor([drawn_colour("random", 7, step, 2, style()) for step in range(4000)])
+    assert 0 <= float(drawn.min()) < 0.01
+    assert 0.99 < float(drawn.max()) < 1
+    # Standard errors are 0.0046 of the means and about 0.0013 of the covariances.
+    torch.testing.assert_close(drawn.mean(0), torch.full((3,), 0.5), rtol=0, atol=0.02)
+    torch.testing.assert_close(torch.cov(drawn.T), torch.eye(3) / 12, rtol=0, atol=0.006)
+
+
+def test_colours_of_the_palette_are_those_of_the_styles_pixels() -> None:
+    picture_ = torch.tensor([[[0.1, 0.2, 0.3], [0.9, 0.5, 0.0], [0.9, 0.5, 0.0]], [[1.0, 1.0, 1.0]] * 3])
+    drawn = [drawn_colour("palette", 0, step, 0, picture_) for step in range(3000)]
+    shares = {colour: drawn.count(colour) / len(drawn) for colour in set(drawn)}
+    expected = {tuple(pixel.tolist()): 1 / 6 for pixel in picture_.reshape(-1, 3)}
+    expected |= {tuple(picture_[0, 1].tolist()): 2 / 6, (1.0, 1.0, 1.0): 3 / 6}
+    assert shares == pytest.approx(expected, abs=0.03)
+
+
+# --- what becomes of the picture -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0, 2])
+def test_another_colour_behind_is_what_is_rendered_with_it(scale: int) -> None:
+    scene, camera, present = ball(), cameras(1)[0], (0.7, 0.0, 0.3)
+    colours = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    over, expected = (
+        ReferenceRasterizer(scene, background=colour).render(colours, camera) for colour in (present, COLOUR)
+    )
+    coverage = ReferenceRasterizer(scene).coverage(camera)
+    found = put_behind(downscale(over, scale), downscale(coverage, scale), COLOUR, present)
+    torch.testing.assert_close(found, downscale(expected, scale), rtol=0, atol=1e-12)
+    assert put_behind(over.float(), coverage.float(), COLOUR, present).dtype == torch.float32
+
+
+def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Colour | None) -> tuple[Any, Any]:
+    target, targets = stylizer.views.target(index, scales, behind), stylizer.style_targets(stylizer.views.cameras[0])
+    return stylizer._gradient(index, targets, target, scales, behind)
+
+
+@pytest.mark.parametrize("scales", [[0, 1], [1]])
+@pytest.mark.parametrize("kept", ["kept", "anew"])
+def test_a_steps_gradient_is_that_of_a_job_with_this_background(
+    tiny_weights: BackboneWeights, scales: list[int], kept: Literal["kept", "anew"]
+) -> None:
+    """Content included, whether or not images of it are kept."""
+    keep = () if kept == "kept" else ("content",)
+    drawn = make(tiny_weights, ball(), surround="random", background=(0.1, 0.1, 0.5), keep=keep)
+    fixed = make(tiny_weights, ball(), surround="background", background=COLOUR)
+    with torch.no_grad():
+        drawn.sh_dc += 0.3
+        fixed.sh_dc.copy_(drawn.sh_dc)
+    for _ in range(2):
+        found, loss = drawn_gradient(drawn, 1, scales, COLOUR)
+        expected, exact = drawn_gradient(fixed, 1, scales, None)
+        assert loss.loss == pytest.approx(exact.loss, rel=1e-5)
+        assert loss.terms[scales[-1]]["content"] == pytest.approx(exact.terms[scales[-1]]["content"], rel=1e-3)
+        assert exact.terms[scales[-1]]["content"] > 0
+        assert relative_error(found, expected) < 1e-4
+
+
+def test_photos_have_the_colour_where_no_gaussian_is(tiny_weights: BackboneWeights) -> None:
+    photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
+    settings = make_settings(surround="random", steps_sos=2)
+    stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
+    coverage = stylizer.views.coverage(0)[0][..., None]
+    content = coverage * photo + (1 - coverage) * torch.tensor(COLOUR)
+    expected = stylizer.loss.view_target(content, coverage[..., 0]).content[0]
+    found = stylizer.views.target(0, [0], COLOUR).content[0]
+    for tile, features in expected.items():
+        torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)
+
+
+def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
+    """Loss before and after, on the colour of the settings, whatever was behind in steps."""
+    values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
+    drawn, fixed = (make(tiny_weights, ball(), surround=kind, **values) for kind in ("palette", "background"))
+    assert drawn.start() == fixed.start()
+    run(drawn)
+    assert mean_loss(drawn.evaluate([0, 1])) == mean_loss(fixed.evaluate([0, 1], drawn.sh_dc.detach()))
+
+
+# --- whole runs ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["random", "palette"])
+def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_path: Path, kind: str) -> None:
+    whole, again, resumed, other = (make(tiny_weights, ball(), surround=kind, seed=seed) for seed in (3, 3, 3, 4))
+    for stylizer in (whole, again, other):
+        assert run(stylizer) == "finished"
+    assert torch.equal(whole.sh_dc, again.sh_dc)
+    assert not torch.equal(whole.sh_dc, other.sh_dc)
+    stopped = make(tiny_weights, ball(), surround=kind, seed=3)
+    for _ in range(4):
+        stopped.run_step()
+    save_checkpoint(tmp_path / "c", Checkpoint(stopped.state(), stopped.plan, 1, "run", versions()), "job")
+    loaded = load_checkpoint(tmp_path / "c", "job")
+    assert (loaded.plan.surround, loaded.plan.warm_start) == (kind, True)
+    resumed.load_state(loaded.state)
+    run(resumed)
+    assert torch.equal(whole.sh_dc, resumed.sh_dc)
+    losses = [[record.loss for record in stylizer.history] for stylizer in (whole, resumed)]
+    assert losses[0] == losses[1]
+
+
+def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: BackboneWeights) -> None:
+    """To the last bit as with a fixed background and a cold start."""
+    plain = make(tiny_weights, wall(), surround="background", warm_start=False)
+    automatic = make(tiny_weights, wall())
+    for stylizer in (plain, automatic):
+        run(stylizer)
+    assert torch.equal(plain.sh_dc, automatic.sh_dc)
+    told = [[line.item for line in stylizer.plan.decisions] for stylizer in (plain, automatic)]
+    assert told[0] == told[1]
+    assert not {"surround", "start"} & set(told[0])
+
+
+def test_the_paper_is_the_papers_for_scans_too(tiny_weights: BackboneWeights) -> None:
+    settings = make_settings("paper", steps_coarse=1, steps_sos=1)
+    stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
+    assert (stylizer.plan.surround, stylizer.plan.warm_start) == ("background", False)
+    assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.plan.seen])
+
+
+def test_losses_with_different_colours_behind_do_not_end_a_run_early(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A target is compared with the loss on the background, once in a round."""
+    drawn, fixed = (
+        make(tiny_weights, ball(), surround=kind, early_stop=True, learning_rate=1e-9, steps_sos=60, steps_coarse=0)
+        for kind in ("palette", "background")
+    )
+    assert run(fixed) == "converged"
+    assert run(drawn) == "finished"
+    target = make(tiny_weights, ball(), surround="random", target_loss=0.9, warm_start=False, steps_sos=90)
+    assert run(target) == "target-loss"
+    assert mean_loss(target.evaluate(target.evaluation_views)) <= 0.9 * mean_loss(target.start())
+    assert target.step % target.round_length == 0
+    assert target.seconds_by_part["measuring"] > 0
