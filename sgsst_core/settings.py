@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
@@ -24,6 +24,9 @@ Surround = Literal["auto", "background", "random", "palette"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
+#: Content weights by how strong the style is then, chosen on the front of style against content (docs/quality.md).
+Strength = Literal["light", "balanced", "strong"]
+STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 3e3, "strong": 1.0}
 #: How the default of a setting that presets decide begins, in words.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
@@ -45,6 +48,11 @@ Resolution = Annotated[
     Option(unit="pixels", name="resolution", default="the cameras' own"),
     Field(ge=1, le=MAX_RESOLUTION, description="Pixels of every view's longer side."),
 ]
+
+
+def _weight_of(value: object) -> object:
+    """The number behind a word for `Settings.content_weight`; any other value is itself."""
+    return STRENGTHS.get(value, value) if isinstance(value, str) else value
 
 
 class Settings(BaseModel):
@@ -70,8 +78,17 @@ class Settings(BaseModel):
     learning_rate_end: Annotated[float, Option(unit="as learning_rate", instead="learning_rate")] = Field(
         gt=0, le=100, allow_inf_nan=False, description="Adam's learning rate at the end, reached exponentially."
     )
-    content_weight: Annotated[float, Option(unit="factor", metavar="W")] = Field(
-        1.0, ge=0, le=_MAX_WEIGHT, allow_inf_nan=False, description="Weight of the content term; 0 leaves it out."
+    content_weight: Annotated[
+        float,
+        BeforeValidator(_weight_of, json_schema_input_type=float | Strength),
+        Option(unit="factor or strength", metavar="W"),
+    ] = Field(
+        1.0,
+        ge=0,
+        le=_MAX_WEIGHT,
+        allow_inf_nan=False,
+        description="Weight of the content term, or how strong the style is: light, balanced or strong; 0 leaves the "
+        "term out.",
     )
     feature_scale: FeatureScale = Field(
         "even",

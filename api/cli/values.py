@@ -9,7 +9,10 @@ from dataclasses import dataclass
 
 import typer
 
+from sgsst_core.settings import STRENGTHS
+
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
+_STRENGTHS = "(" + ", ".join(f"{word} {weight:g}" for word, weight in STRENGTHS.items()) + ")."
 _COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -49,8 +52,20 @@ def parse_bytes(text: str) -> int:
     return size
 
 
+def parse_strength(text: str) -> float:
+    """A content weight from "light", "balanced", "strong" or a number."""
+    if text.lower() in STRENGTHS:
+        return STRENGTHS[text.lower()]
+    try:
+        return float(text)
+    except ValueError:
+        words = ", ".join(STRENGTHS)
+        raise typer.BadParameter(f"{text!r} is neither a number nor one of {words}.") from None
+
+
 #: Units whose values are written in another way than in JSON.
 FORMS = {
     "RGB, 0 to 1": Form(parse_colour, "COLOUR", ": black, white, or R,G,B from 0 to 255."),
+    "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),
     "bytes": Form(parse_bytes, "SIZE", ", such as 8GB."),
 }

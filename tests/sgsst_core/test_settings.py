@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.settings import make_settings
+from sgsst_core.settings import Settings, make_settings
 
 
 def test_paper_is_the_published_schedule() -> None:
@@ -45,6 +45,7 @@ def test_learning_rate_is_exponential_in_the_share_of_steps() -> None:
         ({"learning_rate": 0}, "learning_rate"),
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"content_weight": -1}, "content_weight"),
+        ({"content_weight": "weak"}, "content_weight"),
         ({"precision": "float16"}, "precision"),
         ({"max_seconds": 0}, "max_seconds"),
         ({"unheard_of": 1}, "unheard_of"),
@@ -53,6 +54,16 @@ def test_learning_rate_is_exponential_in_the_share_of_steps() -> None:
 def test_values_out_of_range_are_refused_by_name(values: dict[str, object], name: str) -> None:
     with pytest.raises(SettingsError, match=name):
         make_settings(**values)  # type: ignore[arg-type]
+
+
+def test_words_for_a_strength_are_weights() -> None:
+    weights = [
+        make_settings("standard", content_weight=word).content_weight for word in ("strong", "balanced", "light")
+    ]
+    assert weights == sorted(weights)
+    assert weights[0] == make_settings("standard").content_weight
+    schema = Settings.model_json_schema()["properties"]["content_weight"]
+    assert {"number", "string"} == {kind["type"] for kind in schema["anyOf"]}
 
 
 def test_an_unknown_preset_is_refused_with_the_known_ones() -> None:

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from api.cli.main import app, main
 from api.cli.options import flags, help_text, kind_of
 from api.cli.options_table import reference
+from api.cli.values import parse_strength
 from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import Declared, declared
@@ -151,3 +152,13 @@ def test_options_become_settings() -> None:
     assert StylizeOptions(resolution=80).settings().max_resolution == 80
     again = JobParameters.model_validate(json.loads(JobParameters().model_dump_json()))
     assert again.settings() == make_settings(), "null leaves a setting to the preset"
+
+
+@pytest.mark.parametrize(("text", "weight"), [("light", 3e4), ("Balanced", 3e3), ("strong", 1.0), ("2.5", 2.5)])
+def test_a_content_weight_is_a_number_or_a_strength(text: str, weight: float) -> None:
+    assert parse_strength(text) == weight
+
+
+def test_another_word_than_a_strength_is_refused() -> None:
+    with pytest.raises(typer.BadParameter, match="light, balanced, strong"):
+        parse_strength("weak")
