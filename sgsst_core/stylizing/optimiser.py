@@ -19,10 +19,13 @@ class ColourOptimiser:
     Args:
         colours: [n, 3] float32, changed in place.
         learning_rate: until `update` names another one.
+        unit: of the features that gradients come from (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
+            gradients grow with its square, and would sooner be too large to be squared.
     """
 
-    def __init__(self, colours: Tensor, learning_rate: float) -> None:
+    def __init__(self, colours: Tensor, learning_rate: float, unit: float = 1.0) -> None:
         self._colours = colours.requires_grad_()
+        self._unit = unit
         self._fused = colours.is_cuda
         self._adam = torch.optim.Adam([colours], lr=learning_rate, eps=ADAM_EPS, fused=self._fused)
 
@@ -30,9 +33,11 @@ class ColourOptimiser:
         """One step, but for a gradient [n, 3] that is beyond `LARGEST_GRADIENT` or not finite: then nothing changes.
 
         Returns:
-            The largest magnitude in the gradient, a scalar on the colours' device. The caller looks whether it was too
-            large, when it next waits for the device anyway.
+            The largest magnitude in the gradient, in units of a 0-255 input: a scalar on the colours' device. The
+            caller looks whether it was too large, when it next waits for the device anyway.
         """
+        if self._unit != 1:
+            gradient = gradient / self._unit**2
         largest = gradient.abs().amax()
         for group in self._adam.param_groups:
             group["lr"] = learning_rate

@@ -125,7 +125,7 @@ class Stylizer:
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         start = self.transferred() if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
-        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate)
+        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.schedule = planned_phases(plan, settings)

@@ -185,7 +185,8 @@ def _diverged(full: bool) -> CaseResult:
 
 def _many_steps(full: bool) -> CaseResult:
     """At a constant rate; the loss keeps to its lowest level, within what a constant rate leaves it to wander."""
-    stylizer = _stylizer(_walls((2.0, 5), (1.0, 5)), 100_000 if full else 500, learning_rate=2.5e-3)
+    steps = 100_000 if full else 500
+    stylizer = _stylizer(_walls((2.0, 5), (1.0, 5)), steps, learning_rate=2.5e-3, early_stop=False)
     run(stylizer)
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
         return CaseResult(math.inf, 0.0, "colours are not finite")

@@ -231,7 +231,7 @@ def value_of(option: Declared) -> object:
     if get_origin(kind) is Literal:
         return get_args(kind)[-1]
     bounds: list[Any] = [
-        item.ge if isinstance(item, Ge) else item.gt for item in option.info.metadata if isinstance(item, Ge | Gt)
+        item.ge if isinstance(item, Ge) else item.gt for item in option.limits if isinstance(item, Ge | Gt)
     ]
     return kind(bounds[0] + (1 if kind is int else 0.5))
 

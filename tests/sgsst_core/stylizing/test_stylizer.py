@@ -272,7 +272,7 @@ def test_previews_and_checkpoints_come_as_often_as_asked(tiny_weights: BackboneW
     run(stylizer, callbacks)
     assert saved == [1, 2, 3]
     assert stylizer.seconds_by_part["checkpoint"] > 0
-    assert shown == []
+    assert shown == [0], "before the first step alone"
 
 
 @pytest.mark.parametrize(("preset", "phase_1"), [("standard", 0), ("paper", 5)])
