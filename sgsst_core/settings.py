@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
@@ -25,7 +27,6 @@ Surround = Literal["auto", "background", "random", "palette"]
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
 #: Content weights by how strong the style is then, chosen on the front of style against content (docs/quality.md).
-Strength = Literal["light", "balanced", "strong"]
 STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 3e3, "strong": 1.0}
 #: How the default of a setting that presets decide begins, in words.
 BY_PRESET = "by preset"
@@ -50,9 +51,20 @@ Resolution = Annotated[
 ]
 
 
-def _weight_of(value: object) -> object:
-    """The number behind a word for `Settings.content_weight`; any other value is itself."""
-    return STRENGTHS.get(value, value) if isinstance(value, str) else value
+class _StrengthWords:
+    """Lets a number be given by a word of `STRENGTHS`, in JSON schemas too."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self._number, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        numbers = handler(schema)
+        kinds = numbers.get("anyOf", [numbers])
+        return {"anyOf": [*kinds, {"type": "string", "enum": list(STRENGTHS)}]}
+
+    @staticmethod
+    def _number(value: object) -> object:
+        return STRENGTHS.get(value, value) if isinstance(value, str) else value
 
 
 class Settings(BaseModel):
@@ -80,7 +92,7 @@ class Settings(BaseModel):
     )
     content_weight: Annotated[
         float,
-        BeforeValidator(_weight_of, json_schema_input_type=float | Strength),
+        _StrengthWords(),
         Option(unit="factor or strength", metavar="W"),
     ] = Field(
         1.0,
