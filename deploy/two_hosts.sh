@@ -94,7 +94,7 @@ echo "Two hosts: $NET.2 and $NET.3"
 before=$(cat /sys/class/net/sgsst-b/statistics/rx_bytes)
 scene=$WORK/scene
 on_host a env RAY_ADDRESS="$NET.2:$PORT" sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" \
-  --style "$scene/style.png" --out "$OUT" --resolution 160 --views 3 --steps-coarse 0 --steps-sos 20 --backbone vgg16 \
+  --style "$scene/starry_night.jpg" --out "$OUT" --resolution 160 --views 3 --steps-coarse 0 --steps-sos 20 --backbone vgg16 \
   --keep-everything --workers 2
 after=$(cat /sys/class/net/sgsst-b/statistics/rx_bytes)
 
