@@ -17,6 +17,12 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import BackboneWeights, fetch_network_weights, load_network_weights
 from tests import networks
 
+
+def pytest_make_parametrize_id(val: object) -> str | None:
+    """Bytes are named by their number: what is in them may hold the time (gzip) and differ between processes."""
+    return f"{len(val)}-bytes" if isinstance(val, bytes) else None
+
+
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
