@@ -25,6 +25,7 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import fingerprint
+from sgsst_core.stylizing.style_picture import check_style_size
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 
@@ -72,6 +73,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)
+    together(collectives, lambda: check_style_size(style, cameras, settings.style_scale))
     photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
     stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
     own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps) if reader else None

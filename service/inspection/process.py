@@ -39,9 +39,10 @@ from sgsst_core.quality.packed import measure_packed
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.stylizing.style_picture import check_style_size
 from worker.inputs import check_something_in_view, read_cameras_of
 from worker.processes import die_with_parent
-from worker.request import check_steps
+from worker.request import check_choice, check_steps
 
 #: Bytes of an answer.
 MAX_ANSWER = 64 << 20
@@ -94,6 +95,7 @@ def _read_inputs(
         image = load_image(staged.style)
         found["style"] = [image.shape[1], image.shape[0]]
     with _ErrorsOf("cameras"):
+        check_choice(source)
         if source.cameras is not None:
             _check_frames_have_sizes(source.cameras)
         unfitted, orbit = read_cameras_of(source, file.scene)
@@ -105,6 +107,8 @@ def _read_inputs(
             raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
+    with _ErrorsOf("style"):
+        check_style_size(image, cameras, settings.style_scale)
     with _ErrorsOf("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
         for path in paths:

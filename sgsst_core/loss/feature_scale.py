@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
 from sgsst_core.features.network_sources import CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale
 
@@ -93,23 +93,12 @@ def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> Backbo
 
 
 def _features(weights: BackboneWeights, picture: Tensor) -> dict[str, Tensor]:
-    """Features [c, h * w] of the published layers, of a picture [H, W, 3]; plain, in float32."""
-    found = {}
-    values = (picture * weights.input_scale + weights.input_shift).permute(2, 0, 1).unsqueeze(0)
-    block = "1"
-    for layer, (weight, bias) in weights.convolutions.items():
-        if layer[4] != block:
-            values, block = F.max_pool2d(values, 2), layer[4]
-        values = F.relu(F.conv2d(values, weight, bias, padding=1))
-        name = layer.replace("conv", "relu")
-        if name in PUBLISHED:
-            found[name] = values[0].flatten(1)
-        if len(found) == len(PUBLISHED):
-            break
-    return found
+    """Features [h, w, c] of the published layers, of a picture [H, W, 3]."""
+    network = FeatureNetwork(weights, tuple(PUBLISHED), torch.float32)
+    return network.forward(picture, keep=False).features
 
 
 def _gram(features: Tensor) -> Tensor:
-    """Gram matrix / (c h w) of features [c, h * w], float64."""
-    values = features.double()
-    return values @ values.T / values.numel()
+    """Gram matrix / (h w c) of features [h, w, c], float64."""
+    values = features.flatten(0, 1).double()
+    return values.T @ values / values.numel()

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from scipy import ndimage
 from torch import Tensor
 
-from sgsst_core.settings import Settings
+from sgsst_core.errors import SettingsError
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.pyramid import style_size
+from sgsst_core.settings import MAX_RESOLUTION, Settings
 from sgsst_core.stylizing.warm_start import in_colours_of
 
 
@@ -26,6 +30,27 @@ def prepared_style(style: Tensor, settings: Settings, sh_dc: Tensor, weights: Te
         # 2017, section 5.2.
         style = in_colours_of(style, sh_dc, weights)
     return style
+
+
+def check_style_size(style: Tensor, cameras: Sequence[Camera], scale: float) -> None:
+    """Prove that no view asks for a style image [H, W, 3] of more than `MAX_RESOLUTION` pixels on its longer side.
+
+    Args:
+        cameras: at the sizes that they are stylized at.
+        scale: of its strokes.
+
+    Raises:
+        SettingsError: otherwise.
+    """
+    if scale <= 1:
+        return
+    for size in {(camera.height, camera.width) for camera in cameras}:
+        height, width = style_size((style.shape[0], style.shape[1]), size, scale)
+        if max(height, width) > MAX_RESOLUTION:
+            raise SettingsError(
+                f"--style-scale {scale:g} would make the style image {width:,} x {height:,} pixels for views of "
+                f"{size[1]} x {size[0]}; {MAX_RESOLUTION:,} may be the longer side. Give a smaller scale."
+            )
 
 
 def turned(style: Tensor, degrees: float) -> Tensor:

@@ -546,6 +546,11 @@ def _style_is_a_bomb(files: Files) -> list[str]:
     return []
 
 
+def _strokes_too_large(files: Files) -> list[str]:
+    Image.new("RGB", (5000, 1)).save(files.style)
+    return ["--style-scale", "4"]
+
+
 def _out_is_a_folder(files: Files) -> list[str]:
     files.out = files.ply.parent
     return []
@@ -601,6 +606,7 @@ def _damaged_checkpoint(files: Files) -> list[str]:
         (_style_is_no_image, ["style.png", "not an image"]),
         (_style_is_missing, ["style.png", "No such file"]),
         (_style_is_a_bomb, ["style.png", "megapixels"]),
+        (_strokes_too_large, ["--style-scale 4", "16,384", "smaller scale"]),
         (_out_is_a_folder, ["is a folder"]),
         (_out_lies_in_a_file, ["cameras.json"]),
         (_out_is_the_scene, ["is the scene itself"]),

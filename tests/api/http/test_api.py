@@ -163,6 +163,8 @@ PARAMETERS = [
     ('{"near": NaN}', "invalid-request"),
     ('{"background": [0, 0]}', "invalid-request"),
     ('{"orbit": 3}', "invalid-cameras"),
+    ('{"elevation": 30}', "invalid-cameras"),
+    ('{"radius": 2}', "invalid-cameras"),
     ("[]", "invalid-request"),
     ("{", "invalid-request"),
     ("[" * 60_000, "invalid-request"),
@@ -173,6 +175,13 @@ PARAMETERS = [
 @pytest.mark.parametrize(("text", "code"), PARAMETERS, ids=[text[:30] for text, _ in PARAMETERS])
 def test_parameters_that_make_no_sense(client: httpx.Client, files: dict[str, bytes], text: str, code: str) -> None:
     refused(client.post("/v1/jobs", files=form(files), data={"parameters": text}), 422, code)
+
+
+def test_strokes_larger_than_any_picture_may_be(client: httpx.Client, files: dict[str, bytes]) -> None:
+    line = form(files, style=png(5000, 1, zlib.compress(bytes(1 + 3 * 5000))))
+    for where in ("/v1/jobs", "/v1/jobs?dry_run=true"):
+        answer = client.post(where, files=line, data={"parameters": '{"style_scale": 4}'})
+        assert refused(answer, 422, "invalid-settings")["input"] == "style"
 
 
 def test_missing_and_surplus_files(client: httpx.Client, files: dict[str, bytes]) -> None:

@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from sgsst_core.constants import SH_C0
+from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.scene.pyramid import style_size
-from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.style_picture import _inside, prepared_style, turned
+from sgsst_core.settings import MAX_RESOLUTION, make_settings
+from sgsst_core.stylizing.style_picture import _inside, check_style_size, prepared_style, turned
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, wall
 
@@ -117,6 +118,16 @@ def test_strokes_as_they_are_leave_a_small_style_alone() -> None:
     assert style_size((50, 70), (64, 96)) == (50, 70)
     assert style_size((50, 70), (64, 96), 2) == (100, 140)
     assert style_size((1, 1), (64, 96), 0.25) == (1, 1)
+
+
+def test_a_style_may_be_as_large_as_a_view_may_be() -> None:
+    (view,) = cameras()[:1]
+    line = torch.zeros(1, 100, 3)
+    most = MAX_RESOLUTION / 100
+    check_style_size(line, [view], most)
+    check_style_size(torch.zeros(1, MAX_RESOLUTION + 1, 3), [view], 1)  # is never made larger
+    with pytest.raises(SettingsError, match=rf"for views of {view.width} x {view.height}; 16,384 may be"):
+        check_style_size(line, [view], most + 0.1)
 
 
 def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
