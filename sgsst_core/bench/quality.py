@@ -145,7 +145,7 @@ def compare_quality(
     if lpips is None:
         raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
-    held_out = _held_out(stylizer)
+    held_out = held_out_views(stylizer)
     views = [held_out.cameras[index] for index in held_out.views]
     judge = Judge(lpips, style, scene, held_out.rasterizer, views, stylizer.settings.background)
     if not judge.cameras:
@@ -180,7 +180,7 @@ def _left_out(curves: Sequence[Curve]) -> dict[str, str]:
     return {curve.variant.name: curve.left_out for curve in curves if curve.left_out}
 
 
-def _held_out(stylizer: Stylizer) -> HeldOut:
+def held_out_views(stylizer: Stylizer) -> HeldOut:
     """Views between a job's cameras, of its whole scene."""
     exact = ExactLoss(stylizer, "sos")
     return HeldOut(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -58,18 +59,18 @@ def is_original(weights: BackboneWeights) -> bool:
     return bool((weights.input_scale == 255).all())
 
 
-def paper_scales(weights: BackboneWeights) -> dict[str, float]:
-    """Factors of layers that give The Starry Night the published statistics, to two digits: rounding does not show.
+def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict[str, float]:
+    """Factors of layers that give a picture, The Starry Night unless told otherwise, the published statistics.
 
-    The painting of the published run is another one; two others give factors within 25 % of this one's
-    (docs/quality.md).
+    To two digits: rounding does not show. The painting of the published run is another one; two others give factors
+    within 25 % of this one's (docs/quality.md).
     """
-    with Image.open(STARRY_NIGHT) as painting:
+    with Image.open(picture) as painting:
         size = [round(side * _SIDE / max(painting.size)) for side in painting.size]
         small = painting.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
-    picture = torch.from_numpy(np.array(small, dtype=np.float32)) / 255
-    nothing = (torch.tensor(CAFFE_MEAN) / 255).expand(picture.shape)
-    found, of_nothing = _features(weights, picture), _features(weights, nothing)
+    pixels = torch.from_numpy(np.array(small, dtype=np.float32)) / 255
+    nothing = (torch.tensor(CAFFE_MEAN) / 255).expand(pixels.shape)
+    found, of_nothing = _features(weights, pixels), _features(weights, nothing)
     scales = {}
     for layer, published in PUBLISHED.items():
         if layer == _CONTENT:

@@ -1,0 +1,148 @@
+"""Settings compared after the same steps, judged by a network that no run optimises, on views between the cameras.
+
+python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content_weight": 3000}' 'ROW=...'
+
+Every row has settings on top of the standard preset's, in JSON; `factor` scales all features of VGG16 by a number, 1
+leaves them as the network comes. Rows are added to benchmarks/results/equal_steps.json, under NAME; with more seeds
+they are means, and "spread" is the largest difference between two seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.cameras import read_views
+from benchmarks.machine import RESULTS, write_result
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.bench.quality import held_out_views
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.files.images import load_image
+from sgsst_core.files.ply import read_scene
+from sgsst_core.loss.feature_scale import with_scales
+from sgsst_core.quality.judge import Judge
+from sgsst_core.quality.lpips import Lpips
+from sgsst_core.report.contact_sheet import write_rows
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+
+#: Views on the sheet.
+SHOWN = 3
+COLUMNS = ("style", "palette", "content", "features", "swing", "saturated", "seconds")
+
+
+def main() -> None:
+    """Run, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("cameras", help="camera file, or orbit:N")
+    parser.add_argument("style", type=Path)
+    parser.add_argument("name", help="of the pair, in the results")
+    parser.add_argument("rows", nargs="+", help="NAME=JSON")
+    parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--resolution", type=int, default=320)
+    parser.add_argument("--steps-coarse", type=int, default=30)
+    parser.add_argument("--steps-sos", type=int, default=60)
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--settings", default="{}", help="JSON, of all rows")
+    parser.add_argument("--out", type=Path, help="folder for a sheet of pictures")
+    arguments = parser.parse_args()
+    scene, style = read_scene(arguments.scene).scene, load_image(arguments.style)
+    cameras = read_views(arguments.cameras, scene, arguments.views, arguments.resolution)
+    base = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "early_stop": False}
+    base |= json.loads(arguments.settings)
+    judge = _judge(scene, cameras, style, base)
+    rows = {"unstylized": asdict(_judged(judge, scene.sh_dc))}
+    colours = {"unstylized": scene.sh_dc}
+    print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
+    _print("unstylized", rows["unstylized"])
+    for row in arguments.rows:
+        name, _, text = row.partition("=")
+        found = []
+        for seed in arguments.seeds.split(","):
+            values = base | json.loads(text or "{}") | {"seed": int(seed)}
+            colours[name], seconds = _run(scene, cameras, style, values)
+            found.append({**asdict(_judged(judge, colours[name])), "seconds": seconds})
+        rows[name] = _mean(found)
+        _print(name, rows[name])
+        _store(arguments, rows)
+    if arguments.out:
+        _write_sheet(arguments.out, arguments.name, judge, style, colours)
+
+
+def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
+    """Of all views between those of a job."""
+    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
+    held_out = held_out_views(stylizer)
+    views = [held_out.cameras[index] for index in held_out.views]
+    return Judge(Lpips(), style, scene, held_out.rasterizer, views, stylizer.settings.background)
+
+
+def _judged(judge: Judge, sh_dc: torch.Tensor) -> Any:
+    judgement = judge.judge(sh_dc)
+    assert judgement is not None, "no view can be judged: give more cameras, or larger views"
+    return judgement
+
+
+def _run(
+    scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any]
+) -> tuple[torch.Tensor, float]:
+    """Colours [N, 3], and processor seconds of the steps."""
+    weights = _weights(values.pop("factor", None))
+    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=weights)
+    before = time.process_time()
+    while stylizer.step < stylizer.total:
+        stylizer.run_step()
+    return stylizer.stylized(), time.process_time() - before
+
+
+def _weights(factor: float | None) -> BackboneWeights:
+    weights = load_network_weights("vgg16")
+    if factor is None:
+        return weights
+    layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
+    return with_scales(weights, dict.fromkeys(layers, float(factor)))
+
+
+def _mean(found: list[dict[str, float]]) -> dict[str, Any]:
+    """Of several seeds."""
+    mean: dict[str, Any] = {name: sum(row[name] for row in found) / len(found) for name in found[0]}
+    mean["seeds"] = len(found)
+    if len(found) > 1:
+        values = {name: [row[name] for row in found] for name in COLUMNS}
+        mean["spread"] = {name: max(each) - min(each) for name, each in values.items()}
+    return mean
+
+
+def _print(name: str, row: dict[str, Any]) -> None:
+    print(f"{name:28}", *(f"{row[each]:9.3f}" if each in row else " " * 9 for each in COLUMNS), flush=True)
+
+
+def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
+    """Add the rows of a pair to those that are there."""
+    path = RESULTS / "equal_steps.json"
+    pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
+    told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
+    told |= {"resolution": arguments.resolution, "steps": [arguments.steps_coarse, arguments.steps_sos]}
+    told |= {"settings": json.loads(arguments.settings)}
+    earlier = pairs.get(arguments.name, {}).get("rows", {})
+    pairs[arguments.name] = {**told, "rows": {**earlier, **rows}}
+    write_result("equal_steps", {"pairs": pairs})
+
+
+def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colours: dict[str, torch.Tensor]) -> None:
+    """A row of views for each of the ways."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [(way, [judge.pictures(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colours.items()]
+    write_rows(folder / f"{name}.jpg", style, rows)
+    torch.save(colours, folder / f"{name}.pt")
+
+
+if __name__ == "__main__":
+    main()
