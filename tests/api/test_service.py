@@ -179,6 +179,7 @@ def test_the_ply_in_ranges(service: Service, files: dict[str, Path], expected: b
         assert not (service.data / "artifacts" / job_id).exists()
 
 
+@pytest.mark.slow
 def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     scene, gaussians = tmp_path / "wall.ply", wall(sh_degree=1)
     gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at one depth, their order would make the picture
@@ -245,6 +246,7 @@ def read(folder: Path, data: bytes) -> SceneFile:
     return read_scene(path)
 
 
+@pytest.mark.slow
 def test_a_canceled_job_goes_on_where_it_was(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files)
@@ -325,6 +327,7 @@ def test_a_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
         assert found["result"]["steps"] == 4
 
 
+@pytest.mark.slow
 def test_jobs_side_by_side_share_cores_and_memory(files: dict[str, Path], tmp_path: Path) -> None:
     with Service(tmp_path / "data", SGSST_PARALLEL_JOBS="2") as service, service.client() as client:
         jobs = [submit(client, files, name=name) for name in ("one", "two", "three")]

@@ -62,7 +62,7 @@ def go_on(job: Job, steps: int | None = None) -> Result:
 @pytest.mark.parametrize(
     ("preset", "scan", "settings"),
     [
-        ("preview", False, {"position_weights": "off"}),
+        pytest.param("preview", False, {"position_weights": "off"}, marks=pytest.mark.slow),
         pytest.param("standard", True, {"precision": "bfloat16", "views_per_step": 2}, marks=pytest.mark.slow),
         pytest.param("paper", False, {"position_weights": "off", "kept_weights": "half"}, marks=pytest.mark.slow),
     ],
@@ -85,7 +85,7 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
     assert torch.equal(before.means, after.means)
 
 
-@pytest.mark.parametrize("scan", [False, True])
+@pytest.mark.parametrize("scan", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
     """One wait more where a view comes for the first time, and its lists are built."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
@@ -103,7 +103,7 @@ def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: P
     assert (record.stage, first) == ("sos", False)
 
 
-@pytest.mark.parametrize("scan", [False, True])
+@pytest.mark.parametrize("scan", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> None:
     """With VGG19, the larger network, on three scales. The number is the same for views of any size.
 

@@ -13,7 +13,15 @@ from tests.stability.hard_cases import check
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
 
-@pytest.mark.parametrize("case", optimisation.cases(), ids=lambda case: case.name)
+#: Of some ten seconds each.
+LONG = ("100,000 steps", "total weights from 1e-6 to 1e2 in one scene")
+CASES = [
+    pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.name in LONG else [])
+    for case in optimisation.cases()
+]
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 

@@ -165,6 +165,7 @@ def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFi
         assert str(out) in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_keep_everything_gives_the_same_scene(files: Files) -> None:
     results = []
     for options in ([], ["--keep-everything"]):
@@ -260,6 +261,7 @@ def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.Captur
     assert (report["stopped"], len(report["history"])) == ("converged", 48)
 
 
+@pytest.mark.slow
 def test_held_out_views_approximations_and_findings_are_reported(files: Files) -> None:
     assert main(files.stylize("--steps-sos", "16", "--kept-weights", "half")) == 0
     report = json.loads(files.out.with_name("stylized.report.json").read_text())

@@ -95,7 +95,7 @@ def test_the_gradient_is_the_slope_of_the_loss(tiny_weights: BackboneWeights, st
     assert (ahead - behind) / (2 * step) == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
 
 
-@pytest.mark.parametrize("style_loss", MATCHED)
+@pytest.mark.parametrize("style_loss", [MATCHED[0], pytest.param(MATCHED[1], marks=pytest.mark.slow)])
 def test_the_real_network_agrees_with_untiled_autograd(
     vgg16_weights: BackboneWeights, style_loss: StyleLossName
 ) -> None:

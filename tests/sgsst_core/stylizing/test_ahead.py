@@ -159,6 +159,7 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
     assert not threads()
 
 
+@pytest.mark.slow
 def test_photos_whose_features_are_kept_are_read_once(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
 ) -> None:

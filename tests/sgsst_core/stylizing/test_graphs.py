@@ -68,7 +68,7 @@ def make(
     return Stylizer(plan, scene, views, style(), settings, weights=weights)
 
 
-@pytest.mark.parametrize("scan", [False, True])
+@pytest.mark.parametrize("scan", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_steps_with_graphs_are_the_same_to_the_bit(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, scan: bool
 ) -> None:
@@ -91,6 +91,7 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
     assert (graphs.graphs.captured, graphs.graphs.problem) == (2, None)
 
 
+@pytest.mark.slow
 def test_a_colour_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -179,6 +179,7 @@ def test_ray_itself_may_be_killed(undisturbed: tuple[float, bytes], cluster: Clu
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_a_full_disk_costs_a_checkpoint_and_a_cancelled_job_goes_on(
     undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
 ) -> None:

@@ -41,6 +41,7 @@ def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_pat
     assert ranks_alive[-1] == 1
 
 
+@pytest.mark.slow
 def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
