@@ -18,7 +18,7 @@ Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
-KeptColours = Literal["no", "match"]
+KeptColours = Literal["no", "match", "luminance"]
 StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: What lies behind the Gaussians in a step: `Settings.background`, a uniform colour, or one of the style's pixels.
 PlannedSurround = Literal["background", "random", "palette"]
@@ -138,7 +138,9 @@ class Settings(BaseModel):
         0.0, ge=-360, le=360, description="Turn the style image by D degrees, against the clock."
     )
     keep_colours: KeptColours = Field(
-        "no", description="match: the style image takes the scene's colours first, so that only its strokes are taken."
+        "no",
+        description="match: the style image takes the scene's colours first, so that only its strokes are taken; "
+        "luminance: colours change in luminance alone.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(

@@ -12,13 +12,17 @@ from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
 from sgsst_core.loss.nearest import nearest_reference
 from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget
+from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
 
 
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
     """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
-    x = rgb.double() * network_weights.input_scale.double() + network_weights.input_shift.double()
+    rgb = rgb.double()
+    if network_weights.grey:
+        rgb = (rgb @ torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64))[..., None].expand(rgb.shape)
+    x = rgb * network_weights.input_scale.double() + network_weights.input_shift.double()
     x = x.permute(2, 0, 1).unsqueeze(0)
     features: dict[str, Tensor] = {}
     block = 1

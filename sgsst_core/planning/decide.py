@@ -200,6 +200,7 @@ class _Deciding:
             *decisions.of_scene(probe, plan, settings),
             *decisions.of_views(probe, plan, settings, self.work, shared),
             *decisions.of_surround(plan, settings, self.visits),
+            *decisions.of_colours(settings),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
             *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),

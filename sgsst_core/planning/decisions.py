@@ -120,15 +120,30 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
         decisions.append(Decision("surround", f"{colour} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
         reason = f"{share}: nothing beside the object tells how bright it should be"
+        begins = "luminance begins" if settings.keep_colours == "luminance" else "colours begin"
         decisions.append(
             Decision(
                 "start",
-                "colours begin with the style's mean and spread",
+                f"{begins} with the style's mean and spread",
                 reason if settings.warm_start is None else "asked for",
                 error="it is another start than the paper's",
             )
         )
     return decisions
+
+
+def of_colours(settings: Settings) -> list[Decision]:
+    """What becomes of the scene's colours, where they do not simply become the style's."""
+    if settings.keep_colours != "luminance":
+        return []
+    return [
+        Decision(
+            "colours",
+            "luminance alone is compared and optimised: each Gaussian keeps its chroma",
+            "asked for",
+            error=_ANOTHER_LOSS,
+        )
+    ]
 
 
 def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -> list[Decision]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.loss.feature_scale import at_scale
+from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.orbit import Orbit, orbit_decisions
@@ -61,7 +61,7 @@ def make_plan(
     timer = timer or Timer()
     with timer("planning"):
         fitted = fit_cameras(cameras, settings)
-        weights = at_scale(weights or load_network_weights("auto"), settings.feature_scale)
+        weights = weights_for(weights or load_network_weights("auto"), settings)
         workshop = equip(scene, fitted, settings, weights, collectives, rasterizer)
         if looked is None:
             with timer("survey"):

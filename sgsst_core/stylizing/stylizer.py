@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.loss.feature_scale import at_scale
+from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -49,7 +49,7 @@ from sgsst_core.stylizing.surround import Colour, drawn_colour
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import Views
-from sgsst_core.stylizing.warm_start import warm_start
+from sgsst_core.stylizing.warm_start import luminance_start, warm_start
 from sgsst_core.timing import Timer
 
 
@@ -102,7 +102,7 @@ class Stylizer:
         self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
-        self.weights = weights = at_scale(weights, settings.feature_scale)
+        self.weights = weights = weights_for(weights, settings)
         self.photos = photos
         self.style = style = prepared_style(style, settings, scene.sh_dc, plan.survey.total_blend_weights)
         forget_device_peak(plan.device)
@@ -125,7 +125,8 @@ class Stylizer:
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         start = self.transferred() if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
-        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit)
+        chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
+        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit, chroma_of)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.schedule = planned_phases(plan, settings)
@@ -168,9 +169,15 @@ class Stylizer:
     def transferred(self) -> Tensor:
         """Colours [N, 3] of the Gaussians that are rendered, with the style's mean and spread in closed form."""
         seen, own = self.plan.seen, self.scene.sh_dc[self.plan.seen]
-        found = warm_start(own, self.plan.survey.total_blend_weights[seen], self.style)
+        transfer = luminance_start if self._keeps_chroma else warm_start
+        found = transfer(own, self.plan.survey.total_blend_weights[seen], self.style)
         # Of what no view decides, colours follow from what becomes of the others: see `stylized`.
         return torch.where(self.plan.optimised[seen][:, None], found, own)
+
+    @property
+    def _keeps_chroma(self) -> bool:
+        """Whether colours change in luminance alone."""
+        return self.settings.keep_colours == "luminance"
 
     def _loss(self) -> SosLoss:
         settings = self.settings
@@ -493,7 +500,8 @@ class Stylizer:
             result[self.plan.seen] = self.sh_dc.detach().cpu()
             if self.settings.unseen == "neighbours":
                 weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
-                result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
+                change = neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
+                result[weights <= 0] += change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
             self._stylized = result
         return self._stylized
 
