@@ -142,6 +142,11 @@ class Settings(BaseModel):
         description="match: the style image takes the scene's colours first, so that only its strokes are taken; "
         "luminance: colours change in luminance alone.",
     )
+    sh_fade: Annotated[Share, Option(metavar="S")] = Field(
+        0.0,
+        description="Fade colours that depend on the direction of view by S, in the result too: 0 leaves spherical "
+        "harmonics as they are, 1 leaves none above degree 0.",
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."

@@ -147,7 +147,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     """Write the PLY, then everything beside it. Every rank calls this."""
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.collectives.rank == 0
-    stylizer.collectives.broadcast(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
+    stylizer.collectives.broadcast(lambda: _write_ply(job))
     packed = stylizer.collectives.broadcast(lambda: _write_packed(job))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
@@ -160,12 +160,17 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     return Result(stopped, stylizer.step, stylizer.total, before, after, found, problem, packed)
 
 
+def _write_ply(job: Job) -> None:
+    stylizer = job.stylizer
+    write_stylized(job.scene_file, job.outputs.ply, stylizer.stylized(), sh_fade=stylizer.settings.sh_fade)
+
+
 def _write_packed(job: Job) -> PackedLoss | None:
     """Write the stylized scene in a packed form beside the PLY, and measure what that loses."""
     path, form, stylizer = job.outputs.packed, job.outputs.packed_form, job.stylizer
     if path is None or form is None:
         return None
-    scene = replace(job.scene_file.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
+    scene = replace(stylizer.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
     write_packed(path, scene, form)
     settings = stylizer.settings
     return measure_packed(path, scene, stylizer.views.cameras, background=settings.background, near=settings.near)

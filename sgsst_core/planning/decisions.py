@@ -54,7 +54,10 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
 def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
     scene, degree = probe.scene, probe.scene.used_degree
     if not scene.sh_degree:
-        return [Decision("spherical harmonics", "no view directions are computed", "the scene has degree 0")]
+        nothing = ": there is nothing to fade" if settings.sh_fade else ""
+        return [Decision("spherical harmonics", "no view directions are computed", f"the scene has degree 0{nothing}")]
+    if settings.sh_fade:
+        return [_of_fading(probe, settings.sh_fade)]
     if "sh" in settings.keep or degree == scene.sh_degree:
         return []
     return [
@@ -65,6 +68,25 @@ def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
             bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
         )
     ]
+
+
+def _of_fading(probe: Probe, fade: float) -> Decision:
+    scene = probe.scene
+    if fade == 1:
+        return Decision(
+            "spherical harmonics",
+            f"degrees 1 to {scene.sh_degree} are faded out: no view directions are computed, and the result has zeros",
+            "asked for",
+            bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - 1) * 4,
+            error="no colour depends on the direction of view any more",
+        )
+    return Decision(
+        "spherical harmonics",
+        f"coefficients of degrees 1 to {scene.sh_degree} are {1 - fade:.3g} times as large, in the result too; "
+        f"evaluated up to degree {scene.used_degree}",
+        "asked for",
+        error="colours depend less on the direction of view",
+    )
 
 
 def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_bytes: int) -> list[Decision]:

@@ -63,6 +63,7 @@ def make_plan(
         fitted = fit_cameras(cameras, settings)
         weights = weights_for(weights or load_network_weights("auto"), settings)
         workshop = equip(scene, fitted, settings, weights, collectives, rasterizer)
+        scene = workshop.scene
         if looked is None:
             with timer("survey"):
                 looked = survey(scene, fitted, workshop.rasterizer, collectives, show)

@@ -81,7 +81,8 @@ class SceneFacts:
     Attributes:
         gaussians: N.
         sh_degree: of its file.
-        used_degree: highest SH degree with a coefficient that is not 0, among the Gaussians that are rendered.
+        used_degree: highest SH degree with a coefficient that is not 0 after fading, among the Gaussians that are
+            rendered.
         held_degree: of what is in memory; 0 where coefficients stay in the file.
     """
 
@@ -182,7 +183,8 @@ class Workshop:
     """What measuring needs, and a job that follows the plan goes on to use.
 
     Attributes:
-        scene: the whole scene.
+        scene: the whole scene, with its spherical harmonics faded as the settings say.
+        sh_degree: of the scene as it came.
         cameras: at the size at which they are stylized.
         weights: of the network.
         network: in the precision in which it will run.
@@ -198,6 +200,7 @@ class Workshop:
     network: FeatureNetwork
     precision_ratio: float | None
     rasterizer: Rasterizer
+    sh_degree: int
 
 
 def equip(
@@ -214,6 +217,7 @@ def equip(
         cameras: at the size at which they are stylized.
         rasterizer: that computes blend weights anew; None chooses.
     """
+    sh_degree, scene = scene.sh_degree, scene.faded(settings.sh_fade)
     device = common_device(collectives)
     problems = gpu_problems(collectives) if device == "cuda" else {}
     ratio = precision_ratio(settings.precision, device, collectives)
@@ -229,7 +233,7 @@ def equip(
     )
     name = rasterizer or rasterizer_anew(device, problems)
     whole = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
-    return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole)
+    return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole, sh_degree)
 
 
 def common_device(collectives: Collectives) -> Device:
@@ -286,7 +290,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     used_degree = scene.used_degree(seen)
     held_degree = 0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree
     return Probe(
-        SceneFacts(len(scene), scene.sh_degree, used_degree, held_degree),
+        SceneFacts(len(scene), workshop.sh_degree, used_degree, held_degree),
         tuple((camera.height, camera.width) for camera in cameras),
         looked,
         tuple(distinct),

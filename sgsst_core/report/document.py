@@ -125,7 +125,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
         "scene": {
             "path": str(sources.scene),
             "gaussians": len(stylizer.scene),
-            "sh_degree": stylizer.scene.sh_degree,
+            "sh_degree": stylizer.sh_degree,
             "dropped": sources.dropped,
         },
         "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},

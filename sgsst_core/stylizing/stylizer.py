@@ -117,7 +117,9 @@ class Stylizer:
         self.loss = self._loss()
         #: In place of `loss` in steps, where the plan says so.
         self.graphs = LossGraphs(self.loss) if plan.graphs and self.group.size == 1 else None
-        self.scene = scene
+        self.sh_degree = scene.sh_degree
+        #: With its spherical harmonics faded as the settings say.
+        self.scene = scene = workshop.scene if workshop else scene.faded(settings.sh_fade)
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
         rasterizer, self._coarse = self._rasterizers(seen, workshop)

@@ -35,8 +35,8 @@ ROUNDING = 2**-22
 
 
 def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) -> Stylizer:
-    values = {"coarsest_side": 24, "keep_colours": "luminance"} | values
-    settings = make_settings(steps_coarse=2, steps_sos=steps, early_stop=False, **values)
+    chosen: dict[str, Any] = {"coarsest_side": 24, "keep_colours": "luminance"} | values
+    settings = make_settings(steps_coarse=2, steps_sos=steps, early_stop=False, **chosen)
     return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
 
 
@@ -89,7 +89,7 @@ def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: Ba
     colours = (COLOUR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
     image = rasterizer.render(colours, view)
     size = (view.height, view.width)
-    used = resize_area(stylizer.style, style_size(tuple(stylizer.style.shape[:2]), size))
+    used = resize_area(stylizer.style, style_size((stylizer.style.shape[0], stylizer.style.shape[1]), size))
     _, pixels = sos_reference(stylizer.weights, image, used, image, coarsest=24)
     exact = rasterizer.colour_gradient(pixels, view) * SH_C0 * (colours > 0)
     assert stylizer.weights.grey

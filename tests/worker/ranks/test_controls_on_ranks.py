@@ -21,6 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
     ("scene", "values"),
     [
         pytest.param(wall(sh_degree=1), {"keep_colours": "luminance"}, id="luminance"),
+        pytest.param(wall(sh_degree=2), {"sh_fade": 0.3}, id="fading"),
         pytest.param(ball(), {"keep_colours": "luminance", "surround": "palette"}, id="luminance-of-a-scan"),
     ],
 )
