@@ -33,6 +33,7 @@ from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
+from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
@@ -107,6 +108,7 @@ def _read_inputs(
         pixels = sum(camera.width * camera.height for camera in cameras)
         if pixels > limits["pixels"]:
             raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
+        check_scales(settings.scales, cameras, settings.coarsest_side)
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
     with _ErrorsOf("style"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -79,6 +81,7 @@ def sos_reference(
     coverage: Tensor | None = None,
     style_loss: StyleLossName = "sos",
     coarsest: int = COARSEST_SHORTER_SIDE,
+    scales: Sequence[float] = (),
 ) -> tuple[float, Tensor]:
     """E and dE/dimage [H, W, 3] in float64.
 
@@ -88,11 +91,14 @@ def sos_reference(
         coverage: [H, W] position weights; None for equal weights.
         style_loss: see `style_losses`; with features that are matched, the style has at most `nearest.MOST_VECTORS`.
         coarsest: pixels of the coarsest scale's shorter side at most.
+        scales: weight of each scale, from full size on; all alike where none is given.
     """
     x = image.double().clone().requires_grad_()
-    loss = torch.zeros((), dtype=torch.float64)
-    scales = scale_count(image.shape[0], image.shape[1], coarsest)
-    for scale in range(scales):
+    total = torch.zeros((), dtype=torch.float64)
+    count = scale_count(image.shape[0], image.shape[1], coarsest)
+    factors = [1.0] * count if not scales else [*scales, *[0.0] * count][:count]
+    for scale, factor in enumerate(factors):
+        loss = torch.zeros((), dtype=torch.float64)
         side = 1 << scale
         features = features_reference(network_weights, box_average_reference(x, side))
         wanted = features_reference(network_weights, box_average_reference(style.double(), side))
@@ -109,7 +115,8 @@ def sos_reference(
             position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
             a = torch.ones(difference.shape[:2], dtype=torch.float64) if position is None else position
             loss = loss + content_weight * (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
-    loss = loss / scales
+        total = total + factor * loss
+    loss = total / sum(factors)
     (gradient,) = torch.autograd.grad(loss, x)
     return loss.item(), gradient
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS
 from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
@@ -325,12 +326,16 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
     scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
     reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
     decisions.append(Decision("scales", scales, reason))
+    if settings.scales:
+        decisions.append(_of_scale_weights(settings, max(counts)))
     if settings.steps_coarse and not plan.steps_coarse:
         decisions.append(
             Decision(
                 "phase 1",
                 f"its {settings.steps_coarse} steps are left out",
-                "the coarsest scale is the only one, so that it would be the same as phase 2",
+                "one scale is the only one that counts, so that it would be the same as phase 2"
+                if settings.scales
+                else "the coarsest scale is the only one, so that it would be the same as phase 2",
                 error="the steps, which work on the same loss",
             )
         )
@@ -348,6 +353,15 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
             )
         )
     return decisions
+
+
+def _of_scale_weights(settings: Settings, most: int) -> Decision:
+    weights = ScaleWeights(settings.scales)
+    chosen = weights.chosen(most)
+    told = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in chosen)
+    left = most - len(chosen)
+    nothing = f"; {left} of {most} scales are not computed" if left else ""
+    return Decision("weights of scales", f"{told}{nothing}", "asked for", error=_ANOTHER_LOSS)
 
 
 def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:

@@ -21,6 +21,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import search
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import Collectives
@@ -340,7 +341,7 @@ def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
     )
 
 
-def _loss(workshop: Workshop) -> SosLoss:
+def _loss(workshop: Workshop, scales: ScaleWeights = EVEN) -> SosLoss:
     """As one rank's."""
     settings = workshop.settings
     return SosLoss(
@@ -349,6 +350,7 @@ def _loss(workshop: Workshop) -> SosLoss:
         style_loss=settings.style_loss,
         memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
         coarsest=settings.coarsest_side,
+        scales=scales,
         keep_activations="activations" not in settings.keep,
     )
 
@@ -359,7 +361,7 @@ def _launch_cost(workshop: Workshop, views: Sequence[Camera]) -> LaunchCost | No
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
     if workshop.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
         return None
-    return launch_cost(_loss(workshop), (views[0].height, views[0].width))
+    return launch_cost(_loss(workshop, ScaleWeights(settings.scales)), (views[0].height, views[0].width))
 
 
 def _side(workshop: Workshop, loss: SosLoss) -> int:

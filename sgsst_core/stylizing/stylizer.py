@@ -20,6 +20,7 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
@@ -190,6 +191,7 @@ class Stylizer:
             memory=int(self.memory * MEMORY_SHARES["activations"]),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
+            scales=ScaleWeights(settings.scales),
             leave_out="uncovered" not in settings.keep,
             keep_activations="activations" not in settings.keep,
             timer=self.timer,
@@ -274,6 +276,11 @@ class Stylizer:
         camera = self.views.cameras[index]
         return self.loss.scale_count(camera.height, camera.width)
 
+    def scales(self, index: int) -> list[int]:
+        """The scales of a view that count, the finest first."""
+        camera = self.views.cameras[index]
+        return self.loss.scales(camera.height, camera.width)
+
     @property
     def evaluation_views(self) -> list[int]:
         """Indices of the plan's `loss_views`, evenly spread over those that see anything."""
@@ -338,7 +345,7 @@ class Stylizer:
             phase.stage,
             views[0],
             self.seconds,
-            mean_loss(terms),
+            mean_loss(terms, self.loss.weights),
             terms,
             dict(self.timer.seconds),
             self._process.memory_info().rss,
@@ -355,7 +362,7 @@ class Stylizer:
         self._cost = 0
         own_views = views[self._team.own_group :: self._team.groups]
         for place, index in enumerate(own_views):
-            scales = phase.scales(self.scale_count(index))
+            scales = phase.scales(self.scales(index))
             behind = self.behind(index)
             with self.timer("prepare"):
                 target = self.views.target(index, scales, behind)
@@ -437,7 +444,7 @@ class Stylizer:
             index, phase = self._queue[-1 - self._team.own_group], phase_at(self.schedule, self.step + 1)
         else:
             return
-        self.views.look_ahead(index, phase.scales(self.scale_count(index)))
+        self.views.look_ahead(index, phase.scales(self.scales(index)))
 
     @property
     def coming(self) -> list[int]:

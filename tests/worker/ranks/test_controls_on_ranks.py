@@ -22,6 +22,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
     [
         pytest.param(wall(sh_degree=1), {"keep_colours": "luminance"}, id="luminance"),
         pytest.param(wall(sh_degree=2), {"sh_fade": 0.3}, id="fading"),
+        pytest.param(wall(), {"scales": (1.0, 0.5)}, id="scales"),
+        pytest.param(wall(), {"scales": (0.0, 1.0), "style_loss": "mixed"}, id="one-scale"),
         pytest.param(ball(), {"keep_colours": "luminance", "surround": "palette"}, id="luminance-of-a-scan"),
     ],
 )
