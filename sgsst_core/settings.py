@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
@@ -18,7 +26,7 @@ Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
-KeptColours = Literal["no", "match"]
+KeptColours = Literal["no", "match", "luminance"]
 StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: What lies behind the Gaussians in a step: `Settings.background`, a uniform colour, or one of the style's pixels.
 PlannedSurround = Literal["background", "random", "palette"]
@@ -49,6 +57,16 @@ Resolution = Annotated[
     Option(unit="pixels", name="resolution", default="the cameras' own"),
     Field(ge=1, le=MAX_RESOLUTION, description="Pixels of every view's longer side."),
 ]
+
+
+ScaleWeight = Annotated[float, Field(ge=0, le=_MAX_WEIGHT, allow_inf_nan=False)]
+
+
+def _some_weight(weights: tuple[float, ...] | None) -> tuple[float, ...] | None:
+    """Scales of which one counts; none given leaves them all alike."""
+    if weights and not any(weights):
+        raise ValueError("no scale has a weight")
+    return weights
 
 
 class _StrengthWords:
@@ -138,7 +156,24 @@ class Settings(BaseModel):
         0.0, ge=-360, le=360, description="Turn the style image by D degrees, against the clock."
     )
     keep_colours: KeptColours = Field(
-        "no", description="match: the style image takes the scene's colours first, so that only its strokes are taken."
+        "no",
+        description="match: the style image takes the scene's colours first, so that only its strokes are taken; "
+        "luminance: colours change in luminance alone.",
+    )
+    sh_fade: Annotated[Share, Option(metavar="S")] = Field(
+        0.0,
+        description="Fade colours that depend on the direction of view by S, in the result too: 0 leaves spherical "
+        "harmonics as they are, 1 leaves none above degree 0.",
+    )
+    scales: Annotated[
+        tuple[ScaleWeight, ...],
+        Option(unit="weights of scales", metavar="W,W,...", default="all alike"),
+        AfterValidator(_some_weight),
+    ] = Field(
+        (),
+        max_length=16,
+        description="Weight of each scale in the loss, from full size on, each scale half as large as the one before; "
+        "those that are not named, or have 0, are not computed.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(

@@ -13,6 +13,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import write_packed, write_stylized
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.quality.packed import PackedLoss, measure_packed
@@ -21,7 +22,7 @@ from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import bought, build_report, plan_json, sent_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
-from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.options import RunOptions
@@ -43,6 +44,7 @@ class Result:
         bought: what error the time bought (`report.bought`).
         report_error: why report, contact sheet or curves are missing; None if they are not.
         packed: what the packed file loses that lies beside the PLY; None where there is none.
+        weights: of the scales in `before` and `after`.
     """
 
     stopped: Stopped
@@ -53,6 +55,12 @@ class Result:
     bought: dict[str, Any] | None = None
     report_error: str | None = None
     packed: PackedLoss | None = None
+    weights: ScaleWeights = EVEN
+
+    @property
+    def losses(self) -> tuple[float, float]:
+        """The loss before and after."""
+        return mean_loss(self.before, self.weights), mean_loss(self.after, self.weights)
 
 
 def execute(
@@ -147,7 +155,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     """Write the PLY, then everything beside it. Every rank calls this."""
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.collectives.rank == 0
-    stylizer.collectives.broadcast(lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized()))
+    stylizer.collectives.broadcast(lambda: _write_ply(job))
     packed = stylizer.collectives.broadcast(lambda: _write_packed(job))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
@@ -157,7 +165,12 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     error = _write_reports(job, stopped, before, after, packed) if first else None
     found = bought(stylizer, before)
     problem = str(error) if error else None
-    return Result(stopped, stylizer.step, stylizer.total, before, after, found, problem, packed)
+    return Result(stopped, stylizer.step, stylizer.total, before, after, found, problem, packed, stylizer.loss.weights)
+
+
+def _write_ply(job: Job) -> None:
+    stylizer = job.stylizer
+    write_stylized(job.scene_file, job.outputs.ply, stylizer.stylized(), sh_fade=stylizer.settings.sh_fade)
 
 
 def _write_packed(job: Job) -> PackedLoss | None:
@@ -165,7 +178,7 @@ def _write_packed(job: Job) -> PackedLoss | None:
     path, form, stylizer = job.outputs.packed, job.outputs.packed_form, job.stylizer
     if path is None or form is None:
         return None
-    scene = replace(job.scene_file.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
+    scene = replace(stylizer.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
     write_packed(path, scene, form)
     settings = stylizer.settings
     return measure_packed(path, scene, stylizer.views.cameras, background=settings.background, near=settings.near)

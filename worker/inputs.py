@@ -16,8 +16,10 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit
 from sgsst_core.planning.survey import nothing_seen, sees_something
@@ -71,8 +73,10 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_image(request.style))
     scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
+    together(collectives, lambda: check_fading(scene_file.path, scene_file.header, settings.sh_fade))
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)
+    together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))
     together(collectives, lambda: check_style_size(style, cameras, settings.style_scale))
     photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
     stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")

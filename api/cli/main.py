@@ -201,9 +201,7 @@ def _tell_losses(ended: RanksResult) -> None:
 
 
 def _conclude(outputs: Outputs, result: Result, command: str) -> None:
-    from sgsst_core.stylizing.evaluation import mean_loss
-
-    before, after = mean_loss(result.before), mean_loss(result.after)
+    before, after = result.losses
     out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
     for line in _time_bought(result):
         out_console.print(f"{'time bought:':<22}{line}")

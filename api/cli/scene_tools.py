@@ -12,6 +12,7 @@ from pathlib import Path
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
 from sgsst_core.planning import planner
@@ -59,6 +60,7 @@ def make_plan(
             raise OutputError(f"{sheet}: is not the name of a JPEG file. Name one to write, such as views.jpg.")
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
+    check_fading(file.path, file.header, settings.sh_fade)
     weights = load_network_weights(backbone)
     load_image(style)  # a style that cannot be used is told before the work, too
     if sheet is not None:

@@ -63,9 +63,18 @@ def parse_strength(text: str) -> float:
         raise typer.BadParameter(f"{text!r} is neither a number nor one of {words}.") from None
 
 
+def parse_weights(text: str) -> tuple[float, ...]:
+    """Weights of scales from "1,0.5,0,1"."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} are no numbers with commas between them such as 1,0.5,0,1.") from None
+
+
 #: Units whose values are written in another way than in JSON.
 FORMS = {
     "RGB, 0 to 1": Form(parse_colour, "COLOUR", ": black, white, or R,G,B from 0 to 255."),
     "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),
+    "weights of scales": Form(parse_weights, "W,W,...", ": 1,0,0.5 for the first and the third."),
     "bytes": Form(parse_bytes, "SIZE", ", such as 8GB."),
 }

@@ -28,10 +28,12 @@ from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
+from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
+from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
@@ -89,6 +91,7 @@ def _read_inputs(
                 "too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be."
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
+        check_fading(file.path, file.header, settings.sh_fade)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _ErrorsOf("style"):
         _check_pixel_count(staged.style, limits)
@@ -105,6 +108,7 @@ def _read_inputs(
         pixels = sum(camera.width * camera.height for camera in cameras)
         if pixels > limits["pixels"]:
             raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
+        check_scales(settings.scales, cameras, settings.coarsest_side)
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
     with _ErrorsOf("style"):

@@ -214,9 +214,7 @@ def tell_preview(path: Path) -> None:
 
 def summary(result: Result) -> dict[str, Any]:
     """What a job's record says about its end; the report has the rest."""
-    from sgsst_core.stylizing.evaluation import mean_loss
-
-    before, after = mean_loss(result.before), mean_loss(result.after)
+    before, after = result.losses
     return {
         "stopped": result.stopped,
         "steps": result.step,

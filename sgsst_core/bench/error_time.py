@@ -205,7 +205,7 @@ def error_time(
             if part in MOMENTS:
                 loss = exact.evaluate(views, stylizer.stylized())
                 by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
-                relative = mean_loss(loss) / mean_loss(start)
+                relative = mean_loss(loss, exact.loss.weights) / mean_loss(start, exact.loss.weights)
                 curve.points.append(Point(stylizer.seconds, stylizer.step, relative, by_scale))
                 progress(curve.variant, curve.points[-1])
     return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
@@ -225,7 +225,7 @@ def _begin(
     if reason:
         return Curve(variant, [], left_out=reason), None
     stylizer.budget = seconds
-    stylizer.shares = variant.shares(max(stylizer.scale_count(index) for index in stylizer.views.covered))
+    stylizer.shares = variant.shares(max(len(stylizer.scales(index)) for index in stylizer.views.covered))
     return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
 
 
@@ -233,10 +233,10 @@ def _prepare(stylizer: _TimedStylizer) -> float:
     """Prepare every view and the style as the first steps would; returns the seconds."""
     started = time.perf_counter()
     for index in stylizer.views.covered:
-        count = stylizer.scale_count(index)
+        chosen = stylizer.scales(index)
         phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
         stylizer.style_targets(stylizer.views.cameras[index])
-        scales = sorted({scale for phase in phases for scale in phase.scales(count)})
+        scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
         stylizer.views.target(index, scales, stylizer.behind(index))
         stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started

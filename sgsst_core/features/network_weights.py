@@ -43,6 +43,7 @@ class BackboneWeights:
         convolutions: layer name ("conv1_1") to weight [out, in, 3, 3] and bias [out], float32, in network order.
         input_scale, input_shift: [3] float32; the network's input is rgb (0..1) * input_scale + input_shift.
         scales: layer ("relu1_1") to the factor by which its features have been made larger; empty as installed.
+        grey: the network is shown the luminance of pictures alone (`scene.luminance.grey`).
     """
 
     name: str
@@ -52,6 +53,7 @@ class BackboneWeights:
     input_scale: Tensor  # [3]
     input_shift: Tensor  # [3]
     scales: dict[str, float] = field(default_factory=dict)
+    grey: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from torch import Tensor
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
+from sgsst_core.scene.luminance import grey, grey_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
@@ -171,6 +172,7 @@ class FeatureNetwork:
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
+        self._grey = weights.grey
         self._steps = self._build(weights)
         self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
@@ -224,7 +226,8 @@ class FeatureNetwork:
             Activations; a layer whose stride exceeds the pixels has zero cells (a dimension of size 0).
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
-        x = rgb.to(self.device, self._input_dtype) * self._scale + self._shift
+        rgb = rgb.to(self.device, self._input_dtype)
+        x = (grey(rgb) if self._grey else rgb) * self._scale + self._shift
         # [h, w, 3] seen as [1, 3, h, w] is already in channels-last order: no copy.
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         kept = Activations({}, size=(height, width))
@@ -278,7 +281,8 @@ class FeatureNetwork:
             gradient = self._backward_steps(kept, feature_gradient)
         if gradient is None:
             return torch.zeros((*kept.size, 3), dtype=self._input_dtype, device=self.device)
-        return gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
+        pixels = gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
+        return grey_gradient(pixels) if self._grey else pixels
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
         """Gradient [1, 3, h, w] with respect to what went into the first step; None where no layer has one."""

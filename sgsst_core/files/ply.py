@@ -28,6 +28,7 @@ from torch import Tensor
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.compressed_ply import read_compressed_ply, write_compressed_ply
+from sgsst_core.files.fading import Fading, check_fading
 from sgsst_core.files.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, SceneHeader, read_scene_header
 from sgsst_core.files.splat import read_splat
@@ -165,9 +166,9 @@ def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
     return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * count * header.vertex.count > limit
 
 
-def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
-    """Write the scene's PLY again with new f_dc_0..2; every other byte comes back as it was. A scene of a packed file
-    becomes a PLY as `write_scene` writes it.
+def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: float = 0.0) -> None:
+    """Write the scene's PLY again with new f_dc_0..2; every other byte comes back as it was, but for f_rest_* where
+    they fade. A scene of a packed file becomes a PLY as `write_scene` writes it.
 
     Where a value is still what the file holds (in float32), its bytes stay too. Rows that were dropped at reading
     are absent, which also changes the count in the header. The file appears whole or not at all.
@@ -176,9 +177,10 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
         source: what `read_scene` gave.
         target: file to write; may be the source itself.
         sh_dc: [N, 3], finite, N = len(source.scene).
+        sh_fade: by how much f_rest_* fade, 0 to 1: see `Scene.faded`.
 
     Raises:
-        SceneError: the source file was changed since it was read.
+        SceneError: the source file was changed since it was read, or cannot hold faded coefficients.
         OutputError: the target cannot be written.
         ValueError: sh_dc has the wrong shape or non-finite values.
     """
@@ -187,15 +189,17 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor) -> None:
     if _stamp(source.path) != source.stamp:
         raise changed(source.path)
     if source.form != "ply" or source.header is None:
-        write_scene(target, replace(source.scene, sh_dc=sh_dc.detach().to("cpu", torch.float32)))
+        write_scene(target, replace(source.scene.faded(sh_fade), sh_dc=sh_dc.detach().to("cpu", torch.float32)))
         return
+    check_fading(source.path, source.header, sh_fade)
+    fading = Fading.of(source.header, sh_fade)
     colours = sh_dc.detach().to("cpu", torch.float32).contiguous().numpy()
     with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
         output.write(_header_for(source, source.header))
         if source.header.text:
-            _write_text(source, source.header, colours, file, output)
+            _write_text(source, source.header, colours, fading, file, output)
         else:
-            _write_binary(source, source.header, colours, file, output)
+            _write_binary(source, source.header, colours, fading, file, output)
 
 
 def write_scene(path: Path, scene: Scene) -> None:
@@ -470,7 +474,12 @@ def _blocks(
 
 
 def _write_binary(
-    source: SceneFile, header: PlyHeader, colours: NDArray[Any], file: io.BufferedReader, output: BinaryIO
+    source: SceneFile,
+    header: PlyHeader,
+    colours: NDArray[Any],
+    fading: Fading | None,
+    file: io.BufferedReader,
+    output: BinaryIO,
 ) -> None:
     dtype = header.vertex.dtype(header.byte_order)
     before = element_offsets(source.path, header)["vertex"] - len(header.raw)
@@ -487,6 +496,8 @@ def _write_binary(
         for name, column in zip(_DC, new.T, strict=True):
             different = rows[name].astype(np.float32) != column
             rows[name][different] = column[different]
+        if fading is not None:
+            fading.apply(rows)
         output.write(rows.view(np.uint8).data)
     _copy(file, output)
     if _stamp(source.path) != source.stamp:
@@ -503,11 +514,19 @@ def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
         count = None if count is None else count - len(data)
 
 
-def _write_text(source: SceneFile, header: PlyHeader, colours: NDArray[Any], file: BinaryIO, output: BinaryIO) -> None:
+def _write_text(
+    source: SceneFile,
+    header: PlyHeader,
+    colours: NDArray[Any],
+    fading: Fading | None,
+    file: BinaryIO,
+    output: BinaryIO,
+) -> None:
     vertex = header.vertex
     before = header.elements[: header.elements.index(vertex)]
     order = [prop.name for prop in vertex.properties]
-    slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in _DC]
+    names = (*_DC, *(fading.names if fading else ()))
+    slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
     file.seek(len(header.raw))
     # latin-1 gives every byte back as it came, newline="" every line end
     lines = io.TextIOWrapper(file, "latin-1", newline="")
@@ -518,14 +537,23 @@ def _write_text(source: SceneFile, header: PlyHeader, colours: NDArray[Any], fil
         for index in range(count):
             line = lines.readline()
             if kept[index]:
-                output.write(_recoloured(line, slots, next(values)).encode("latin-1"))
+                output.write(_recoloured(line, slots, next(values), fading).encode("latin-1"))
     for line in lines:
         output.write(line.encode("latin-1"))
 
 
-def _recoloured(line: str, slots: list[tuple[int, str]], values: NDArray[Any]) -> str:
-    """A row of text with its three colour tokens replaced where their value changes; all spacing stays."""
+def _recoloured(line: str, slots: list[tuple[int, str]], values: NDArray[Any], fading: Fading | None) -> str:
+    """A row of text with its three colour tokens replaced where their value changes, and others that fade; all spacing
+    stays.
+
+    Args:
+        slots: place and kind of the tokens: those of the colours first.
+        values: [3], of the colours.
+    """
     tokens = list(re.finditer(r"\S+", line))
+    if fading is not None:
+        old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
+        values = np.concatenate([values, fading.faded(old)])
     for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
         token = tokens[slot]
         if np.float32(token[0]) != value:

@@ -22,7 +22,7 @@ from sgsst_core.features.network_sources import CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
-from sgsst_core.settings import FeatureScale
+from sgsst_core.settings import FeatureScale, Settings
 
 #: Of every layer, `even`: Gram matrix, mean and standard deviation then count about alike at the start.
 EVEN_SCALE = 8.0
@@ -52,6 +52,12 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
         return weights
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
     return with_scales(weights, paper_scales(weights) if scale == "paper" else dict.fromkeys(layers, EVEN_SCALE))
+
+
+def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
+    """The network as a job with these settings uses it: at its scale, and shown luminance alone where colours stay."""
+    scaled = at_scale(weights, settings.feature_scale)
+    return replace(scaled, grey=True) if settings.keep_colours == "luminance" else scaled
 
 
 def is_original(weights: BackboneWeights) -> bool:

@@ -189,7 +189,7 @@ class LossGraphs:
                 gradient.copy_(found.image_gradient)
         finally:
             loss.timer = timer
-        return _Graph(graph, own_image, own_view, SosResult(found.scales, values, gradient))
+        return _Graph(graph, own_image, own_view, SosResult(found.scales, values, gradient, found.weights))
 
     def _places(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
         """Where an image and what it is compared with are copied to."""

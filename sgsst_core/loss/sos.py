@@ -27,6 +27,7 @@ from sgsst_core.features.vgg import (
     layer_stride,
 )
 from sgsst_core.loss.nearest import Matches, StyleVectors, chosen_places, places_in
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
 from sgsst_core.loss.tiling import Tiling
@@ -67,11 +68,13 @@ class SosResult:
         values: [scales, 5] float64, each scale's loss split into `TERMS`, still on the device.
         image_gradient: dE/dimage [H, W, 3], of which every rank has a part: they add up to the whole. None if only the
             loss was asked for.
+        weights: of the scales in the loss.
     """
 
     scales: tuple[int, ...]
     values: Tensor
     image_gradient: Tensor | None
+    weights: ScaleWeights = EVEN
 
     @property
     def terms(self) -> dict[int, LossTerms]:
@@ -85,9 +88,8 @@ class SosResult:
 
     @property
     def loss(self) -> float:
-        """E, the mean over the scales that were evaluated. Waits for the device."""
-        terms = self.terms
-        return sum(part.total for part in terms.values()) / len(terms)
+        """E, the weighted mean over the scales that were evaluated. Waits for the device."""
+        return self.weights.mean({scale: part.total for scale, part in self.terms.items()})
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,7 @@ class SosLoss:
         memory: bytes that activations may take.
         tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
         coarsest: pixels of the coarsest scale's shorter side at most.
+        scales: weights of the pyramid's scales; what has none is not computed.
         leave_out: pixels without weight do not go through the network; False for comparison.
         keep_activations: as many as fit between the two passes; False computes each tile twice, for comparison.
         timer: receives the seconds of `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
@@ -157,6 +160,7 @@ class SosLoss:
         tile_size: int | None = None,
         coarsest: int = COARSEST_SHORTER_SIDE,
         style_scale: float = 1.0,
+        scales: ScaleWeights = EVEN,
         leave_out: bool = True,
         keep_activations: bool = True,
         timer: Timer | None = None,
@@ -171,7 +175,8 @@ class SosLoss:
         self.leave_out = leave_out
         held = network.held_bytes_per_pixel()
         working = network.working_bytes_per_pixel() / held
-        self.tiling = Tiling(network.halo, memory / held, working, coarsest, tile_size, keep_activations)
+        self.weights = scales
+        self.tiling = Tiling(network.halo, memory / held, working, coarsest, tile_size, keep_activations, scales)
         self.timer = timer or Timer()
         self.collectives = collectives
         self.speeds = (1.0,) * collectives.size
@@ -183,6 +188,10 @@ class SosLoss:
     def scale_count(self, height: int, width: int) -> int:
         """n_s of views of a size."""
         return self.tiling.scale_count((height, width))
+
+    def scales(self, height: int, width: int) -> list[int]:
+        """The scales that count of views of a size, the finest first."""
+        return self.tiling.scales((height, width))
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
         """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
@@ -232,7 +241,7 @@ class SosLoss:
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
     def style_targets(self, style: Tensor, view_size: Size) -> dict[int, ScaleTarget]:
-        """Targets of every scale of views of view_size (height, width) from a style image [H, W, 3] in 0..1.
+        """Targets of every scale that counts, for views of view_size (height, width), from a style [H, W, 3] in 0..1.
 
         A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
 
@@ -241,7 +250,7 @@ class SosLoss:
         """
         size = style_size(_size(style), view_size, self.style_scale)
         image = resize_area(style, size).to(self.network.device)
-        scaled = {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
+        scaled = {scale: downscale(image, scale) for scale in self.scales(*view_size)}
         layers = self._style_statistics(scaled) if self.style_layers else {}
         vectors = {scale: self._style_vectors(picture) for scale, picture in scaled.items()}
         if self.nearest_layers and all(found is None for found in vectors.values()):
@@ -301,13 +310,14 @@ class SosLoss:
         return target
 
     def _sizes(self, size: Size, scales: Sequence[int] | None = None, image_scale: int = 0) -> dict[int, Size]:
-        """(height, width) of scales of a view, whose size is given at one of them; None for all."""
-        scales = range(self.scale_count(*size)) if scales is None else scales
+        """(height, width) of scales of a view, whose size is given at one of them; None for all that count."""
+        scales = self.scales(*size) if scales is None else scales
         return {scale: (size[0] >> scale - image_scale, size[1] >> scale - image_scale) for scale in scales}
 
     def position_weights(self, coverage: Tensor) -> list[Tensor]:
         """Coverage [H, W] in 0..1 at every power of two that a layer of a scale needs."""
-        levels = self.scale_count(coverage.shape[0], coverage.shape[1]) + layer_stride("relu5_1").bit_length()
+        coarsest = self.scales(coverage.shape[0], coverage.shape[1])[-1]
+        levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
         return coverage_pyramid(coverage.to(self.network.device, _gradient_dtype(self.network)), levels)
 
     def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
@@ -342,13 +352,13 @@ class SosLoss:
             image: of the view at its scale `image_scale`.
             style: targets by scale, from `style_targets`.
             view: from `view_target`.
-            scales: which scales, none of them finer than the image; None for all (SOS), of a full-size image. Phase 1
-                passes the coarsest alone.
+            scales: which scales, all with a weight and none of them finer than the image; None for all that count
+                (SOS), of a full-size image. Phase 1 passes the coarsest alone.
             gradient: False evaluates the loss only.
             image_scale: 0 for full size.
         """
         sizes = self._sizes(_size(image), scales, image_scale)
-        share = self._share_of(view, sizes)
+        share, weights = self._share_of(view, sizes), self.weights.shares(sizes)
         total = torch.zeros(image.shape, dtype=_gradient_dtype(self.network), device=self.network.device)
         terms: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):
@@ -356,8 +366,9 @@ class SosLoss:
             for pass_, pixel_gradient in self._round(scaled, style, view, share, gradient):
                 terms[pass_.scale] = pass_.terms
                 if pixel_gradient is not None:
-                    add_upscaled_(total, pixel_gradient, pass_.scale - image_scale, 1.0 / len(sizes))
-        return SosResult(tuple(terms), torch.stack(list(terms.values())), total if gradient else None)
+                    add_upscaled_(total, pixel_gradient, pass_.scale - image_scale, weights[pass_.scale])
+        values = torch.stack(list(terms.values()))
+        return SosResult(tuple(terms), values, total if gradient else None, self.weights)
 
     def _share_of(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Share:
         if view.share is not None and view.share.tiles.keys() == sizes.keys():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -12,13 +14,17 @@ from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
 from sgsst_core.loss.nearest import nearest_reference
 from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget
+from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
 
 
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
     """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
-    x = rgb.double() * network_weights.input_scale.double() + network_weights.input_shift.double()
+    rgb = rgb.double()
+    if network_weights.grey:
+        rgb = (rgb @ torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64))[..., None].expand(rgb.shape)
+    x = rgb * network_weights.input_scale.double() + network_weights.input_shift.double()
     x = x.permute(2, 0, 1).unsqueeze(0)
     features: dict[str, Tensor] = {}
     block = 1
@@ -75,6 +81,7 @@ def sos_reference(
     coverage: Tensor | None = None,
     style_loss: StyleLossName = "sos",
     coarsest: int = COARSEST_SHORTER_SIDE,
+    scales: Sequence[float] = (),
 ) -> tuple[float, Tensor]:
     """E and dE/dimage [H, W, 3] in float64.
 
@@ -84,11 +91,14 @@ def sos_reference(
         coverage: [H, W] position weights; None for equal weights.
         style_loss: see `style_losses`; with features that are matched, the style has at most `nearest.MOST_VECTORS`.
         coarsest: pixels of the coarsest scale's shorter side at most.
+        scales: weight of each scale, from full size on; all alike where none is given.
     """
     x = image.double().clone().requires_grad_()
-    loss = torch.zeros((), dtype=torch.float64)
-    scales = scale_count(image.shape[0], image.shape[1], coarsest)
-    for scale in range(scales):
+    total = torch.zeros((), dtype=torch.float64)
+    count = scale_count(image.shape[0], image.shape[1], coarsest)
+    factors = [1.0] * count if not scales else [*scales, *[0.0] * count][:count]
+    for scale, factor in enumerate(factors):
+        loss = torch.zeros((), dtype=torch.float64)
         side = 1 << scale
         features = features_reference(network_weights, box_average_reference(x, side))
         wanted = features_reference(network_weights, box_average_reference(style.double(), side))
@@ -105,7 +115,8 @@ def sos_reference(
             position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
             a = torch.ones(difference.shape[:2], dtype=torch.float64) if position is None else position
             loss = loss + content_weight * (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
-    loss = loss / scales
+        total = total + factor * loss
+    loss = total / sum(factors)
     (gradient,) = torch.autograd.grad(loss, x)
     return loss.item(), gradient
 

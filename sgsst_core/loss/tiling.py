@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sgsst_core.features.partition import PartitionTile, Rectangle, choose_tile_size, kept_tiles, partition
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.parallel.division import Size
 from sgsst_core.scene.pyramid import scale_count
 
@@ -21,6 +22,7 @@ class Tiling:
         coarsest: pixels of the coarsest scale's shorter side at most.
         tile_size: side of partition tiles, a multiple of 16; None lets the memory decide.
         keep_activations: as many as fit between the two passes; False computes each tile twice.
+        weights: of the scales that count.
     """
 
     halo: int
@@ -29,10 +31,15 @@ class Tiling:
     coarsest: int
     tile_size: int | None = None
     keep_activations: bool = True
+    weights: ScaleWeights = EVEN
 
     def scale_count(self, size: Size) -> int:
         """n_s of views of a size (height, width)."""
         return scale_count(*size, self.coarsest)
+
+    def scales(self, size: Size) -> list[int]:
+        """The scales that count of views of a size (height, width), the finest first."""
+        return self.weights.chosen(self.scale_count(size))
 
     def tiles(self, size: Size, region: Rectangle | None = None) -> list[PartitionTile]:
         """The tiles of a region of a scaled view of size (height, width), as large as the memory allows."""

@@ -105,14 +105,14 @@ class LaunchCost:
 
 
 def pieces_of(size: Size, tiling: Tiling, region: Rectangle | None, *, coarsest: bool = False) -> tuple[Piece, ...]:
-    """What of a view goes through the network: one piece for each scale, or for the coarsest alone.
+    """What of a view goes through the network: one piece for each scale that counts, or for the coarsest alone.
 
     Args:
         size: (height, width) of the view.
         region: that holds every covered pixel; None where uncovered pixels go through too.
     """
-    count = tiling.scale_count(size)
-    return tuple(_piece(size, scale, region) for scale in range(count - 1 if coarsest else 0, count))
+    scales = tiling.scales(size)
+    return tuple(_piece(size, scale, region) for scale in (scales[-1:] if coarsest else scales))
 
 
 def _piece(size: Size, scale: int, region: Rectangle | None) -> Piece:
@@ -212,7 +212,7 @@ def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: i
     """
     if not channels:
         return 0
-    scaled = {size: [(size[0] >> s, size[1] >> s) for s in range(tiling.scale_count(size))] for size in set(sizes)}
+    scaled = {size: [(size[0] >> s, size[1] >> s) for s in tiling.scales(size)] for size in set(sizes)}
     vectors = sum(_vectors(part) for parts in scaled.values() for part in parts)
     positions = (
         max(sum(part[0] * part[1] for part in parts) for parts in scaled.values()) // layer_stride(_MATCHED) ** 2
@@ -225,7 +225,7 @@ def content_bytes(sizes: Sequence[Size], tiling: Tiling, cell: int) -> int:
     cells = sum(
         (height >> scale + 3) * (width >> scale + 3)
         for height, width in sizes
-        for scale in range(tiling.scale_count((height, width)))
+        for scale in tiling.scales((height, width))
     )
     return cells * cell
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import divide, loads
 from sgsst_core.planning import decisions
@@ -74,6 +75,7 @@ class _Deciding:
             network.working_bytes / network.held_bytes,
             settings.coarsest_side,
             keep_activations="activations" not in settings.keep,
+            weights=ScaleWeights(settings.scales),
         )
         self.base = self._without_decisions()
         self.sizes = [probe.sizes[index] for index in self.base.covered]
@@ -125,7 +127,7 @@ class _Deciding:
             settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
         )
         scan = is_scan(looked, weighted=weighted)
-        several = any(self.tiling.scale_count(size) > 1 for size in probe.sizes)
+        several = any(len(self.tiling.scales(size)) > 1 for size in probe.sizes)
         steps_coarse = settings.steps_coarse if several or settings.preset == "paper" else 0
         views = len(probe.distinct)
         form = self._kept_form((steps_coarse + settings.steps_sos) * settings.views_per_step / views)
@@ -200,6 +202,7 @@ class _Deciding:
             *decisions.of_scene(probe, plan, settings),
             *decisions.of_views(probe, plan, settings, self.work, shared),
             *decisions.of_surround(plan, settings, self.visits),
+            *decisions.of_colours(settings),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
             *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),

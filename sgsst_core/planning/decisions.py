@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS
 from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
@@ -54,7 +55,10 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
 def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
     scene, degree = probe.scene, probe.scene.used_degree
     if not scene.sh_degree:
-        return [Decision("spherical harmonics", "no view directions are computed", "the scene has degree 0")]
+        nothing = ": there is nothing to fade" if settings.sh_fade else ""
+        return [Decision("spherical harmonics", "no view directions are computed", f"the scene has degree 0{nothing}")]
+    if settings.sh_fade:
+        return [_of_fading(probe, settings.sh_fade)]
     if "sh" in settings.keep or degree == scene.sh_degree:
         return []
     return [
@@ -65,6 +69,25 @@ def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
             bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
         )
     ]
+
+
+def _of_fading(probe: Probe, fade: float) -> Decision:
+    scene = probe.scene
+    if fade == 1:
+        return Decision(
+            "spherical harmonics",
+            f"degrees 1 to {scene.sh_degree} are faded out: no view directions are computed, and the result has zeros",
+            "asked for",
+            bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - 1) * 4,
+            error="no colour depends on the direction of view any more",
+        )
+    return Decision(
+        "spherical harmonics",
+        f"coefficients of degrees 1 to {scene.sh_degree} are {1 - fade:.3g} times as large, in the result too; "
+        f"evaluated up to degree {scene.used_degree}",
+        "asked for",
+        error="colours depend less on the direction of view",
+    )
 
 
 def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_bytes: int) -> list[Decision]:
@@ -120,15 +143,30 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
         decisions.append(Decision("surround", f"{colour} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
         reason = f"{share}: nothing beside the object tells how bright it should be"
+        begins = "luminance begins" if settings.keep_colours == "luminance" else "colours begin"
         decisions.append(
             Decision(
                 "start",
-                "colours begin with the style's mean and spread",
+                f"{begins} with the style's mean and spread",
                 reason if settings.warm_start is None else "asked for",
                 error="it is another start than the paper's",
             )
         )
     return decisions
+
+
+def of_colours(settings: Settings) -> list[Decision]:
+    """What becomes of the scene's colours, where they do not simply become the style's."""
+    if settings.keep_colours != "luminance":
+        return []
+    return [
+        Decision(
+            "colours",
+            "luminance alone is compared and optimised: each Gaussian keeps its chroma",
+            "asked for",
+            error=_ANOTHER_LOSS,
+        )
+    ]
 
 
 def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -> list[Decision]:
@@ -288,12 +326,16 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
     scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
     reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
     decisions.append(Decision("scales", scales, reason))
+    if settings.scales:
+        decisions.append(_of_scale_weights(settings, max(counts)))
     if settings.steps_coarse and not plan.steps_coarse:
         decisions.append(
             Decision(
                 "phase 1",
                 f"its {settings.steps_coarse} steps are left out",
-                "the coarsest scale is the only one, so that it would be the same as phase 2",
+                "one scale is the only one that counts, so that it would be the same as phase 2"
+                if settings.scales
+                else "the coarsest scale is the only one, so that it would be the same as phase 2",
                 error="the steps, which work on the same loss",
             )
         )
@@ -311,6 +353,15 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
             )
         )
     return decisions
+
+
+def _of_scale_weights(settings: Settings, most: int) -> Decision:
+    weights = ScaleWeights(settings.scales)
+    chosen = weights.chosen(most)
+    told = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in chosen)
+    left = most - len(chosen)
+    nothing = f"; {left} of {most} scales are not computed" if left else ""
+    return Decision("weights of scales", f"{told}{nothing}", "asked for", error=_ANOTHER_LOSS)
 
 
 def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:

@@ -21,7 +21,7 @@ def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
         return LaunchCost(problem="only NVIDIA GPUs are known to replay them")
     picture = soft_picture(max(size))[: size[0], : size[1]].contiguous().to(loss.network.device)
     style, view = loss.style_targets(picture.flip(0), size), loss.view_target(picture)
-    scales = list(range(loss.scale_count(*size)))
+    scales = loss.scales(*size)
     graphs = LossGraphs(loss)
 
     def evaluate() -> SosResult:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.loss.feature_scale import at_scale
+from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.orbit import Orbit, orbit_decisions
@@ -53,7 +54,8 @@ def make_plan(
 
     Raises:
         CameraError: no cameras, or none sees a Gaussian.
-        SettingsError: pruning would leave no Gaussian, or a rasterizer that cannot be used here.
+        SettingsError: pruning would leave no Gaussian, the views do not have the scales that were asked for, or a
+            rasterizer that cannot be used here.
         WeightsError: no weights.
     """
     if not cameras:
@@ -61,8 +63,10 @@ def make_plan(
     timer = timer or Timer()
     with timer("planning"):
         fitted = fit_cameras(cameras, settings)
-        weights = at_scale(weights or load_network_weights("auto"), settings.feature_scale)
+        check_scales(settings.scales, fitted, settings.coarsest_side)
+        weights = weights_for(weights or load_network_weights("auto"), settings)
         workshop = equip(scene, fitted, settings, weights, collectives, rasterizer)
+        scene = workshop.scene
         if looked is None:
             with timer("survey"):
                 looked = survey(scene, fitted, workshop.rasterizer, collectives, show)

@@ -21,6 +21,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import search
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import Collectives
@@ -81,7 +82,8 @@ class SceneFacts:
     Attributes:
         gaussians: N.
         sh_degree: of its file.
-        used_degree: highest SH degree with a coefficient that is not 0, among the Gaussians that are rendered.
+        used_degree: highest SH degree with a coefficient that is not 0 after fading, among the Gaussians that are
+            rendered.
         held_degree: of what is in memory; 0 where coefficients stay in the file.
     """
 
@@ -182,7 +184,8 @@ class Workshop:
     """What measuring needs, and a job that follows the plan goes on to use.
 
     Attributes:
-        scene: the whole scene.
+        scene: the whole scene, with its spherical harmonics faded as the settings say.
+        sh_degree: of the scene as it came.
         cameras: at the size at which they are stylized.
         weights: of the network.
         network: in the precision in which it will run.
@@ -198,6 +201,7 @@ class Workshop:
     network: FeatureNetwork
     precision_ratio: float | None
     rasterizer: Rasterizer
+    sh_degree: int
 
 
 def equip(
@@ -214,6 +218,7 @@ def equip(
         cameras: at the size at which they are stylized.
         rasterizer: that computes blend weights anew; None chooses.
     """
+    sh_degree, scene = scene.sh_degree, scene.faded(settings.sh_fade)
     device = common_device(collectives)
     problems = gpu_problems(collectives) if device == "cuda" else {}
     ratio = precision_ratio(settings.precision, device, collectives)
@@ -229,7 +234,7 @@ def equip(
     )
     name = rasterizer or rasterizer_anew(device, problems)
     whole = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
-    return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole)
+    return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole, sh_degree)
 
 
 def common_device(collectives: Collectives) -> Device:
@@ -286,7 +291,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     used_degree = scene.used_degree(seen)
     held_degree = 0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree
     return Probe(
-        SceneFacts(len(scene), scene.sh_degree, used_degree, held_degree),
+        SceneFacts(len(scene), workshop.sh_degree, used_degree, held_degree),
         tuple((camera.height, camera.width) for camera in cameras),
         looked,
         tuple(distinct),
@@ -336,7 +341,7 @@ def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
     )
 
 
-def _loss(workshop: Workshop) -> SosLoss:
+def _loss(workshop: Workshop, scales: ScaleWeights = EVEN) -> SosLoss:
     """As one rank's."""
     settings = workshop.settings
     return SosLoss(
@@ -345,6 +350,7 @@ def _loss(workshop: Workshop) -> SosLoss:
         style_loss=settings.style_loss,
         memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
         coarsest=settings.coarsest_side,
+        scales=scales,
         keep_activations="activations" not in settings.keep,
     )
 
@@ -355,7 +361,7 @@ def _launch_cost(workshop: Workshop, views: Sequence[Camera]) -> LaunchCost | No
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
     if workshop.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
         return None
-    return launch_cost(_loss(workshop), (views[0].height, views[0].width))
+    return launch_cost(_loss(workshop, ScaleWeights(settings.scales)), (views[0].height, views[0].width))
 
 
 def _side(workshop: Workshop, loss: SosLoss) -> int:

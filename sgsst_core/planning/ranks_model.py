@@ -130,7 +130,8 @@ class IterationWork:
 
     @property
     def _image_bytes(self) -> int:
-        height, width = max(piece.size for piece in self.pieces)
+        # Of full size, whichever scales are computed of it.
+        height, width = max((piece.size[0] << piece.scale, piece.size[1] << piece.scale) for piece in self.pieces)
         return 12 * height * width
 
     @property

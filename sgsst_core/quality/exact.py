@@ -102,6 +102,7 @@ class ExactLoss:
             memory=stylizer.loss.memory,
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
+            scales=stylizer.loss.weights,
         )
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
 
@@ -171,7 +172,7 @@ class ExactTwin(ExactLoss):
             index, phase = stylizer.views.covered[0], stylizer.schedule[0]
         else:
             index, phase = stylizer.history[-1].view, stylizer.phase
-        scales = phase.scales(stylizer.scale_count(index))
+        scales = phase.scales(stylizer.scales(index))
         colours = stylizer.scene.sh_dc if start else stylizer.stylized()
         with stylizer.with_colours(colours) if start else nullcontext():
             approximate, seconds = stylizer.gradient(index, scales)

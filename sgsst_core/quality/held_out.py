@@ -186,6 +186,7 @@ class HeldOut:
             memory=loss.memory,
             tile_size=loss.tile_size,
             coarsest=loss.coarsest,
+            scales=loss.weights,
             leave_out=loss.leave_out,
         )
         self._sh_rest = scene.sh_rest.to(rasterizer.device)

@@ -12,6 +12,7 @@ from typing import Any
 from sgsst_core.budget import device_peak
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.parallel.collectives import TRAFFIC
 from sgsst_core.planning.measuring import allowed_seconds
@@ -79,13 +80,14 @@ def build_report(
         },
         "graphs": _graphs_json(stylizer),
         "machine": machine(stylizer.network.device),
-        "history": [_record_json(record, before) for record in stylizer.history],
+        "history": [_record_json(record, before, stylizer.loss.weights) for record in stylizer.history],
     }
 
 
 def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, after: Evaluation) -> dict[str, Any]:
     """What was made by which program in what time, and how good it is."""
     coarse = sum(record.stage == "coarse" for record in stylizer.history)
+    weights = stylizer.loss.weights
     return {
         "version": REPORT_VERSION,
         "program": {"name": "sgsst-service", "version": program_version()},
@@ -99,9 +101,9 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
         "seconds_by_part": {name: round(seconds, 3) for name, seconds in sorted(stylizer.seconds_by_part.items())},
         "loss": {
             "views": [stylizer.views.cameras[index].name for index in stylizer.evaluation_views],
-            "before": _evaluation_json(before),
-            "after": _evaluation_json(after),
-            "relative": mean_loss(after) / mean_loss(before),
+            "before": _evaluation_json(before, weights),
+            "after": _evaluation_json(after, weights),
+            "relative": mean_loss(after, weights) / mean_loss(before, weights),
             "relative_by_scale": {str(scale): after[scale].total / before[scale].total for scale in before},
         },
         "bought": bought(stylizer, before),
@@ -125,7 +127,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
         "scene": {
             "path": str(sources.scene),
             "gaussians": len(stylizer.scene),
-            "sh_degree": stylizer.scene.sh_degree,
+            "sh_degree": stylizer.sh_degree,
             "dropped": sources.dropped,
         },
         "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
@@ -240,7 +242,7 @@ def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
     records = [record for record in stylizer.history if record.stage == "sos"]
     if not records:
         return None
-    start, losses = mean_loss(before), [record.loss for record in records]
+    start, losses = mean_loss(before, stylizer.loss.weights), [record.loss for record in records]
     length = stylizer.round_length
     relative = [smoothed(losses[max(0, end - length) : end], length) / start for end in range(1, len(losses) + 1)]
     reached = []
@@ -285,16 +287,17 @@ def _cameras_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     }
 
 
-def _evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
-    return {"total": mean_loss(evaluation), "scales": {str(s): _terms_json(terms) for s, terms in evaluation.items()}}
+def _evaluation_json(evaluation: Evaluation, weights: ScaleWeights) -> dict[str, Any]:
+    scales = {str(scale): _terms_json(terms) for scale, terms in evaluation.items()}
+    return {"total": mean_loss(evaluation, weights), "scales": scales}
 
 
 def _terms_json(terms: LossTerms) -> dict[str, float]:
     return {**terms, "total": terms.total}
 
 
-def _record_json(record: StepRecord, before: Evaluation) -> dict[str, Any]:
-    start = mean_loss({scale: before[scale] for scale in record.terms if scale in before} or before)
+def _record_json(record: StepRecord, before: Evaluation, weights: ScaleWeights) -> dict[str, Any]:
+    start = mean_loss({scale: before[scale] for scale in record.terms if scale in before} or before, weights)
     return {
         "step": record.step,
         "stage": record.stage,

@@ -116,6 +116,7 @@ class StoredHarmonics:
         chosen: [N] int32, ascending: the rows that are the scene's Gaussians; None for all.
         coefficients: K, the first ones of the file's; None for all.
         file: the file, if it is open already.
+        factor: by which they are multiplied when they are read; rounded to float32.
 
     Raises:
         SceneError: the file cannot be opened, or is no longer what the layout says.
@@ -130,8 +131,10 @@ class StoredHarmonics:
         chosen: NDArray[np.int32] | None = None,
         coefficients: int | None = None,
         file: RowFile | None = None,
+        factor: float = 1.0,
     ) -> None:
         self.layout = layout
+        self._factor = factor
         self._chosen = chosen
         self._file = file or RowFile(layout.path)
         self._file.check_unchanged(layout.stamp)
@@ -140,7 +143,7 @@ class StoredHarmonics:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process opens the file itself."""
-        return StoredHarmonics, (self.layout, self._chosen, self.shape[1])
+        return StoredHarmonics, (self.layout, self._chosen, self.shape[1], None, self._factor)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -158,11 +161,15 @@ class StoredHarmonics:
         """Those of Gaussians whose indices ascend."""
         indices = rows.to("cpu", torch.int32).numpy()
         chosen = indices if self._chosen is None else self._chosen[indices]
-        return StoredHarmonics(self.layout, chosen, self.shape[1], self._file)
+        return StoredHarmonics(self.layout, chosen, self.shape[1], self._file, self._factor)
 
     def first(self, coefficients: int) -> StoredHarmonics:
         """The first coefficients of each colour alone."""
-        return StoredHarmonics(self.layout, self._chosen, coefficients, self._file)
+        return StoredHarmonics(self.layout, self._chosen, coefficients, self._file, self._factor)
+
+    def times(self, factor: float) -> StoredHarmonics:
+        """All of them multiplied by a factor, as a tensor in memory would be: in float32."""
+        return StoredHarmonics(self.layout, self._chosen, self.shape[1], self._file, self._factor * factor)
 
     def to(self, device: torch.device | str) -> StoredHarmonics | Tensor:
         """Themselves where they are used from the CPU; on a GPU a tensor [N, K, 3]."""
@@ -240,6 +247,8 @@ class StoredHarmonics:
                 rows = self._chosen[start:stop] - np.int32(row)
             if len(rows):
                 self._file.read(layout.offset + row * layout.row_bytes, buffer[: count * layout.row_bytes])
+                if self._factor != 1:
+                    values[:count] *= np.float32(self._factor)
                 work(start, values, rows)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import ScaleTarget
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.scene.camera import Camera
@@ -31,7 +32,7 @@ def evaluate(
         camera = views.cameras[index]
         with torch.no_grad():
             image = views.render(index, views.colours(index, sh_dc))
-        target = views.target(index, range(views.loss.scale_count(camera.height, camera.width)))
+        target = views.target(index, views.loss.scales(camera.height, camera.width))
         evaluations.append(views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
     return mean_evaluation(evaluations)
 
@@ -45,6 +46,6 @@ def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
     return {scale: terms / len(evaluations) for scale, terms in total.items()}
 
 
-def mean_loss(evaluation: Evaluation) -> float:
-    """E_SOS: the mean of the scales' losses."""
-    return sum(terms.total for terms in evaluation.values()) / len(evaluation)
+def mean_loss(evaluation: Evaluation, weights: ScaleWeights = EVEN) -> float:
+    """E_SOS: the weighted mean of the scales' losses."""
+    return weights.mean({scale: terms.total for scale, terms in evaluation.items()})

@@ -132,7 +132,7 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
         return None
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]
     if settings.target_loss and len(losses) >= stylizer.round_length:  # every view has been visited by then
-        target = settings.target_loss * mean_loss(stylizer.start())
+        target = settings.target_loss * mean_loss(stylizer.start(), stylizer.loss.weights)
         if stylizer.plan.surround != "background":
             losses = _losses_on_background(stylizer)
         if has_reached(losses, target, stylizer.round_length):
@@ -145,7 +145,7 @@ def _losses_on_background(stylizer: Stylizer) -> list[float]:
     if stylizer.step % stylizer.round_length:
         return []
     with stylizer.measuring():
-        return [mean_loss(stylizer.evaluate(stylizer.evaluation_views))] * stylizer.round_length
+        return [mean_loss(stylizer.evaluate(stylizer.evaluation_views), stylizer.loss.weights)] * stylizer.round_length
 
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sgsst_core.scene.luminance import with_chroma_of
+
 #: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
 #: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
@@ -21,9 +23,14 @@ class ColourOptimiser:
         learning_rate: until `update` names another one.
         unit: of the features that gradients come from (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
             gradients grow with its square, and would sooner be too large to be squared.
+        chroma_of: [n, 3], colours whose chroma is kept: what is optimised is then how far each colour's luminance is
+            from theirs. None lets colours change freely.
     """
 
-    def __init__(self, colours: Tensor, learning_rate: float, unit: float = 1.0) -> None:
+    def __init__(
+        self, colours: Tensor, learning_rate: float, unit: float = 1.0, chroma_of: Tensor | None = None
+    ) -> None:
+        self._chroma_of = chroma_of
         self._colours = colours.requires_grad_()
         self._unit = unit
         self._fused = colours.is_cuda
@@ -38,6 +45,9 @@ class ColourOptimiser:
         """
         if self._unit != 1:
             gradient = gradient / self._unit**2
+        if self._chroma_of is not None:
+            # The derivative with respect to what is added to all three channels. Adam's steps are the same in each.
+            gradient = gradient.sum(dim=1, keepdim=True).expand(-1, 3).contiguous()
         largest = gradient.abs().amax()
         for group in self._adam.param_groups:
             group["lr"] = learning_rate
@@ -48,7 +58,18 @@ class ColourOptimiser:
             self._adam.step()
         elif not is_too_large(float(largest)):
             self._adam.step()
+        else:
+            return largest
+        self._keep_chroma(largest)
         return largest
+
+    @torch.no_grad()
+    def _keep_chroma(self, largest: Tensor) -> None:
+        """Take rounding of the step out of the colours' chroma; where no step was made, nothing changes."""
+        if self._chroma_of is None:
+            return
+        kept = with_chroma_of(self._colours, self._chroma_of)
+        self._colours.copy_(torch.where(largest <= LARGEST_GRADIENT, kept, self._colours))
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """First and second moment [n, 3], on the CPU; zeros before the first step."""

@@ -16,16 +16,17 @@ class Phase:
     Attributes:
         stage: its name: "coarse" (phase 1) and "sos" (phase 2) in every preset.
         steps: how many.
-        scale: the one scale that is optimised, counted from the coarsest (0); None for all, the SOS loss.
+        scale: the one scale that is optimised, counted from the coarsest (0) of those that count; None for all of them,
+            the SOS loss.
     """
 
     stage: str
     steps: int
     scale: int | None = None
 
-    def scales(self, count: int) -> list[int]:
-        """The scales of a view that has `count`, 0 being full size."""
-        return list(range(count)) if self.scale is None else [max(count - 1 - self.scale, 0)]
+    def scales(self, chosen: Sequence[int]) -> list[int]:
+        """Those of a view's chosen scales, the finest first, that are optimised."""
+        return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
 
 
 def planned_phases(plan: Plan, settings: Settings) -> list[Phase]:

@@ -13,7 +13,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
-from sgsst_core.stylizing.warm_start import in_colours_of
+from sgsst_core.stylizing.warm_start import in_colours_of, in_luminance_of
 
 
 def prepared_style(style: Tensor, settings: Settings, sh_dc: Tensor, weights: Tensor) -> Tensor:
@@ -29,6 +29,8 @@ def prepared_style(style: Tensor, settings: Settings, sh_dc: Tensor, weights: Te
         # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
         # 2017, section 5.2.
         style = in_colours_of(style, sh_dc, weights)
+    elif settings.keep_colours == "luminance":
+        style = in_luminance_of(style, sh_dc, weights)  # section 5.1 there
     return style
 
 

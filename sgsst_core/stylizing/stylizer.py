@@ -18,8 +18,9 @@ from torch import Tensor
 from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, device_peak, forget_device_peak
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.loss.feature_scale import at_scale
+from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
@@ -49,7 +50,7 @@ from sgsst_core.stylizing.surround import Colour, drawn_colour
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import Views
-from sgsst_core.stylizing.warm_start import warm_start
+from sgsst_core.stylizing.warm_start import luminance_start, warm_start
 from sgsst_core.timing import Timer
 
 
@@ -102,7 +103,7 @@ class Stylizer:
         self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
-        self.weights = weights = at_scale(weights, settings.feature_scale)
+        self.weights = weights = weights_for(weights, settings)
         self.photos = photos
         self.style = style = prepared_style(style, settings, scene.sh_dc, plan.survey.total_blend_weights)
         forget_device_peak(plan.device)
@@ -117,7 +118,9 @@ class Stylizer:
         self.loss = self._loss()
         #: In place of `loss` in steps, where the plan says so.
         self.graphs = LossGraphs(self.loss) if plan.graphs and self.group.size == 1 else None
-        self.scene = scene
+        self.sh_degree = scene.sh_degree
+        #: With its spherical harmonics faded as the settings say.
+        self.scene = scene = workshop.scene if workshop else scene.faded(settings.sh_fade)
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
         rasterizer, self._coarse = self._rasterizers(seen, workshop)
@@ -125,7 +128,8 @@ class Stylizer:
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         start = self.transferred() if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
-        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit)
+        chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
+        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit, chroma_of)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.schedule = planned_phases(plan, settings)
@@ -168,9 +172,15 @@ class Stylizer:
     def transferred(self) -> Tensor:
         """Colours [N, 3] of the Gaussians that are rendered, with the style's mean and spread in closed form."""
         seen, own = self.plan.seen, self.scene.sh_dc[self.plan.seen]
-        found = warm_start(own, self.plan.survey.total_blend_weights[seen], self.style)
+        transfer = luminance_start if self._keeps_chroma else warm_start
+        found = transfer(own, self.plan.survey.total_blend_weights[seen], self.style)
         # Of what no view decides, colours follow from what becomes of the others: see `stylized`.
         return torch.where(self.plan.optimised[seen][:, None], found, own)
+
+    @property
+    def _keeps_chroma(self) -> bool:
+        """Whether colours change in luminance alone."""
+        return self.settings.keep_colours == "luminance"
 
     def _loss(self) -> SosLoss:
         settings = self.settings
@@ -181,6 +191,7 @@ class Stylizer:
             memory=int(self.memory * MEMORY_SHARES["activations"]),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
+            scales=ScaleWeights(settings.scales),
             leave_out="uncovered" not in settings.keep,
             keep_activations="activations" not in settings.keep,
             timer=self.timer,
@@ -265,6 +276,11 @@ class Stylizer:
         camera = self.views.cameras[index]
         return self.loss.scale_count(camera.height, camera.width)
 
+    def scales(self, index: int) -> list[int]:
+        """The scales of a view that count, the finest first."""
+        camera = self.views.cameras[index]
+        return self.loss.scales(camera.height, camera.width)
+
     @property
     def evaluation_views(self) -> list[int]:
         """Indices of the plan's `loss_views`, evenly spread over those that see anything."""
@@ -329,7 +345,7 @@ class Stylizer:
             phase.stage,
             views[0],
             self.seconds,
-            mean_loss(terms),
+            mean_loss(terms, self.loss.weights),
             terms,
             dict(self.timer.seconds),
             self._process.memory_info().rss,
@@ -346,7 +362,7 @@ class Stylizer:
         self._cost = 0
         own_views = views[self._team.own_group :: self._team.groups]
         for place, index in enumerate(own_views):
-            scales = phase.scales(self.scale_count(index))
+            scales = phase.scales(self.scales(index))
             behind = self.behind(index)
             with self.timer("prepare"):
                 target = self.views.target(index, scales, behind)
@@ -428,7 +444,7 @@ class Stylizer:
             index, phase = self._queue[-1 - self._team.own_group], phase_at(self.schedule, self.step + 1)
         else:
             return
-        self.views.look_ahead(index, phase.scales(self.scale_count(index)))
+        self.views.look_ahead(index, phase.scales(self.scales(index)))
 
     @property
     def coming(self) -> list[int]:
@@ -493,7 +509,8 @@ class Stylizer:
             result[self.plan.seen] = self.sh_dc.detach().cpu()
             if self.settings.unseen == "neighbours":
                 weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
-                result[weights <= 0] += neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
+                change = neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
+                result[weights <= 0] += change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
             self._stylized = result
         return self._stylized
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import SH_C0
+from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.scene.luminance import luminance
 
 #: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
 #: could be stretched to the style's: it is left flat instead of blowing rounding up.
@@ -51,6 +52,46 @@ def in_colours_of(style: Tensor, sh_dc: Tensor, weights: Tensor) -> Tensor:
     mean, covariance = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
     matched = (pixels - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
     return matched.clamp(0, 1).to(style.dtype).reshape(style.shape)
+
+
+def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor) -> Tensor:
+    """As `warm_start`, in luminance alone: mean and spread of the style's, clamped to 0..1, with the colours' chroma.
+
+    Returns:
+        [N, 3] float32.
+    """
+    own = luminance(COLOUR_OFFSET + SH_C0 * sh_dc.double())
+    wanted = luminance(style.reshape(-1, 3).double()).to(own)
+    matched = _matched(own, weights.double(), wanted.mean(), wanted.std(correction=0))
+    return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
+
+
+def in_luminance_of(style: Tensor, sh_dc: Tensor, weights: Tensor) -> Tensor:
+    """A style image [H, W, 3] in 0..1 without colour, its luminance with mean and deviation of a scene's.
+
+    Args:
+        sh_dc, weights: as in `warm_start`.
+    """
+    colours = luminance((COLOUR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1))
+    share = weights.double() / weights.double().amax()
+    share = share / share.sum()
+    mean = (share * colours).sum()
+    spread = (share * (colours - mean).square()).sum().sqrt()
+    own = luminance(style.reshape(-1, 3).double())
+    equal = torch.ones(len(own), dtype=own.dtype, device=own.device)
+    matched = _matched(own, equal, mean.to(own), spread.to(own))
+    return matched.to(style.dtype).reshape(*style.shape[:2], 1).expand(style.shape).contiguous()
+
+
+def _matched(values: Tensor, weights: Tensor, mean: Tensor, spread: Tensor) -> Tensor:
+    """Values [n] moved and stretched to a mean and a deviation, clamped to 0..1; flat ones are moved alone."""
+    share = weights / weights.amax()
+    share = share / share.sum()
+    own = (share * values).sum()
+    deviation = (share * (values - own).square()).sum().sqrt()
+    flat = deviation <= _FLAT**0.5 * own.abs().clamp_min(torch.finfo(values.dtype).tiny)
+    factor = torch.where(flat, 0.0, spread / torch.where(flat, 1.0, deviation))
+    return ((values - own) * factor + mean).clamp(0, 1)
 
 
 def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

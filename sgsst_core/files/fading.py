@@ -1,0 +1,81 @@
+"""Spherical harmonics that fade as a scene's rows are written again: `f_rest_*` times one factor, in float32.
+
+What is written is what a job has optimised with: `Scene.faded` multiplies the same float32 numbers by the same one.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.ply_header import PlyHeader
+from sgsst_core.scene.gaussians import fade_factor
+
+
+@dataclass(frozen=True)
+class Fading:
+    """What fades in rows of a file.
+
+    Attributes:
+        names: of the properties, in the file's order.
+        factor: float32's value; 0 makes every coefficient 0, without a sign.
+    """
+
+    names: tuple[str, ...]
+    factor: float
+
+    @staticmethod
+    def of(header: PlyHeader, fade: float) -> Fading | None:
+        """Of a file's vertices; None where nothing changes."""
+        names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
+        factor = fade_factor(fade)
+        return Fading(names, factor) if names and factor != 1 else None
+
+    def apply(self, rows: NDArray[Any]) -> None:
+        """Fade a structured block of rows, in place."""
+        if not len(rows):
+            return
+        dtype = rows.dtype
+        assert dtype.fields is not None
+        first = dtype.fields[self.names[0]][1]
+        packed = all(
+            dtype[name] == np.dtype("<f4") and dtype.fields[name][1] == first + 4 * place
+            for place, name in enumerate(self.names)
+        )
+        if packed and first % 4 == 0 and dtype.itemsize % 4 == 0:  # as trainers write them: one pass over the rows
+            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
+            part = table[:, first // 4 : first // 4 + len(self.names)]
+            part[:] = self.faded(part)
+            return
+        for name in self.names:
+            rows[name] = self.faded(rows[name].astype(np.float32))
+
+    def faded(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Float32 values after fading."""
+        return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
+
+
+def check_fading(path: Path, header: PlyHeader | None, fade: float) -> None:
+    """Prove that a file can hold faded coefficients.
+
+    Args:
+        header: None for what is no PLY: it becomes one, of float32.
+
+    Raises:
+        SceneError: they are stored as integers.
+    """
+    if header is None or "vertex" not in header.names or not fade:
+        return
+    kinds = {prop.name: prop.kind for prop in header.vertex.properties}
+    whole = [name for name, kind in kinds.items() if re.fullmatch(r"f_rest_\d+", name) and kind[0] != "f"]
+    if whole:
+        raise SceneError(
+            f"{path}: {whole[0]} is stored as integers, which cannot fade. Convert it to float first, or leave "
+            "--sh-fade out."
+        )

@@ -1,0 +1,82 @@
+"""What artists ask for, through the command: told in the plan, done in the result, refused before the work."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from api.cli.main import main
+from sgsst_core.files.ply import read_scene
+from sgsst_core.scene.stored_harmonics import held
+from tests.small_scenes import wall, write_files
+
+pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
+
+CONTROLS = ["--keep-colours", "luminance", "--sh-fade", "0.25", "--scales", "1,0,0.5", "--coarsest-side", "16"]
+
+
+def command(name: str, folder: Path, *options: str) -> list[str]:
+    ply, cameras, style = write_files(folder, wall(sh_degree=1))
+    return [name, str(ply), "--style", str(style), "--cameras", str(cameras), "--backbone", "vgg16", *options]
+
+
+@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
+def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+    out = tmp_path / "new" / f"out.{form}"
+    steps = ["--steps-coarse", "1", "--steps-sos", "3"]
+    assert main(command("stylize", tmp_path, "--out", str(out), *steps, *CONTROLS)) == 0
+    shown = capsys.readouterr().out
+    for line in (
+        "luminance alone is compared and optimised",
+        "0.75 times as large",
+        "scale 0 1, scale 2 0.5; 1 of 3 scales are not computed",
+        "2 of 3 scales",
+    ):
+        assert line in shown
+    before, after = (read_scene(path).scene for path in (tmp_path / "scene.ply", tmp_path / "new" / "out.ply"))
+    assert torch.equal(held(after.sh_rest), 0.75 * held(before.sh_rest))
+    change = after.sh_dc - before.sh_dc
+    assert float(change.abs().max()) > 0.1
+    torch.testing.assert_close(change, change.mean(1, keepdim=True).expand(-1, 3), atol=1e-6, rtol=0)
+    report = json.loads((tmp_path / "new" / "out.report.json").read_text())
+    assert report["settings"]["keep_colours"] == "luminance"
+    assert report["settings"]["scales"] == [1, 0, 0.5]
+    assert report["settings"]["sh_fade"] == 0.25
+    assert report["scene"]["sh_degree"] == 1
+    loss = report["loss"]["after"]
+    assert sorted(loss["scales"]) == ["0", "2"]
+    assert loss["total"] == pytest.approx((loss["scales"]["0"]["total"] + 0.5 * loss["scales"]["2"]["total"]) / 1.5)
+    packed = read_scene(out).scene
+    assert float(held(packed.sh_rest).abs().max()) < 0.8 * float(held(before.sh_rest).abs().max())
+
+
+def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command("plan", tmp_path, "--out", str(tmp_path / "plan.json"), *CONTROLS)) == 0
+    items = [entry["item"] for entry in json.loads((tmp_path / "plan.json").read_text())["decisions"]]
+    assert {"colours", "spherical harmonics", "weights of scales"} <= set(items)
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--scales", "0,0"], "no scale has a weight"),
+        (["--scales", "1,-1"], "greater than or equal to 0"),
+        (["--scales", "nan"], "finite"),
+        (["--scales", "fine"], "are no numbers with commas between them"),
+        (["--scales", "0,1"], "the views have one scale, 0"),
+        (["--sh-fade", "1.5"], "less than or equal to 1"),
+        (["--keep-colours", "hue"], "hue"),
+    ],
+    ids=str,
+)
+def test_what_makes_no_sense_is_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], problem: str
+) -> None:
+    for name in ("stylize", "plan"):
+        out = tmp_path / ("out.ply" if name == "stylize" else "plan.json")
+        assert main(command(name, tmp_path, "--out", str(out), *options)) == 2
+        assert problem in capsys.readouterr().err
+        assert not out.exists()

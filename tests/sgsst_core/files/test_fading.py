@@ -1,0 +1,143 @@
+"""Spherical harmonics that fade: the same float32 numbers in memory, in a file, and in the file that is written."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files import ply
+from sgsst_core.files.ply import read_scene, write_packed, write_scene, write_stylized
+from sgsst_core.scene import stored_harmonics
+from sgsst_core.scene.gaussians import fade_factor
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from tests.sgsst_core.splat_scenes import cloud
+
+FADES = (1e-9, 0.25, 0.7, 1.0)
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
+    monkeypatch.setattr(ply, "BLOCK_ROWS", 17)
+
+
+def written(folder: Path, degree: int = 3) -> Path:
+    write_scene(folder / "scene.ply", cloud(60, degree=degree))
+    return folder / "scene.ply"
+
+
+def in_another_form(path: Path, form: str) -> Path:
+    """The same scene: as text, in the other byte order, with doubles, or with a property among the coefficients."""
+    vertices = PlyData.read(path)["vertex"].data
+    kinds = [(name, "<f8" if form == "doubles" and "rest" in name else "<f4") for name in vertices.dtype.names]
+    if form == "mixed up":
+        kinds.insert(20, ("extra", "u1"))
+        kinds.append(kinds.pop(12))
+    rows = np.zeros(len(vertices), kinds)
+    for name in vertices.dtype.names:
+        rows[name] = vertices[name]
+    target = path.with_name("other.ply")
+    PlyData([PlyElement.describe(rows, "vertex")], text=form == "text", byte_order=">" if form == "big" else "<").write(
+        target
+    )
+    return target
+
+
+@pytest.mark.parametrize("form", ["plain", "text", "big", "doubles", "mixed up"])
+@pytest.mark.parametrize("fade", FADES)
+def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, fade: float) -> None:
+    path = written(tmp_path)
+    if form != "plain":
+        path = in_another_form(path, form)
+    source = read_scene(path)
+    wanted = source.scene.faded(fade)
+    colours = source.scene.sh_dc + 1
+    write_stylized(source, tmp_path / "out.ply", colours, sh_fade=fade)
+    found = read_scene(tmp_path / "out.ply").scene
+    rest = torch.zeros_like(held(found.sh_rest)) if fade == 1 else held(wanted.sh_rest)
+    assert torch.equal(held(found.sh_rest), rest)
+    if fade == 1:
+        assert wanted.sh_degree == 0
+        assert not torch.signbit(held(found.sh_rest)).any()
+    assert torch.equal(found.sh_dc, colours)
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(found, name), getattr(source.scene, name))
+    before, after = (PlyData.read(each)["vertex"].data for each in (path, tmp_path / "out.ply"))
+    assert before.dtype == after.dtype
+    for name in set(before.dtype.names) - {"f_dc_0", "f_dc_1", "f_dc_2"}:
+        if "rest" not in name:
+            assert np.array_equal(before[name], after[name])
+
+
+def test_without_fading_every_byte_stays(tmp_path: Path) -> None:
+    source = read_scene(written(tmp_path))
+    for name, values in (("a", {}), ("b", {"sh_fade": 0.0}), ("c", {"sh_fade": 1e-9})):
+        write_stylized(source, tmp_path / f"{name}.ply", source.scene.sh_dc, **values)
+        assert (tmp_path / f"{name}.ply").read_bytes() == source.path.read_bytes()
+    assert source.scene.faded(0) is source.scene
+
+
+@pytest.mark.parametrize("fade", FADES)
+def test_coefficients_in_the_file_are_those_in_memory(tmp_path: Path, fade: float) -> None:
+    path = written(tmp_path)
+    stored, plain = (read_scene(path, held_bytes=limit).scene.faded(fade) for limit in (0, None))
+    assert isinstance(plain.sh_rest, Tensor)
+    if fade == 1:
+        assert stored.sh_rest.shape == plain.sh_rest.shape == (60, 0, 3)
+        return
+    assert isinstance(stored.sh_rest, StoredHarmonics)
+    rows = torch.arange(0, 60, 3)
+    for found in (stored.sh_rest, pickle.loads(pickle.dumps(stored.sh_rest))):
+        assert torch.equal(found.tensor(), plain.sh_rest)
+        assert torch.equal(held(found[rows]), plain.sh_rest[rows])
+        assert torch.equal(found.first(8).tensor(), plain.sh_rest[:, :8])
+        assert torch.equal(found.largest(), plain.sh_rest.abs().amax((1, 2)))
+    assert stored.used_degree() == 3
+
+
+def test_rows_that_were_dropped_are_absent_and_the_others_fade(tmp_path: Path) -> None:
+    scene = cloud(60, degree=2)
+    scene.means[5] = torch.nan
+    write_scene(tmp_path / "scene.ply", scene)
+    source = read_scene(tmp_path / "scene.ply", drop_invalid=True)
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.5)
+    found = read_scene(tmp_path / "out.ply").scene
+    assert len(found) == 59
+    assert torch.equal(held(found.sh_rest), held(source.scene.sh_rest) * 0.5)
+
+
+def test_a_scene_of_degree_0_has_nothing_to_fade(tmp_path: Path) -> None:
+    source = read_scene(written(tmp_path, degree=0))
+    assert source.scene.faded(0.5) is source.scene
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.5)
+    assert (tmp_path / "out.ply").read_bytes() == source.path.read_bytes()
+
+
+def test_packed_scenes_fade_into_their_ply(tmp_path: Path) -> None:
+    write_packed(tmp_path / "scene.spz", cloud(60, degree=1), "spz")
+    source = read_scene(tmp_path / "scene.spz")
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.25)
+    assert torch.equal(held(read_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.75)
+
+
+def test_whole_numbers_cannot_fade(tmp_path: Path) -> None:
+    vertices = PlyData.read(written(tmp_path, 1))["vertex"].data
+    kinds = [(name, "i4" if "rest" in name else "<f4") for name in vertices.dtype.names]
+    PlyData([PlyElement.describe(vertices.astype(kinds), "vertex")], byte_order="<").write(tmp_path / "whole.ply")
+    source = read_scene(tmp_path / "whole.ply")
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
+    with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot fade"):
+        write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.5)
+
+
+def test_the_factor_is_a_float32() -> None:
+    assert fade_factor(0) == 1
+    assert fade_factor(1) == 0
+    assert np.float32(fade_factor(0.3)) == fade_factor(0.3)

@@ -1,0 +1,112 @@
+"""Scales that count more, less or not at all: the weighted loss by its definition, and nothing computed in vain."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights, check_scales
+from sgsst_core.loss.sos import SosLoss, SosResult, resize_area
+from sgsst_core.loss.sos_reference import sos_reference
+from sgsst_core.scene.pyramid import style_size
+from sgsst_core.settings import make_settings
+from tests.sgsst_core.pictures import picture, relative_error
+from tests.small_scenes import cameras
+
+SIZE, COARSEST = (160, 233), 50
+
+
+def evaluate(
+    weights: BackboneWeights,
+    values: tuple[float, ...],
+    tile_size: int | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> tuple[SosResult, list[tuple[int, int]]]:
+    """The loss of a view of three scales, and the sizes of all pictures that went through the network."""
+    image, content, painting = (picture(*SIZE, seed=seed).to(dtype) for seed in (1, 2, 3))
+    coverage = (picture(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1).to(dtype)
+    network = FeatureNetwork(weights, dtype=dtype)
+    seen, forward = [], network.forward
+
+    def looked(rgb: torch.Tensor, *, keep: bool = True) -> object:
+        seen.append((int(rgb.shape[0]), int(rgb.shape[1])))
+        return forward(rgb, keep=keep)
+
+    network.forward = looked  # type: ignore[method-assign, assignment]
+    loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
+    targets = loss.style_targets(painting, SIZE)
+    result = loss.evaluate(image, targets, loss.view_target(content, coverage))
+    assert targets.keys() == set(result.scales)
+    return result, seen
+
+
+@pytest.mark.parametrize("values", [(1.0, 0.5, 2.0), (0.0, 3.0, 0.25), (1.0,), (0.0, 0.0, 1e-9), (1e12, 1e-12)])
+@pytest.mark.parametrize("tile_size", [None, 64])
+def test_float64_agrees_with_the_definition(
+    tiny_weights: BackboneWeights, values: tuple[float, ...], tile_size: int | None
+) -> None:
+    image, content, painting = (picture(*SIZE, seed=seed) for seed in (1, 2, 3))
+    painting = resize_area(painting, style_size(SIZE, SIZE))
+    coverage = (picture(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+    expected, gradient = sos_reference(
+        tiny_weights, image, painting, content, coverage=coverage, coarsest=COARSEST, scales=values
+    )
+    found, _ = evaluate(tiny_weights, values, tile_size)
+    assert found.loss == pytest.approx(expected, rel=1e-9)
+    assert found.image_gradient is not None
+    assert relative_error(found.image_gradient, gradient) < 1e-9
+
+
+def test_scales_without_weight_do_not_go_through_the_network(tiny_weights: BackboneWeights) -> None:
+    result, seen = evaluate(tiny_weights, (0.0, 1.0))
+    assert result.scales == (1,)
+    assert all(height <= SIZE[0] // 2 and width <= SIZE[1] // 2 for height, width in seen)
+    assert len(seen) == 3  # content, style and view, once each
+
+
+@pytest.mark.parametrize("values", [(1.0, 1.0, 1.0), (7.0, 7.0, 7.0)])
+def test_equal_weights_give_the_bits_of_none(tiny_weights: BackboneWeights, values: tuple[float, ...]) -> None:
+    found, _ = evaluate(tiny_weights, values, dtype=torch.float32)
+    expected, _ = evaluate(tiny_weights, (), dtype=torch.float32)
+    assert found.image_gradient is not None
+    assert expected.image_gradient is not None
+    assert torch.equal(found.values, expected.values)
+    if values[0] == 1:
+        assert found.loss == expected.loss
+        assert torch.equal(found.image_gradient, expected.image_gradient)
+    else:
+        torch.testing.assert_close(found.image_gradient, expected.image_gradient)
+
+
+def test_shares_add_up_and_none_is_a_mistake() -> None:
+    weights = ScaleWeights((1.0, 0.0, 3.0))
+    assert weights.chosen(5) == [0, 2]
+    assert EVEN.chosen(3) == [0, 1, 2]
+    assert weights.shares([0, 2]) == {0: 0.25, 2: 0.75}
+    assert weights.mean({0: 4.0, 2: 8.0}) == 7
+    with pytest.raises(ValueError, match="none of the scales"):
+        weights.shares([1])
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.0), (-1.0, 1.0), (math.nan,), (math.inf, 1.0), (1e13,), (1.0,) * 17])
+def test_weights_that_mean_nothing_are_refused(values: tuple[float, ...]) -> None:
+    with pytest.raises(SettingsError, match="scales"):
+        make_settings(scales=values)
+
+
+def test_scales_that_no_view_has_are_refused() -> None:
+    views = cameras(2, 128, 96)
+    check_scales((1.0, 0.0, 0.5), views, 24)
+    check_scales((1.0, 0.0, 0.0, 0.0), views, 96)
+    check_scales((), views, 96)
+    with pytest.raises(SettingsError, match="gives scale 3 a weight, but the views have 3 scales, 0 to 2"):
+        check_scales((1.0, 0.0, 0.5, 1.0), views, 24)
+    with pytest.raises(SettingsError, match="gives scale 1 a weight, but the views have one scale, 0"):
+        check_scales((0.0, 1.0), views, 96)
+    with pytest.raises(SettingsError, match="leaves view 'view_0' nothing: it has 1 of the views' 3 scales"):
+        check_scales((0.0, 1.0), [*cameras(1, 30, 20), *cameras(2, 128, 96)[1:]], 24)

@@ -1,0 +1,80 @@
+"""Jobs whose spherical harmonics fade: what is optimised is what is written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.ply import read_scene, write_scene, write_stylized
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import run, stylize
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.small_scenes import cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(weights: BackboneWeights, scene: Scene, **values: Any) -> Stylizer:
+    settings = make_settings(steps_coarse=0, steps_sos=3, early_stop=False, **values)
+    return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
+
+
+def line(stylizer: Stylizer) -> str:
+    (found,) = (each for each in stylizer.plan.decisions if each.item == "spherical harmonics")
+    return f"{found.decision}: {found.reason}"
+
+
+@pytest.mark.parametrize("fade", [0.4, 1.0])
+def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeights, fade: float) -> None:
+    scene = wall(sh_degree=2)
+    stylizer = make(tiny_weights, scene, sh_fade=fade)
+    came = replace(scene, sh_rest=held(scene.sh_rest) * torch.tensor(1 - fade, dtype=torch.float32))
+    other = make(tiny_weights, came.without_zero_bands())
+    for each in (stylizer, other):
+        run(each)
+    assert torch.equal(stylizer.stylized(), other.stylized())
+    assert [record.loss for record in stylizer.history] == [record.loss for record in other.history]
+    assert stylizer.scene.sh_degree == (0 if fade == 1 else 2)
+    assert stylizer.sh_degree == 2
+    exact = ExactTwin(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
+    assert exact.keys() == stylizer.evaluate(stylizer.evaluation_views).keys()
+    for scale, terms in stylizer.evaluate(stylizer.evaluation_views).items():
+        assert exact[scale].total == pytest.approx(terms.total, rel=1e-6)
+
+
+@pytest.mark.parametrize("held_bytes", [0, None])
+@pytest.mark.parametrize("fade", [0.4, 1.0])
+def test_the_picture_of_the_result_is_what_was_optimised(
+    tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, fade: float
+) -> None:
+    write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
+    source = read_scene(tmp_path / "scene.ply", held_bytes=held_bytes)
+    assert isinstance(source.scene.sh_rest, StoredHarmonics) == (held_bytes == 0)
+    settings = make_settings(steps_coarse=0, steps_sos=2, sh_fade=fade)
+    colours = stylize(source.scene, cameras(), style(), settings, weights=tiny_weights)
+    write_stylized(source, tmp_path / "out.ply", colours, sh_fade=fade)
+    result = read_scene(tmp_path / "out.ply").scene
+    stylizer = Stylizer.planned(source.scene, cameras(), style(), settings, weights=tiny_weights)
+    stylizer.set_colours(colours)
+    again = Stylizer.planned(result, cameras(), style(), make_settings(), weights=tiny_weights)
+    for index in range(3):
+        pictures = [
+            each.views.render(index, each.views.colours(index, each.sh_dc.detach())) for each in (stylizer, again)
+        ]
+        assert torch.equal(*pictures)
+
+
+def test_the_plan_says_what_fades(tiny_weights: BackboneWeights) -> None:
+    assert "there is nothing to fade" in line(make(tiny_weights, wall(), sh_fade=0.5))
+    assert "0.75 times as large" in line(make(tiny_weights, wall(sh_degree=1), sh_fade=0.25))
+    out = make(tiny_weights, wall(sh_degree=1), sh_fade=1)
+    assert "faded out: no view directions are computed" in line(out)
+    assert out.views.scene.sh_degree == 0

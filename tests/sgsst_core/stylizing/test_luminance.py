@@ -1,0 +1,185 @@
+"""Colours that change in luminance alone, through whole jobs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.errors import DivergedError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.loss.sos_reference import sos_reference
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.luminance import luminance
+from sgsst_core.scene.pyramid import style_size
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.optimiser import ColourOptimiser
+from sgsst_core.stylizing.style_picture import prepared_style
+from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.warm_start import luminance_start
+from tests.sgsst_core.pictures import picture, relative_error
+from tests.small_scenes import ball, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+#: Of a value around 1, when it has been rounded to float32 once and was rounded before.
+ROUNDING = 2**-22
+
+
+def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) -> Stylizer:
+    chosen: dict[str, Any] = {"coarsest_side": 24, "keep_colours": "luminance"} | values
+    settings = make_settings(steps_coarse=2, steps_sos=steps, early_stop=False, **chosen)
+    return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
+
+
+def chroma_off(found: torch.Tensor, scene: Scene) -> float:
+    """How far what each Gaussian's channels have changed by is from being the same."""
+    change = found.double() - scene.sh_dc.double()
+    size = torch.maximum(found.abs(), scene.sh_dc.abs()).amax(1, keepdim=True).clamp_min(1).double()
+    return float(((change - change.mean(1, keepdim=True)).abs() / size).max())
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"revive": False},
+        {"warm_start": True},
+        {"surround": "palette"},
+        {"style_loss": "mixed"},
+        {"content_weight": 0, "views_per_step": 2},
+        {"unseen": "keep"},
+        {"memory_limit": 1 << 20},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("make_scene", [wall, ball])
+def test_every_gaussian_keeps_its_chroma(
+    tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
+) -> None:
+    scene = make_scene()
+    stylizer = make(tiny_weights, scene, **values)
+    assert any(line.item == "colours" for line in stylizer.plan.decisions)
+    before = stylizer.sh_dc.detach().clone()
+    run(stylizer)
+    found = stylizer.stylized()
+    assert float((stylizer.sh_dc.detach() - before).abs().max()) > 0.1
+    assert chroma_off(found, scene) < ROUNDING
+    if values.get("unseen") != "keep" and not stylizer.plan.seen.all():
+        hidden = ~stylizer.plan.seen
+        assert float((found - scene.sh_dc)[hidden].abs().max()) > 0
+
+
+def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: BackboneWeights) -> None:
+    """dE/d(what is added to all three channels of a Gaussian), by autograd through definitions in float64."""
+    scene, view = wall(), cameras(1)[0]
+    settings = make_settings(keep_colours="luminance", coarsest_side=24, steps_coarse=0, revive=False)
+    stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
+    found, _ = stylizer.gradient(0, range(stylizer.scale_count(0)))
+
+    rasterizer = ReferenceRasterizer(scene)
+    colours = (COLOUR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
+    image = rasterizer.render(colours, view)
+    size = (view.height, view.width)
+    used = resize_area(stylizer.style, style_size((stylizer.style.shape[0], stylizer.style.shape[1]), size))
+    _, pixels = sos_reference(stylizer.weights, image, used, image, coarsest=24)
+    exact = rasterizer.colour_gradient(pixels, view) * SH_C0 * (colours > 0)
+    assert stylizer.weights.grey
+    assert relative_error(found.sum(1).double(), exact.sum(1)[stylizer.plan.seen]) < 1e-4
+
+
+def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> None:
+    weights = replace(tiny_weights, grey=True)
+    image, content, painting = picture(129, 161, seed=1), picture(129, 161, seed=2), picture(100, 120, seed=3)
+    painting = resize_area(painting, style_size((100, 120), (129, 161)))
+    coverage = (picture(129, 161, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+    expected, gradient = sos_reference(weights, image, painting, content, coverage=coverage, coarsest=70)
+    for tile_size in (None, 64):
+        loss = SosLoss(FeatureNetwork(weights, dtype=torch.float64), tile_size=tile_size, coarsest=70)
+        targets = loss.style_targets(painting, (129, 161))
+        found = loss.evaluate(image, targets, loss.view_target(content, coverage))
+        assert found.loss == pytest.approx(expected, rel=1e-9)
+        assert found.image_gradient is not None
+        assert relative_error(found.image_gradient, gradient) < 1e-9
+
+
+def test_colours_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: BackboneWeights) -> None:
+    network = FeatureNetwork(replace(tiny_weights, grey=True), dtype=torch.float64)
+    image = picture(40, 48, seed=1)
+    other = image + torch.tensor([0.587, -0.299, 0.0], dtype=torch.float64) * picture(40, 48, seed=5)[..., :1]
+    first, second = (network.forward(each, keep=False).features for each in (image, other))
+    for layer, features in first.items():
+        torch.testing.assert_close(features, second[layer])
+
+
+def test_the_style_takes_the_scenes_luminance() -> None:
+    generator = torch.Generator().manual_seed(1)
+    colours = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
+    weights = torch.rand(5000, generator=generator, dtype=torch.float64)
+    settings = make_settings(keep_colours="luminance")
+    found = prepared_style(0.5 + 0.1 * picture(64, 64, seed=2).float(), settings, (colours - 0.5) / SH_C0, weights)
+    assert torch.equal(found[..., 0], found[..., 1])
+    share, values = weights / weights.sum(), luminance(colours.double())
+    mean = float((share * values).sum())
+    assert float(found.double().mean()) == pytest.approx(mean, abs=1e-5)
+    assert float(found[..., 0].double().std(correction=0)) == pytest.approx(
+        float((share * (values - mean).square()).sum().sqrt()), rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
+def test_flat_styles_and_scenes_are_finite(value: float) -> None:
+    settings = make_settings(keep_colours="luminance")
+    flat, some = torch.full((5, 4, 3), value), 0.3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    ones = torch.ones(20, dtype=torch.float64)
+    for scene_colours, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):
+        found = prepared_style(painting, settings, scene_colours, ones)
+        assert bool(found.isfinite().all())
+        wanted = luminance((0.5 + SH_C0 * scene_colours).clamp(0, 1)).mean()
+        torch.testing.assert_close(found.mean(), wanted, atol=1e-4, rtol=0)
+        start = luminance_start(scene_colours, ones, painting)
+        assert chroma_off(start, replace(wall(), sh_dc=scene_colours)) < ROUNDING
+        brightness = luminance(0.5 + SH_C0 * start.double())
+        assert -1e-6 <= float(brightness.min()) <= float(brightness.max()) <= 1 + 1e-6
+
+
+def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, tmp_path: Any) -> None:
+    whole, first, second = (make(tiny_weights, wall()) for _ in range(3))
+    run(whole)
+    for _ in range(3):
+        first.run_step()
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, "run", versions()), "job")
+    second.load_state(load_checkpoint(path, "job").state)
+    run(second)
+    assert torch.equal(whole.stylized(), second.stylized())
+
+
+def test_where_no_step_can_be_made_nothing_changes() -> None:
+    original = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    colours = original + 0.7 * torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
+    before = colours.clone()
+    optimiser = ColourOptimiser(colours, 0.1, chroma_of=original)
+    optimiser.update(torch.full((50, 3), 1e20), 0.1)
+    assert torch.equal(colours.detach(), before)
+    optimiser.update(torch.ones(50, 3), 0.1)
+    assert not torch.equal(colours.detach(), before)
+
+
+def test_a_run_that_diverges_keeps_its_colours(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, wall())
+    stylizer.run_step()
+    with torch.no_grad():
+        stylizer.sh_dc.mul_(1e12)
+    before = stylizer.sh_dc.detach().clone()
+    with pytest.raises(DivergedError):
+        stylizer.run_step()
+    assert torch.equal(before, stylizer.sh_dc.detach())

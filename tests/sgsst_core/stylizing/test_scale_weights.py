@@ -1,0 +1,90 @@
+"""Whole jobs in which some scales count."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.measure import Measurements
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.small_scenes import cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(weights: BackboneWeights, steps_coarse: int = 2, **values: Any) -> Stylizer:
+    settings = make_settings(**({"steps_coarse": steps_coarse, "steps_sos": 3, "coarsest_side": 16} | values))
+    return Stylizer.planned(wall(), cameras(), style(), settings, weights=weights)
+
+
+def line(stylizer: Stylizer, item: str) -> str:
+    return next((each.decision for each in stylizer.plan.decisions if each.item == item), "")
+
+
+def test_phase_1_takes_the_coarsest_scale_that_counts(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, scales=(1.0, 0.5))
+    assert stylizer.scale_count(0) == 3
+    run(stylizer)
+    assert [sorted(record.terms) for record in stylizer.history] == [[1], [1], [0, 1], [0, 1], [0, 1]]
+    record = stylizer.history[-1]
+    assert record.loss == pytest.approx((record.terms[0].total + 0.5 * record.terms[1].total) / 1.5)
+    assert line(stylizer, "weights of scales") == "scale 0 1, scale 1 0.5; 1 of 3 scales are not computed"
+
+
+def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, scales=(1.0, 0.0, 0.5))
+    found = stylizer.evaluate([0, 1])
+    assert sorted(found) == [0, 2]
+    weights = stylizer.loss.weights
+    assert mean_loss(found, weights) == pytest.approx((found[0].total + 0.5 * found[2].total) / 1.5)
+    twin = ExactTwin(stylizer).evaluate([0, 1], stylizer.scene.sh_dc)
+    assert mean_loss(twin, weights) == pytest.approx(mean_loss(found, weights), rel=1e-5)
+    run(stylizer)
+    measure = Measurements(stylizer)
+    measure.at_the_end()
+    assert set(map(int, stylizer.measured[-1]["held_out"]["gram"])) == {0, 2}
+
+
+def test_one_scale_leaves_phase_1_out(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, scales=(0.0, 1.0))
+    assert stylizer.plan.steps_coarse == 0
+    assert "left out" in line(stylizer, "phase 1")
+    record = stylizer.run_step()
+    assert list(record.terms) == [1]
+
+
+def test_equal_weights_give_the_bits_of_none(tiny_weights: BackboneWeights) -> None:
+    jobs = [make(tiny_weights), make(tiny_weights, scales=(1.0, 1.0, 1.0))]
+    for job in jobs:
+        run(job)
+    assert torch.equal(jobs[0].stylized(), jobs[1].stylized())
+
+
+def test_the_plan_counts_what_is_computed(tiny_weights: BackboneWeights) -> None:
+    whole, coarse = make(tiny_weights, steps_coarse=0), make(tiny_weights, steps_coarse=0, scales=(0.0, 0.0, 1.0))
+    expected = [job.plan.prediction for job in (whole, coarse)]
+    assert expected[0] is not None
+    assert expected[1] is not None
+    assert expected[1].style < 0.2 * expected[0].style  # a sixteenth of the pixels, and halos
+
+
+def test_scales_that_the_views_have_not_are_refused_before_anything_is_looked_at(tiny_weights: BackboneWeights) -> None:
+    with pytest.raises(SettingsError, match="the views have 3 scales"):
+        make(tiny_weights, scales=(1.0, 0.0, 0.0, 1.0))
+
+
+def test_several_runs_repeat_and_the_loss_falls(tiny_weights: BackboneWeights) -> None:
+    first, second = (make(tiny_weights, steps_sos=30, scales=(0.0, 1.0, 2.0), early_stop=False) for _ in range(2))
+    start = mean_loss(first.start(), first.loss.weights)
+    run(first)
+    run(second)
+    assert torch.equal(first.stylized(), second.stylized())
+    assert mean_loss(first.evaluate(first.evaluation_views), first.loss.weights) < 0.5 * start

@@ -1,0 +1,38 @@
+"""What artists ask for gives the same result on several ranks as on one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.scene.gaussians import Scene
+from tests.sgsst_core.pictures import relative_error
+from tests.small_scenes import ball, wall
+from tests.worker.ranks.spawn import on_ranks
+from tests.worker.ranks.test_exact_ranks import stylize
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.mark.parametrize(
+    ("scene", "values"),
+    [
+        pytest.param(wall(sh_degree=1), {"keep_colours": "luminance"}, id="luminance"),
+        pytest.param(wall(sh_degree=2), {"sh_fade": 0.3}, id="fading"),
+        pytest.param(wall(), {"scales": (1.0, 0.5)}, id="scales"),
+        pytest.param(wall(), {"scales": (0.0, 1.0), "style_loss": "mixed"}, id="one-scale"),
+        pytest.param(ball(), {"keep_colours": "luminance", "surround": "palette"}, id="luminance-of-a-scan"),
+    ],
+)
+def test_ranks_end_where_one_rank_ends(scene: Scene, values: dict[str, Any]) -> None:
+    values = {"steps_coarse": 2, "steps_sos": 4, "learning_rate": 0.01} | values
+    expected = stylize(ALONE, scene, 3, values)
+    for ranks in (2, 3):
+        found = on_ranks(ranks, stylize, scene, 3, values)
+        for result in found:
+            assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
+            assert relative_error(result["colours"], expected["colours"]) < 1e-3
+            assert torch.equal(result["colours"], found[0]["colours"])
