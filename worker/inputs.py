@@ -18,6 +18,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.loss.mixture import StyleMixture, normalised
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit
 from sgsst_core.planning.survey import nothing_seen, sees_something
@@ -28,6 +29,7 @@ from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.style_picture import check_style_size
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
+from worker.styles import StyleFile
 
 T = TypeVar("T")
 
@@ -38,7 +40,7 @@ class Inputs:
 
     Attributes:
         weights: of the feature network.
-        style: [H, W, 3] in 0..1.
+        style: pictures [H, W, 3] in 0..1.
         scene_file: the scene, and what was left out of its file.
         cameras: at the sizes that they are stylized at.
         orbit: how they were chosen; None for those of files.
@@ -47,7 +49,7 @@ class Inputs:
     """
 
     weights: BackboneWeights
-    style: Tensor
+    style: StyleMixture
     scene_file: SceneFile
     cameras: list[Camera]
     orbit: Orbit | None
@@ -69,7 +71,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     """
     source, settings, images = request.source, request.settings, request.images
     weights = _same_weights(request.backbone, collectives)
-    style = together(collectives, lambda: load_image(request.style))
+    style = together(collectives, lambda: load_styles(request.styles))
     scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)
@@ -78,6 +80,18 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
     own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps) if reader else None
     return Inputs(weights, style, scene_file, cameras, made, photos, _same_fingerprint(own, collectives))
+
+
+def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
+    """Read a style's pictures.
+
+    Raises:
+        ImageError: one cannot be used.
+        SettingsError: there are too many, or weights that are no shares.
+    """
+    weights = normalised([file.weight for file in files])  # before anything is read
+    names = tuple(file.path.name for file in files)
+    return StyleMixture(tuple(load_image(file.path) for file in files), weights, names)
 
 
 def _cameras_on_all_ranks(

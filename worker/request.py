@@ -11,6 +11,7 @@ from sgsst_core.files.scene_headers import PackedForm, form_of_name
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, ViewOptions
+from worker.styles import StyleFile
 
 
 class SceneRequest(ViewOptions):
@@ -37,7 +38,7 @@ class StylizeRequest:
 
     Attributes:
         source: scene and cameras.
-        style: style image.
+        styles: style pictures, with their weights.
         images: folder of photos for the content term; None for unstylized renders.
         out: PLY to write, or packed file to write beside one: see `Outputs.of`.
         backbone: feature network.
@@ -46,7 +47,7 @@ class StylizeRequest:
     """
 
     source: SceneRequest
-    style: Path
+    styles: tuple[StyleFile, ...]
     images: Path | None
     out: Path
     backbone: Backbone

@@ -21,6 +21,7 @@ from api.cli.progress_bars import clock, job_bar, live_bar
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
 from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
+from worker.styles import parse_styles
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from api.cli.bench import VariantsRequest
@@ -64,6 +65,14 @@ CamerasOption = Annotated[
     ),
 ]
 StyleOption = Annotated[Path, typer.Option(help="Style image.", show_default=False)]
+StylesOption = Annotated[
+    list[str],
+    typer.Option(
+        metavar="FILE[:WEIGHT]",
+        help="Style image. Several are mixed, in proportion to their weights.",
+        show_default=False,
+    ),
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -82,7 +91,7 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 def stylize(
     context: typer.Context,
     scene: SceneArgument,
-    style: StyleOption,
+    style: StylesOption,
     out: Annotated[
         Path,
         typer.Option(
@@ -102,7 +111,7 @@ def stylize(
     from worker.request import SceneRequest, StylizeRequest
 
     source = SceneRequest.of(scene, cameras, options)
-    request = StylizeRequest(source, style, images, out, options.backbone, run.resume, settings)
+    request = StylizeRequest(source, parse_styles(style), images, out, options.backbone, run.resume, settings)
     _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
 
 
@@ -253,7 +262,7 @@ def _time_bought(result: Result) -> list[str]:
 @with_options(StylizeOptions, without=("workers",))
 def plan(
     scene: SceneArgument,
-    style: StyleOption,
+    style: StylesOption,
     out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
     cameras: CamerasOption = None,
     sheet: Annotated[Path | None, typer.Option(help="Pictures of the views to write, JPEG.")] = None,
@@ -267,7 +276,7 @@ def plan(
     settings = options.settings()
     source = SceneRequest.of(scene, cameras, options)
     with job_bar(error_console) as bar:
-        made = make_plan(source, style, options.backbone, settings, out, bar.show_planning, sheet)
+        made = make_plan(source, parse_styles(style), options.backbone, settings, out, bar.show_planning, sheet)
     table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
         saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
@@ -344,6 +353,7 @@ def demo(
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_network_weights
     from worker.request import SceneRequest, StylizeRequest, check_folder
+    from worker.styles import StyleFile
 
     check_folder(out)
     try:
@@ -354,8 +364,8 @@ def demo(
         files = build_demo(out)
     source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
     settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
-    request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, settings)
-    options: dict[str, object] = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
+    request = StylizeRequest(source, (StyleFile(files.style),), None, out / "stylized.ply", "auto", False, settings)
+    options: dict[str, object] = {"--style": files.style, "--cameras": files.cameras, "--out": request.out}
     options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
     options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]

@@ -24,15 +24,16 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
-from worker.inputs import check_something_seen, read_scene_and_cameras
+from worker.inputs import check_something_seen, load_styles, read_scene_and_cameras
 from worker.request import SceneRequest, check_choice, check_folder
+from worker.styles import StyleFile
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
 def make_plan(
     source: SceneRequest,
-    style: Path,
+    styles: Sequence[StyleFile],
     backbone: str,
     settings: Settings,
     out: Path,
@@ -60,12 +61,12 @@ def make_plan(
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
     weights = load_network_weights(backbone)
-    load_image(style)  # a style that cannot be used is told before the work, too
+    style = load_styles(styles)  # one that cannot be used is told before the work, too
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
         write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
     plan, _ = planner.make_plan(
-        file.scene, cameras, settings, weights=weights, measured=True, show=show_planning, orbit=orbit
+        file.scene, cameras, settings, weights=weights, measured=True, show=show_planning, orbit=orbit, style=style
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))

@@ -26,7 +26,8 @@ from sgsst_core.features.vgg import (
     FeatureNetwork,
     layer_stride,
 )
-from sgsst_core.loss.nearest import Matches, StyleVectors, chosen_places, places_in
+from sgsst_core.loss.mixture import StyleMixture, mixed_target, shares_of
+from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, places_in
 from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
 from sgsst_core.loss.tiling import Tiling
@@ -231,25 +232,50 @@ class SosLoss:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
-    def style_targets(self, style: Tensor, view_size: Size) -> dict[int, ScaleTarget]:
-        """Targets of every scale of views of view_size (height, width) from a style image [H, W, 3] in 0..1.
+    def style_targets(self, style: Tensor | StyleMixture, view_size: Size) -> dict[int, ScaleTarget]:
+        """Targets of every scale of views of view_size (height, width) from a style: pictures [H, W, 3] in 0..1.
 
-        A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
+        A layer that has no cell at a scale of a very small style is missing there and is left out of the loss; of
+        several pictures, those that have cells stand for all.
 
         Raises:
             ImageError: features are to be matched, and the style is too small to have any.
         """
-        size = style_size(_size(style), view_size, self.style_scale)
-        image = resize_area(style, size).to(self.network.device)
-        scaled = {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
-        layers = self._style_statistics(scaled) if self.style_layers else {}
-        vectors = {scale: self._style_vectors(picture) for scale, picture in scaled.items()}
+        mixture = StyleMixture.of(style)
+        pyramids = [self._style_pyramid(picture, view_size) for picture in mixture.pictures]
+        layers = self._mixed_layers(pyramids, mixture.weights) if self.style_layers else {}
+        vectors = {
+            scale: self._style_vectors([pyramid[scale] for pyramid in pyramids], mixture.weights)
+            for scale in pyramids[0]
+        }
         if self.nearest_layers and all(found is None for found in vectors.values()):
+            height, width = _size(pyramids[0][0])
             raise ImageError(
-                f"The style is used at {image.shape[1]} x {image.shape[0]} pixels, too few to match features with. "
+                f"The style is used at {width} x {height} pixels, too few to match features with. "
                 "Give a larger picture, or larger views, or leave --style-loss at sos."
             )
-        return {scale: ScaleTarget(layers.get(scale, {}), vectors[scale]) for scale in scaled}
+        return {scale: ScaleTarget(layers.get(scale, {}), found) for scale, found in vectors.items()}
+
+    def _style_pyramid(self, picture: Tensor, view_size: Size) -> dict[int, Tensor]:
+        """A picture of the style at every scale of views of a size, on the network's device."""
+        size = style_size(_size(picture), view_size, self.style_scale)
+        image = resize_area(picture, size).to(self.network.device)
+        return {scale: downscale(image, scale) for scale in range(self.scale_count(*view_size))}
+
+    def _mixed_layers(
+        self, pyramids: Sequence[Mapping[int, Tensor]], weights: Sequence[float]
+    ) -> dict[int, dict[str, LayerTarget]]:
+        """What pictures with their weights ask of each layer at each scale."""
+        every = [self._style_statistics(pyramid) for pyramid in pyramids]
+        mixed: dict[int, dict[str, LayerTarget]] = {}
+        for scale in pyramids[0]:
+            mixed[scale] = {}
+            for layer in self.style_layers:
+                pairs = zip(every, weights, strict=True)
+                some = [(own[scale][layer], weight) for own, weight in pairs if layer in own[scale]]
+                if some:
+                    mixed[scale][layer] = mixed_target([target for target, _ in some], [weight for _, weight in some])
+        return mixed
 
     def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
         """Statistics of a style image [h, w, 3] at some scales, shared out over the ranks."""
@@ -264,18 +290,32 @@ class SosLoss:
                 }
         return targets
 
-    def _style_vectors(self, image: Tensor) -> StyleVectors | None:
-        """Vectors of a style image [h, w, 3] at one scale; None where nothing is matched, or there is none.
+    def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
+        """Vectors of pictures [h, w, 3] with weights at one scale; None where nothing is matched, or there is none.
 
-        They are too many to be sent: every rank computes them all.
+        They are those of all pictures together. Where that is too many, each has its share by weight. They are too many
+        to be sent: every rank computes them all.
         """
         if not self.nearest_layers:
             return None
-        size, stride = _size(image), layer_stride(self.nearest_layers[0])
-        width = size[1] // stride
-        places = chosen_places(size[0] // stride * width)
-        if not len(places):
+        stride = layer_stride(self.nearest_layers[0])
+        counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
+        most = shares_of(counts, weights, MOST_VECTORS)
+        parts = [
+            self._vectors_of(image, chosen_places(count, some))
+            for image, count, some in zip(images, counts, most, strict=True)
+            if count
+        ]
+        if not parts:
             return None
+        return StyleVectors.of(
+            {layer: torch.cat([part[layer] for part in parts]).to(images[0].device) for layer in self.nearest_layers}
+        )
+
+    def _vectors_of(self, image: Tensor, places: Tensor) -> dict[str, Tensor]:
+        """Features [k, c] of a picture [h, w, 3] at some places of the layers that are matched, on the CPU."""
+        size = _size(image)
+        width = size[1] // layer_stride(self.nearest_layers[0])
         vectors = {
             layer: torch.empty((len(places), self.network.channels(layer)), dtype=self.network.dtype)
             for layer in self.nearest_layers
@@ -286,7 +326,7 @@ class SosLoss:
             inside, row, column = places_in(places, width, view)
             for layer, found in vectors.items():
                 found[inside] = features[layer][own.slices].cpu()[row, column]
-        return StyleVectors.of({layer: found.to(image.device) for layer, found in vectors.items()})
+        return vectors
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
         """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""

@@ -6,8 +6,9 @@ import math
 from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.nearest import MOST_VECTORS
-from sgsst_core.loss.style_losses import NEAREST_WEIGHTS
+from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
 from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
@@ -170,6 +171,14 @@ def _of_style_loss(probe: Probe, settings: Settings, work: Work) -> Decision:
         f"{settings.style_loss} was asked for",
         error="it is another loss than the paper's",
     )
+
+
+def of_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
+    """Of several style pictures, how they are mixed."""
+    reason = f"{len(style.pictures)} pictures were given"
+    if not has_statistics(settings.style_loss):
+        reason += "; features are matched with those of all of them, whose weights count where there are too many"
+    return [Decision("styles", f"a mixture: {style.text}", reason, error=_ANOTHER_LOSS)]
 
 
 def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:

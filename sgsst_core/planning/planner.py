@@ -8,11 +8,13 @@ from dataclasses import replace
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import at_scale
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.decisions import of_styles
 from sgsst_core.planning.orbit import Orbit, orbit_decisions
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.probe import Workshop, equip, measure
+from sgsst_core.planning.probe import Probe, Workshop, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
 from sgsst_core.planning.survey import Survey, survey
@@ -35,6 +37,7 @@ def make_plan(
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
     orbit: Orbit | None = None,
+    style: StyleMixture | None = None,
 ) -> tuple[Plan, Workshop]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
@@ -47,6 +50,7 @@ def make_plan(
         show: told how far the survey has come.
         timer: counts the seconds of `survey`, and of all else as `planning`.
         orbit: that the cameras are of, for the plan to tell of it; None for those of files.
+        style: for the plan to tell of its pictures; None for one picture.
 
     Returns:
         The plan, and what was built to make it, for a `Stylizer` to go on with.
@@ -68,7 +72,15 @@ def make_plan(
                 looked = survey(scene, fitted, workshop.rasterizer, collectives, show)
         link = probe_link(collectives, workshop.network.device)
         # Timings differ from rank to rank: one decides for all.
-        plan = collectives.broadcast(lambda: decide(measure(workshop, looked, link), settings, measured=measured))
+        plan = collectives.broadcast(lambda: _decide(measure(workshop, looked, link), settings, measured, style))
         if orbit is not None:
             plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, looked), *plan.decisions))
     return plan, workshop
+
+
+def _decide(probe: Probe, settings: Settings, measured: bool, style: StyleMixture | None) -> Plan:
+    """The plan, with what it has to tell of a style of several pictures."""
+    if style is None or len(style.pictures) == 1:
+        return decide(probe, settings, measured=measured)
+    plan = decide(replace(probe, styles=len(style.pictures)), settings, measured=measured)
+    return replace(plan, decisions=(*of_styles(style, settings), *plan.decisions))

@@ -160,6 +160,7 @@ class Probe:
         process_bytes: of physical memory, with scene and network loaded.
         device_bytes: of a GPU's memory, likewise; 0 where a CPU computes.
         launches: of a view's loss on a GPU; None on a CPU, and where nothing follows from it.
+        styles: pictures that the style is mixed of.
     """
 
     scene: SceneFacts
@@ -175,6 +176,7 @@ class Probe:
     pruned_error: ImageError | None = None
     device_bytes: int = 0
     launches: LaunchCost | None = None
+    styles: int = 1
 
 
 @dataclass(frozen=True)

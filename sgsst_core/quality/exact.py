@@ -109,7 +109,7 @@ class ExactLoss:
         """What the style asks of views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
-            style = self._stylizer.style.to(self.loss.network.device)
+            style = self._stylizer.style.map(lambda picture: picture.to(self.loss.network.device))
             self._style_targets[size] = self.loss.style_targets(style, size)
         return self._style_targets[size]
 

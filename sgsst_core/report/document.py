@@ -36,7 +36,7 @@ class Sources:
     Attributes:
         scene: the PLY file.
         dropped: Gaussians of the file that were left out because of non-finite values.
-        style: the style image.
+        styles: the style's pictures.
         cameras: the camera file or folder; None for an orbit.
         photos: folder of the content images; None for unstylized renders.
         backbone: the feature network's weights.
@@ -44,7 +44,7 @@ class Sources:
 
     scene: Path
     dropped: int
-    style: Path
+    styles: tuple[Path, ...]
     cameras: Path | None
     photos: Path | None
     backbone: BackboneWeights
@@ -113,7 +113,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
 
 def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     """What was stylized with what."""
-    backbone, style = sources.backbone, stylizer.style
+    backbone, styles = sources.backbone, _styles_json(stylizer, sources)
     return {
         "settings": stylizer.settings.model_dump(mode="json"),
         "backbone": {
@@ -128,13 +128,23 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
             "sh_degree": stylizer.scene.sh_degree,
             "dropped": sources.dropped,
         },
-        "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
+        "style": {name: styles[0][name] for name in ("path", "width", "height")},
+        "styles": styles,
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.views.weighted,
             "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
         },
     }
+
+
+def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
+    """The pictures of the style, as they were used, with their shares."""
+    style = stylizer.style
+    return [
+        {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
+        for path, picture, weight in zip(sources.styles, style.pictures, style.weights, strict=True)
+    ]
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:

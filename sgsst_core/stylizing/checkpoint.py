@@ -23,6 +23,7 @@ from torch import Tensor
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
@@ -128,7 +129,12 @@ def versions() -> dict[str, str]:
 
 
 def fingerprint(
-    scene: Scene, cameras: Sequence[Camera], style: Tensor, settings: Settings, weights: str, photos: str = ""
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor | StyleMixture,
+    settings: Settings,
+    weights: str,
+    photos: str = "",
 ) -> str:
     """SHA-256 over all that decides the course of a job.
 
@@ -137,7 +143,9 @@ def fingerprint(
         photos: whatever identifies the content images; empty for unstylized renders.
     """
     digest = hashlib.sha256(repr((weights, photos)).encode())
-    for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
+    mixture = StyleMixture.of(style)
+    arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
+    for tensor in (*arrays, *mixture.pictures):
         digest.update(repr(tuple(tensor.shape)).encode())
         if isinstance(tensor, StoredHarmonics):
             tensor.for_blocks(
@@ -145,6 +153,8 @@ def fingerprint(
             )
         else:
             digest.update(tensor.contiguous().numpy().data)
+    if len(mixture.pictures) > 1:
+        digest.update(repr(mixture.weights).encode())
     for camera in cameras:
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)

@@ -20,6 +20,7 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import at_scale
 from sgsst_core.loss.graphs import LossGraphs
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
@@ -60,7 +61,7 @@ class Stylizer:
         plan: of this scene, these cameras and settings: from `make_plan`, or of an earlier run of the same job.
         scene: what to stylize.
         cameras: the views; larger ones are brought down to `settings.max_resolution`.
-        style: [H, W, 3] in 0..1.
+        style: a picture [H, W, 3] in 0..1, or several with their weights.
         settings: see `Settings`.
         weights: of the feature network.
         photos: content image of a camera by its index, at its (brought down) size; None for unstylized renders.
@@ -81,7 +82,7 @@ class Stylizer:
         plan: Plan,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor,
+        style: Tensor | StyleMixture,
         settings: Settings,
         *,
         weights: BackboneWeights,
@@ -104,10 +105,10 @@ class Stylizer:
         self.latest: list[int] = []
         self.weights = weights = at_scale(weights, settings.feature_scale)
         self.photos = photos
-        self.style = style = prepared_style(style, settings, scene.sh_dc, plan.survey.total_blend_weights)
+        self.style = prepared_style(StyleMixture.of(style), settings, scene.sh_dc, plan.survey.total_blend_weights)
         forget_device_peak(plan.device)
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
-        self._style = style.to(self.network.device)
+        self._style = self.style.map(lambda picture: picture.to(self.network.device))
         self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
@@ -140,7 +141,7 @@ class Stylizer:
         cls,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor,
+        style: Tensor | StyleMixture,
         settings: Settings,
         *,
         weights: BackboneWeights | None = None,
@@ -151,7 +152,13 @@ class Stylizer:
         """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised."""
         weights = weights or load_network_weights("auto")
         plan, workshop = make_plan(
-            scene, cameras, settings, weights=weights, rasterizer=rasterizer, collectives=collectives
+            scene,
+            cameras,
+            settings,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
+            style=StyleMixture.of(style),
         )
         return cls(
             plan,

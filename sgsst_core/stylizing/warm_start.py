@@ -14,43 +14,58 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
+from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 
 #: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
 #: could be stretched to the style's: it is left flat instead of blowing rounding up.
 _FLAT = 1e-9
 
 
-def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor) -> Tensor:
+def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
     """DC coefficients with the style's colours, clamped to what a picture can show (0..1).
 
     Args:
         sh_dc: [N, 3] float32.
         weights: [N] float64, total blend weights, at least one positive.
-        style: [H, W, 3] in 0..1.
+        style: pictures [H, W, 3] in 0..1; of several, the moments are the mixture's.
 
     Returns:
         [N, 3] float32.
     """
     colours = 0.5 + SH_C0 * sh_dc.double()
     mean, covariance = _moments(colours, weights.double() / weights.double().amax())
-    pixels = style.reshape(-1, 3).double()
-    wanted_mean, wanted = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
+    wanted_mean, wanted = _style_moments(StyleMixture.of(style))
     matched = (colours - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
     return ((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype)
 
 
-def in_colours_of(style: Tensor, sh_dc: Tensor, weights: Tensor) -> Tensor:
-    """A style image [H, W, 3] in 0..1 with mean and covariance of a scene's colours: the map the other way round.
+def in_colours_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+    """A style, of pictures [H, W, 3] in 0..1, with mean and covariance of a scene's colours: the inverse map.
+
+    Of several pictures, those are the mixture's: all take the same map.
 
     Args:
         sh_dc, weights: as in `warm_start`.
     """
     colours = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
     wanted_mean, wanted = _moments(colours, weights.double() / weights.double().amax())
-    pixels = style.reshape(-1, 3).double()
-    mean, covariance = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
-    matched = (pixels - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
-    return matched.clamp(0, 1).to(style.dtype).reshape(style.shape)
+    mean, covariance = _style_moments(style)
+    turned = _monge_map(covariance, wanted.to(mean)).T
+
+    def match(picture: Tensor) -> Tensor:
+        matched = (picture.reshape(-1, 3).double() - mean) @ turned + wanted_mean.to(mean)
+        return matched.clamp(0, 1).to(picture.dtype).reshape(picture.shape)
+
+    return style.map(match)
+
+
+def _style_moments(style: StyleMixture) -> tuple[Tensor, Tensor]:
+    """Mean [3] and covariance [3, 3] of a style's pixels, float64."""
+    found = []
+    for picture in style.pictures:
+        pixels = picture.reshape(-1, 3).double()
+        found.append(_moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device)))
+    return mixed_moments(found, style.weights)
 
 
 def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
