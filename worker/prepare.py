@@ -97,6 +97,7 @@ def prepare(
             timer=timer,
             orbit=inputs.orbit,
             style=inputs.style,
+            regions=inputs.regions,
         )
     with timer("preparing"):
         stylizer = Stylizer(
@@ -109,6 +110,7 @@ def prepare(
             photos=inputs.load_photo,
             collectives=collectives,
             workshop=workshop,
+            regions=inputs.regions,
         )
     stylizer.seconds_by_part.update(timer.seconds)
     source, scene_file, images = request.source, inputs.scene_file, request.images

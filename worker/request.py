@@ -11,6 +11,7 @@ from sgsst_core.files.scene_headers import PackedForm, form_of_name
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, ViewOptions
+from worker.regions import RegionRequest
 from worker.styles import StyleFile
 
 
@@ -44,6 +45,7 @@ class StylizeRequest:
         backbone: feature network.
         resume: go on from the checkpoint beside `out`.
         settings: everything else.
+        regions: of the scene, that have a style of their own or are kept; from `region_requests`.
     """
 
     source: SceneRequest
@@ -53,6 +55,7 @@ class StylizeRequest:
     backbone: Backbone
     resume: bool
     settings: Settings
+    regions: tuple[RegionRequest, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,10 @@ class StyleMixture:
 
     @property
     def text(self) -> str:
-        """Names and shares, for people."""
+        """Names, and shares where there are several, for people."""
         names = self.names or [f"picture {number}" for number in range(1, len(self.pictures) + 1)]
+        if len(names) == 1:
+            return names[0]
         shares = zip(names, self.weights, strict=True)
         return ", ".join(f"{name} {share:.0%}" for name, share in shares)
 

@@ -130,6 +130,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
         },
         "style": {name: styles[0][name] for name in ("path", "width", "height")},
         "styles": styles,
+        "regions": _regions_json(stylizer),
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.views.weighted,
@@ -140,10 +141,33 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
 
 def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
     """The pictures of the style, as they were used, with their shares."""
-    style = stylizer.style
+    style, regions, paths = stylizer.style, stylizer.regions, sources.styles
+    if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
+        paths = tuple(map(Path, style.names))  # one region is everything, and has a style of its own
     return [
         {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
-        for path, picture, weight in zip(sources.styles, style.pictures, style.weights, strict=True)
+        for path, picture, weight in zip(paths, style.pictures, style.weights, strict=True)
+    ]
+
+
+def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
+    """The regions of the scene, the rest first; none where it has none."""
+    regions = stylizer.regions
+    if regions is None:
+        return []
+    weights = stylizer.plan.survey.total_blend_weights
+    return [
+        {
+            "name": region.name,
+            "select": region.select or None,
+            "gaussians": int(regions.members(place).sum()),
+            "share": float(weights[regions.members(place)].sum() / weights.sum()),
+            "style": region.style and region.style.text,
+            "weight": region.weight,
+            "keep": region.keep,
+            "stylized": place in regions.active,
+        }
+        for place, region in enumerate(regions.every)
     ]
 
 
