@@ -132,7 +132,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     """Kill the command itself after a random time; then let the same command go on, where something was saved."""
     request = small_request(folder, STEPS)
     source = request.source
-    arguments = ["stylize", str(source.scene), "--cameras", str(source.cameras), "--style", str(request.style)]
+    arguments = ["stylize", str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
     arguments += ["--out", str(request.out), "--backbone", "vgg16", "--steps-sos", "60", "--no-early-stop"]
     arguments += ["--keep-everything", "--workers", "2", "--checkpoint-seconds", str(CHECKPOINT_SECONDS)]
     command = [sys.executable, "-m", "api.cli", *arguments]

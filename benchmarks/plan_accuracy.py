@@ -89,6 +89,7 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     from worker.options import StylizeOptions
     from worker.prepare import prepare
     from worker.request import SceneRequest, StylizeRequest
+    from worker.styles import StyleFile
 
     (case,) = arguments.cases
     scene, resolution, *steps = case.split(":")
@@ -109,7 +110,9 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         source = SceneRequest.of(Path(scene), arguments.cameras, options)
         out = Path(folder) / "stylized.ply"
-        request = StylizeRequest(source, arguments.style, None, out, options.backbone, False, options.settings())
+        request = StylizeRequest(
+            source, (StyleFile(arguments.style),), None, out, options.backbone, False, options.settings()
+        )
         job = prepare(request)
         prepared = time.perf_counter() - started
         begun = peak_memory()

@@ -11,6 +11,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.options import Option
 from sgsst_core.settings import checked
 from worker.options import StylizeOptions
+from worker.styles import MOST_PICTURES
 
 #: A name is shown in terminals, and kept by databases that know no zero bytes.
 _NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
@@ -25,6 +26,15 @@ class JobParameters(StylizeOptions):
 
     name: Annotated[str, Option(default="none; sgsst submit takes the scene's file name")] = Field(
         "", max_length=200, pattern=_NO_CONTROLS, description="For people; not unique."
+    )
+    style_weights: Annotated[
+        list[Annotated[float, Field(gt=0, allow_inf_nan=False)]] | None, Option(instead="--style FILE:WEIGHT")
+    ] = Field(
+        None,
+        min_length=1,
+        max_length=MOST_PICTURES,
+        description="Weight of each style image, in the order in which they are sent: they are mixed in proportion. "
+        "Without, they count alike.",
     )
 
 

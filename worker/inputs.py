@@ -19,6 +19,8 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.loss.mixture import StyleMixture, normalised
+from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit
@@ -30,6 +32,8 @@ from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.style_picture import check_style_size
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
+from worker.selecting import select_regions
+from worker.styles import StyleFile
 
 T = TypeVar("T")
 
@@ -40,20 +44,22 @@ class Inputs:
 
     Attributes:
         weights: of the feature network.
-        style: [H, W, 3] in 0..1.
+        style: pictures [H, W, 3] in 0..1.
         scene_file: the scene, and what was left out of its file.
         cameras: at the sizes that they are stylized at.
         orbit: how they were chosen; None for those of files.
         photos: content image of each camera; None for unstylized renders.
+        regions: of the scene; None where it has none.
         fingerprint: of all of it, and of the settings: equal for the same job.
     """
 
     weights: BackboneWeights
-    style: Tensor
+    style: StyleMixture
     scene_file: SceneFile
     cameras: list[Camera]
     orbit: Orbit | None
     photos: list[Path] | None
+    regions: Regions | None
     fingerprint: str
 
     @property
@@ -71,7 +77,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     """
     source, settings, images = request.source, request.settings, request.images
     weights = _same_weights(request.backbone, collectives)
-    style = together(collectives, lambda: load_image(request.style))
+    style = together(collectives, lambda: load_styles(request.styles))
     scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
     together(collectives, lambda: check_fading(scene_file.path, scene_file.header, settings.sh_fade))
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
@@ -79,9 +85,45 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))
     together(collectives, lambda: check_style_size(style, cameras, settings.style_scale))
     photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
+    regions = read_regions(request, scene_file, cameras, collectives)
     stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
-    own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps) if reader else None
-    return Inputs(weights, style, scene_file, cameras, made, photos, _same_fingerprint(own, collectives))
+    own = None
+    if reader:
+        own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps, regions)
+    return Inputs(weights, style, scene_file, cameras, made, photos, regions, _same_fingerprint(own, collectives))
+
+
+def read_regions(
+    request: StylizeRequest, file: SceneFile, cameras: Sequence[Camera], collectives: Collectives = ALONE
+) -> Regions | None:
+    """The regions of a scene that were asked for; None where none were.
+
+    Raises:
+        InvalidInputError: a selection or a style cannot be used, or every Gaussian is kept; the same on every rank.
+    """
+    if not request.regions:
+        return None
+    scale = request.settings.style_scale
+
+    def load(files: Sequence[StyleFile]) -> StyleMixture:
+        style = load_styles(files)
+        check_style_size(style, cameras, scale)
+        return style
+
+    # One rank selects for all: votes of masks take renders, and processors may round them differently.
+    return collectives.broadcast(lambda: select_regions(request.regions, file, cameras, request.source.near, load))
+
+
+def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
+    """Read a style's pictures.
+
+    Raises:
+        ImageError: one cannot be used.
+        SettingsError: there are too many, or weights that are no shares.
+    """
+    weights = normalised([file.weight for file in files])  # before anything is read
+    names = tuple(file.path.name for file in files)
+    return StyleMixture(tuple(load_image(file.path) for file in files), weights, names)
 
 
 def _cameras_on_all_ranks(

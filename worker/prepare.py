@@ -96,6 +96,8 @@ def prepare(
             show=show_planning,
             timer=timer,
             orbit=inputs.orbit,
+            style=inputs.style,
+            regions=inputs.regions,
         )
     with timer("preparing"):
         stylizer = Stylizer(
@@ -108,10 +110,12 @@ def prepare(
             photos=inputs.load_photo,
             collectives=collectives,
             workshop=workshop,
+            regions=inputs.regions,
         )
     stylizer.seconds_by_part.update(timer.seconds)
     source, scene_file, images = request.source, inputs.scene_file, request.images
-    sources = Sources(source.scene, scene_file.dropped, request.style, source.cameras, images, inputs.weights)
+    styles = tuple(file.path for file in request.styles)
+    sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, inputs.weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
     return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
 

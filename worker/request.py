@@ -11,6 +11,8 @@ from sgsst_core.files.scene_headers import PackedForm, form_of_name
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, ViewOptions
+from worker.regions import RegionRequest
+from worker.styles import StyleFile
 
 
 class SceneRequest(ViewOptions):
@@ -37,21 +39,23 @@ class StylizeRequest:
 
     Attributes:
         source: scene and cameras.
-        style: style image.
+        styles: style pictures, with their weights.
         images: folder of photos for the content term; None for unstylized renders.
         out: PLY to write, or packed file to write beside one: see `Outputs.of`.
         backbone: feature network.
         resume: go on from the checkpoint beside `out`.
         settings: everything else.
+        regions: of the scene, that have a style of their own or are kept; from `region_requests`.
     """
 
     source: SceneRequest
-    style: Path
+    styles: tuple[StyleFile, ...]
     images: Path | None
     out: Path
     backbone: Backbone
     resume: bool
     settings: Settings
+    regions: tuple[RegionRequest, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from api.cli.options import with_options
 from api.cli.progress_bars import clock
 from service.parameters import JobParameters
 from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm, form_of_name, packed_name
+from worker.styles import parse_styles
 
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
@@ -53,7 +54,12 @@ def submit(
         Path,
         typer.Argument(metavar="SCENE", help="3DGS scene: .ply, .compressed.ply, .spz or .splat.", show_default=False),
     ],
-    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    style: Annotated[
+        list[str],
+        typer.Option(
+            metavar="FILE[:WEIGHT]", help="Style image. Several are mixed, as for stylize.", show_default=False
+        ),
+    ],
     cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
     *,
@@ -70,18 +76,22 @@ def submit(
 ) -> None:
     """Send a job to a service. Options are those of stylize; with --out, wait for the result."""
     told = options.model_dump(mode="json", exclude_unset=True)
+    styles = parse_styles(style)
+    if len(styles) > 1:
+        told["style_weights"] = [file.weight for file in styles]
+    pictures = [file.path for file in styles]
     chosen = {"name": scene.stem, **told, **_parse_parameters(parameters)}
     with _client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):
                 plan = client.plan(
-                    scene, style, cameras=cameras, photos=images, progress=progress, planning=planning, **chosen
+                    scene, pictures, cameras=cameras, photos=images, progress=progress, planning=planning, **chosen
                 )
             out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
         with _transfer("sending") as progress:
             job = client.submit(
-                scene, style, cameras=cameras, photos=images, webhook=webhook, progress=progress, **chosen
+                scene, pictures, cameras=cameras, photos=images, webhook=webhook, progress=progress, **chosen
             )
         if out is None:
             out_console.print(json.dumps(job.data) if as_json else job.id)

@@ -18,9 +18,12 @@ from api.cli import client_commands, operator_commands
 from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_options
 from api.cli.progress_bars import clock, job_bar, live_bar
+from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
 from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
 from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
+from worker.regions import region_options, region_requests
+from worker.styles import parse_styles
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from api.cli.bench import VariantsRequest
@@ -64,6 +67,14 @@ CamerasOption = Annotated[
     ),
 ]
 StyleOption = Annotated[Path, typer.Option(help="Style image.", show_default=False)]
+StylesOption = Annotated[
+    list[str],
+    typer.Option(
+        metavar="FILE[:WEIGHT]",
+        help="Style image. Several are mixed, in proportion to their weights.",
+        show_default=False,
+    ),
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -82,7 +93,7 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 def stylize(
     context: typer.Context,
     scene: SceneArgument,
-    style: StyleOption,
+    style: StylesOption,
     out: Annotated[
         Path,
         typer.Option(
@@ -92,6 +103,10 @@ def stylize(
     ],
     cameras: CamerasOption = None,
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    region: RegionOption = None,
+    region_style: RegionStyleOption = None,
+    region_weight: RegionWeightOption = None,
+    region_keep: RegionKeepOption = None,
     *,
     options: StylizeOptions,
     run: RunOptions,
@@ -102,7 +117,9 @@ def stylize(
     from worker.request import SceneRequest, StylizeRequest
 
     source = SceneRequest.of(scene, cameras, options)
-    request = StylizeRequest(source, style, images, out, options.backbone, run.resume, settings)
+    regions = region_requests(region_options(region or (), region_style or (), region_weight or (), region_keep or ()))
+    styles = parse_styles(style)
+    request = StylizeRequest(source, styles, images, out, options.backbone, run.resume, settings, regions)
     _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
 
 
@@ -251,21 +268,27 @@ def _time_bought(result: Result) -> list[str]:
 @with_options(StylizeOptions, without=("workers",))
 def plan(
     scene: SceneArgument,
-    style: StyleOption,
+    style: StylesOption,
     out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
     cameras: CamerasOption = None,
     sheet: Annotated[Path | None, typer.Option(help="Pictures of the views to write, JPEG.")] = None,
+    region: RegionOption = None,
+    region_style: RegionStyleOption = None,
+    region_weight: RegionWeightOption = None,
+    region_keep: RegionKeepOption = None,
     *,
     options: StylizeOptions,
 ) -> None:
     """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
     from api.cli.scene_tools import make_plan
-    from worker.request import SceneRequest
+    from worker.request import SceneRequest, StylizeRequest
 
     settings = options.settings()
     source = SceneRequest.of(scene, cameras, options)
+    regions = region_requests(region_options(region or (), region_style or (), region_weight or (), region_keep or ()))
+    request = StylizeRequest(source, parse_styles(style), None, out, options.backbone, False, settings, regions)
     with job_bar(error_console) as bar:
-        made = make_plan(source, style, options.backbone, settings, out, bar.show_planning, sheet)
+        made = make_plan(request, bar.show_planning, sheet)
     table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
         saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
@@ -342,6 +365,7 @@ def demo(
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_network_weights
     from worker.request import SceneRequest, StylizeRequest, check_folder
+    from worker.styles import StyleFile
 
     check_folder(out)
     try:
@@ -352,8 +376,8 @@ def demo(
         files = build_demo(out)
     source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
     settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
-    request = StylizeRequest(source, files.style, None, out / "stylized.ply", "auto", False, settings)
-    options: dict[str, object] = {"--style": request.style, "--cameras": files.cameras, "--out": request.out}
+    request = StylizeRequest(source, (StyleFile(files.style),), None, out / "stylized.ply", "auto", False, settings)
+    options: dict[str, object] = {"--style": files.style, "--cameras": files.cameras, "--out": request.out}
     options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
     options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]

@@ -22,33 +22,26 @@ from sgsst_core.quality.findings import Finding, findings_of
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
-from sgsst_core.settings import Settings
-from worker.inputs import check_something_seen, read_scene_and_cameras
-from worker.request import SceneRequest, check_choice, check_folder
+from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_cameras
+from worker.request import SceneRequest, StylizeRequest, check_choice, check_folder
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
-def make_plan(
-    source: SceneRequest,
-    style: Path,
-    backbone: str,
-    settings: Settings,
-    out: Path,
-    show_planning: ShowPlanning | None = None,
-    sheet: Path | None = None,
-) -> Plan:
+def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None, sheet: Path | None = None) -> Plan:
     """Plan a job as `sgsst stylize` would, and write the plan as JSON; no step is made.
 
     Args:
+        request: whose `out` is the plan's.
         sheet: JPEG of the views to write, before the plan is made; None for none.
         show_planning: shows how far the survey of the views has come.
 
     Raises:
         InvalidInputError: in one of its forms, for the first input that cannot be used.
     """
+    source, settings, out = request.source, request.settings, request.out
     check_choice(source)
     if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
         raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
@@ -61,13 +54,22 @@ def make_plan(
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
     check_fading(file.path, file.header, settings.sh_fade)
-    weights = load_network_weights(backbone)
-    load_image(style)  # a style that cannot be used is told before the work, too
+    weights = load_network_weights(request.backbone)
+    style = load_styles(request.styles)  # one that cannot be used is told before the work, too
+    regions = read_regions(request, file, fit_cameras(cameras, settings))
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
         write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
     plan, _ = planner.make_plan(
-        file.scene, cameras, settings, weights=weights, measured=True, show=show_planning, orbit=orbit
+        file.scene,
+        cameras,
+        settings,
+        weights=weights,
+        measured=True,
+        show=show_planning,
+        orbit=orbit,
+        style=style,
+        regions=regions,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))

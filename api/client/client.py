@@ -54,7 +54,7 @@ class JobMethods(Methods):
         self,
         /,
         scene: str | Path,
-        style: str | Path,
+        style: str | Path | Sequence[str | Path],
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
@@ -65,7 +65,8 @@ class JobMethods(Methods):
         """Queue a job. Large files go up in parts, and go on after a lost connection.
 
         Args:
-            scene, style: files.
+            scene: file.
+            style: file; several are mixed, by the parameter `style_weights`.
             cameras: as `sgsst stylize --cameras`; None needs the parameter `orbit`.
             photos: folder, for the content term.
             webhook: URL that is told when the job has ended.
@@ -75,7 +76,7 @@ class JobMethods(Methods):
         Raises:
             RequestError: something cannot be used; the message says what.
         """
-        files = Path(scene), Path(style), _path(cameras), _path(photos)
+        files = Path(scene), _paths(style), _path(cameras), _path(photos)
         return Job.of((yield from uploads.create_job(files, parameters, webhook=webhook, progress=progress)))
 
     @Operation
@@ -83,7 +84,7 @@ class JobMethods(Methods):
         self,
         /,
         scene: str | Path,
-        style: str | Path,
+        style: str | Path | Sequence[str | Path],
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
@@ -96,7 +97,7 @@ class JobMethods(Methods):
         Args:
             planning: called with the views that have been looked at and all of them.
         """
-        files = Path(scene), Path(style), _path(cameras), _path(photos)
+        files = Path(scene), _paths(style), _path(cameras), _path(photos)
         return (yield from uploads.plan_job(files, parameters, progress=progress, planning=planning))
 
     @Operation
@@ -197,6 +198,10 @@ class JobMethods(Methods):
 
 def _job(job_id: str) -> Steps[Job]:
     return Job.of((yield Call("GET", f"/v1/jobs/{job_id}")).json())
+
+
+def _paths(value: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(value)] if isinstance(value, str | Path) else [Path(each) for each in value]
 
 
 def _path(value: str | Path | None) -> Path | None:

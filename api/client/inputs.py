@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,19 +21,29 @@ class InputFile:
     size: int
 
 
-def input_files(scene: Path, style: Path, cameras: Path | None, photos: Path | None) -> list[InputFile]:
+def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photos: Path | None) -> list[InputFile]:
     """Everything that a job needs.
 
     Raises:
         RequestError: something is not there.
     """
-    found = [("scene", scene, scene.name), ("style", style, style.name)]
+    found = [("scene", scene, scene.name)]
+    found += [("style", path, name) for path, name in zip(styles, _different_names(styles), strict=True)]
     found += [("cameras", path, path.name) for path in (camera_files(cameras) if cameras else [])]
     found += [("photos", path, name) for path, name in (photo_files(photos) if photos else [])]
     for _, path, _ in found:
         if not path.is_file():
             raise RequestError(f"{path}: is not a file. Check the path.")
     return [InputFile(role, path, name, path.stat().st_size) for role, path, name in found]
+
+
+def _different_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each file: its own, but for those that another one has already."""
+    names: list[str] = []
+    for number, path in enumerate(paths, 1):
+        taken = {name.lower() for name in names}
+        names.append(path.name if path.name.lower() not in taken else f"{number}_{path.name}")
+    return names
 
 
 def camera_files(path: Path) -> list[Path]:

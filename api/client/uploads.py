@@ -6,7 +6,7 @@ import base64
 import hashlib
 import json
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,7 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
     }
 
 
-Files = tuple[Path, Path, Path | None, Path | None]
+Files = tuple[Path, Sequence[Path], Path | None, Path | None]
 
 
 def create_job(
@@ -75,7 +75,7 @@ def create_job(
     """Send a job; returns what the service answers.
 
     Args:
-        files: scene, style, cameras and photos.
+        files: scene, the style's pictures, cameras and photos.
         parameters: of the job; None leaves one out.
         webhook: URL that is told when the job has ended.
         progress: called with the bytes that are up and those of all large files.

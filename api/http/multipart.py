@@ -22,6 +22,7 @@ from service.files.staging import MAX_CAMERA_FILES, ROLES, clean_name
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_headers import read_scene_header
+from worker.styles import MOST_PICTURES
 
 #: Bytes of a text field, which is JSON of parameters or an id.
 _MAX_TEXT = 1 << 16
@@ -60,12 +61,12 @@ class Received:
 
     Attributes:
         files: `role`, `name`, `sha256`, `size` of each file.
-        uploads: role and id where an upload was named instead.
+        uploads: where an upload was named instead, its place among files and uploads, its role and its id.
         texts: the text fields.
     """
 
     files: list[dict[str, Any]] = field(default_factory=list)
-    uploads: list[tuple[str, str]] = field(default_factory=list)
+    uploads: list[tuple[int, str, str]] = field(default_factory=list)
     texts: dict[str, str] = field(default_factory=dict)
 
 
@@ -163,6 +164,7 @@ class _Form:
     def __init__(self, boundary: bytes, blobs: BlobFolder, settings: ServiceSettings) -> None:
         self.received = Received()
         self._blobs, self._settings = blobs, settings
+        self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_PICTURES + 1
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
         self._parts = 0
         self._headers: dict[bytes, bytes] = {}
@@ -211,7 +213,7 @@ class _Form:
 
     def _begin(self) -> None:
         self._parts += 1
-        if self._parts > self._settings.max_photos + MAX_CAMERA_FILES + 2 + len(_TEXT_FIELDS):
+        if self._parts > self._most_files + len(_TEXT_FIELDS):
             raise RefusedInputError(f"There are more than {self._parts - 1} fields.", "too-many-files")
         self._headers = {}
         self._clear_header()
@@ -235,7 +237,7 @@ class _Form:
         if filename is None or self._role in _TEXT_FIELDS:
             return
         count = len(self.received.files)
-        if count >= self._settings.max_photos + MAX_CAMERA_FILES + 2:
+        if count >= self._most_files:
             raise RefusedInputError(f"There are more than {count} files.", "too-many-files")
         self._name = clean_name(self._role, filename.decode("utf-8", "replace"), count)
         self._file = self._blobs.receive(self._settings.max_upload_bytes)
@@ -263,7 +265,8 @@ class _Form:
             return
         text = self._text.decode("utf-8", "replace")
         if self._role not in _TEXT_FIELDS:
-            self.received.uploads.append((self._role, text.strip()))
+            place = len(self.received.files) + len(self.received.uploads)
+            self.received.uploads.append((place, self._role, text.strip()))
         elif self._role in self.received.texts:
             raise RefusedInputError(f"The field {self._role!r} is there twice.", "invalid-request")
         else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from api.http.documentation import invalid
@@ -17,6 +19,7 @@ from service.errors import (
     TooLargeError,
 )
 from service.parameters import JobParameters
+from worker.styles import MOST_PICTURES
 
 
 class JobFromUploads(BaseModel):
@@ -37,7 +40,9 @@ class JobFromUploads(BaseModel):
     )
 
     scene: str = Field(description="Id of the upload with the 3DGS scene: PLY, compressed PLY, SPZ or .splat.")
-    style: str = Field(description="Id of the upload with the style image.")
+    style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_PICTURES)] = Field(
+        description="Id of the upload with the style image; of several, which are mixed by `style_weights`, a list."
+    )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
     parameters: JobParameters = Field(default_factory=JobParameters)
@@ -50,7 +55,13 @@ _FORM = {
     "required": ["scene", "style"],
     "properties": {
         "scene": {**_FILE, "description": "3DGS scene: PLY, compressed PLY, SPZ or .splat; or the id of an upload."},
-        "style": {**_FILE, "description": "Style image; or the id of an upload."},
+        "style": {
+            "type": "array",
+            "items": _FILE,
+            "minItems": 1,
+            "maxItems": MOST_PICTURES,
+            "description": "Style image; or the id of an upload. Several are mixed by `style_weights`.",
+        },
         "cameras": {
             "type": "array",
             "items": _FILE,
@@ -63,7 +74,7 @@ _FORM = {
     "examples": [
         {
             "scene": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n(and so on: the file's bytes)",
-            "style": "(the bytes of style.jpg)",
+            "style": ["(the bytes of style.jpg)"],
             "cameras": ['[{"id": 0, "img_name": "view_0", "width": 64, "height": 48}]'],
             "parameters": '{"preset": "preview"}',
         }
@@ -106,7 +117,7 @@ REFUSALS: tuple[ServiceError, ...] = (
         "All views have 30,000,000,000 pixels; 20,000,000,000 may be.", "too-many-pixels", input="cameras"
     ),
     RefusedInputError("style.jpg: has 20000 x 20000 pixels; 100,000,000 may be.", "image-too-large", input="style"),
-    RefusedInputError("There are more than 2010 files.", "too-many-files"),
+    RefusedInputError("There are more than 2025 files.", "too-many-files"),
     RefusedInputError(
         "view 'view_0' (5187x3361): its 9,000,000 visible Gaussians touch raster tiles 3,000,000,000 times, more than "
         "can be addressed. Render at a lower resolution.",

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from service.errors import RefusedInputError
+from worker.styles import MOST_PICTURES
 
 ROLES = ("scene", "style", "cameras", "photos")
 #: A COLMAP model is at most cameras, images, points3D, rigs, frames; transforms.json may have a companion.
@@ -22,9 +23,24 @@ class Staged:
     """Where a job's files are, as paths relative to the folder: what a report names must not tell where that is."""
 
     scene: Path
-    style: Path
+    styles: tuple[Path, ...]
     cameras: Path | None
     photos: Path | None
+
+    def as_json(self) -> dict[str, Any]:
+        """For JSON; `of_json` reads it."""
+        return {
+            "scene": str(self.scene),
+            "styles": [str(path) for path in self.styles],
+            "cameras": None if self.cameras is None else str(self.cameras),
+            "photos": None if self.photos is None else str(self.photos),
+        }
+
+    @staticmethod
+    def of_json(values: Mapping[str, Any]) -> Staged:
+        """What `as_json` wrote."""
+        cameras, photos = (None if values[role] is None else Path(values[role]) for role in ("cameras", "photos"))
+        return Staged(Path(values["scene"]), tuple(map(Path, values["styles"])), cameras, photos)
 
 
 def clean_name(role: str, name: str, number: int) -> str:
@@ -45,17 +61,29 @@ def _last_bytes(part: str) -> str:
     return part.encode()[-_MAX_NAME:].decode(errors="ignore")
 
 
-def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool) -> None:
+def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool, weights: Sequence[float] | None = None) -> None:
     """Prove that a job has the files that it needs, and no others.
+
+    Args:
+        orbit: there are no camera files then.
+        weights: one for each style picture; None where they count alike.
 
     Raises:
         RefusedInputError: otherwise.
     """
     found = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
-    for role in ("scene", "style"):
-        if len(found[role]) != 1:
-            what = "is missing" if not found[role] else "is there more than once"
-            raise RefusedInputError(f"The file {role!r} {what}. Send it once.", "invalid-request", input=role)
+    for role, most in (("scene", 1), ("style", MOST_PICTURES)):
+        if not 1 <= len(found[role]) <= most:
+            what = "is missing" if not found[role] else f"is there {len(found[role])} times"
+            times = "once" if most == 1 else f"once, or up to {most} of them"
+            raise RefusedInputError(f"The file {role!r} {what}. Send it {times}.", "invalid-request", input=role)
+    if weights is not None and len(weights) != len(found["style"]):
+        raise RefusedInputError(
+            f"style_weights has {len(weights)} values for {len(found['style'])} files 'style'. Give one for each, in "
+            "their order.",
+            "invalid-request",
+            input="style_weights",
+        )
     if not found["cameras"] and not orbit:
         raise RefusedInputError(
             "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'.",
@@ -119,14 +147,17 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
         inputs: `role`, `name` (from `clean_name`) and `sha256` of each.
         blobs: the files by digest.
     """
-    single: dict[str, Path] = {}
+    scene = Path()
+    styles: list[Path] = []
     cameras: list[str] = []
     photos = False
     for entry in inputs:
         role, name = entry["role"], entry["name"]
-        if role in ("scene", "style"):
+        if role == "scene":
+            path = scene = Path(role, name)
+        elif role == "style":
             path = Path(role, name)
-            single[role] = path
+            styles.append(path)
         elif role == "cameras":
             path = Path("cameras", name)
             cameras.append(name)
@@ -137,7 +168,7 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(blobs[entry["sha256"]])
-    return Staged(single["scene"], single["style"], _camera_path(cameras), Path("photos") if photos else None)
+    return Staged(scene, tuple(styles), _camera_path(cameras), Path("photos") if photos else None)
 
 
 def _camera_path(names: Sequence[str]) -> Path | None:

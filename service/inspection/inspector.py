@@ -12,14 +12,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
 import psutil
 
 from service.errors import BusyError, RefusedInputError
-from service.files.staging import Staged, stage
+from service.files.staging import stage
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -27,7 +26,7 @@ from service.store import Store
 #: What is wanted of the inspecting process: prove that a job's inputs can be used, or plan the job as well.
 Work = Literal["validate", "plan"]
 #: Raised when validation changes, so that what older ones found does not count.
-_VERSION = "2"
+_VERSION = "3"
 #: Requests that wait for the inspecting process at most; more are told to come back.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
@@ -211,7 +210,7 @@ class Inspector:
             request = {
                 "work": work,
                 "folder": folder,
-                "staged": as_text(staged),
+                "staged": staged.as_json(),
                 "parameters": parameters.model_dump(mode="json"),
                 "limits": self._limits,
                 "seconds": seconds,
@@ -239,7 +238,9 @@ class Inspector:
     def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
         told = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
-        text = json.dumps([_VERSION, work, files, told, self._limits], sort_keys=True)
+        styles = [entry["name"] for entry in inputs if entry["role"] == "style"]  # whose order that of weights is
+        order = styles if len(styles) > 1 else []
+        text = json.dumps([_VERSION, work, files, order, told, self._limits], sort_keys=True)
         return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
 
     async def close(self) -> None:
@@ -263,8 +264,3 @@ def found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
         )
     found: dict[str, Any] = answer["found"]
     return found
-
-
-def as_text(staged: Staged) -> dict[str, str | None]:
-    """Paths for a request."""
-    return {role: str(path) if path is not None else None for role, path in asdict(staged).items()}

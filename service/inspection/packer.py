@@ -19,7 +19,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.files.names import RESULT
 from service.files.staging import Staged, stage
-from service.inspection.inspector import LEFT_SECONDS, MEMORY_PER_BYTE, InspectionProcess, as_text, found_or_refused
+from service.inspection.inspector import LEFT_SECONDS, MEMORY_PER_BYTE, InspectionProcess, found_or_refused
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -78,7 +78,7 @@ class Packer:
             request = {
                 "work": "pack",
                 "folder": folder,
-                "staged": as_text(staged),
+                "staged": staged.as_json(),
                 "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
                 "limits": {"name": name},
                 "seconds": self._settings.inspection_seconds + _SECONDS_PER_BYTE * result.size,

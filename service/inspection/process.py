@@ -33,6 +33,7 @@ from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
@@ -42,7 +43,7 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.style_picture import check_style_size
-from worker.inputs import check_something_in_view, read_cameras_of
+from worker.inputs import check_something_in_view, load_styles, read_cameras_of
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
 
@@ -74,8 +75,8 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
 
 def _read_inputs(
     staged: Staged, parameters: JobParameters, limits: dict[str, Any]
-) -> tuple[dict[str, Any], Scene, list[Camera], Orbit | None]:
-    """What `validate` finds, and what it has read: the scene, the cameras, and the orbit that these are of."""
+) -> tuple[dict[str, Any], Scene, list[Camera], Orbit | None, StyleMixture]:
+    """What `validate` finds, and what it has read: scene, cameras, the orbit that these are of, and the style."""
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
@@ -94,9 +95,10 @@ def _read_inputs(
         check_fading(file.path, file.header, settings.sh_fade)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _ErrorsOf("style"):
-        _check_pixel_count(staged.style, limits)
-        image = load_image(staged.style)
-        found["style"] = [image.shape[1], image.shape[0]]
+        for path in staged.styles:
+            _check_pixel_count(path, limits)
+        style = load_styles(stylize_request(staged, parameters).styles)
+        found["style"] = [style.pictures[0].shape[1], style.pictures[0].shape[0]]
     with _ErrorsOf("cameras"):
         check_choice(source)
         if source.cameras is not None:
@@ -112,22 +114,24 @@ def _read_inputs(
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
     with _ErrorsOf("style"):
-        check_style_size(image, cameras, settings.style_scale)
+        check_style_size(style, cameras, settings.style_scale)
     with _ErrorsOf("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
         for path in paths:
             _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
-    return found, file.scene, cameras, orbit
+    return found, file.scene, cameras, orbit, style
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
-    found, scene, cameras, orbit = _read_inputs(staged, parameters, limits)
+    found, scene, cameras, orbit, style = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
-    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True, show=show, orbit=orbit)
+    made, _ = make_plan(
+        scene, cameras, request.settings, weights=weights, measured=True, show=show, orbit=orbit, style=style
+    )
     seconds = memory = on_device = None
     if made.prediction:
         memory, on_device = made.prediction.peak_bytes, made.prediction.device_bytes
@@ -213,8 +217,7 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """What a child writes at last: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
-        paths = {role: Path(path) if path else None for role, path in request["staged"].items()}
-        staged = Staged(**paths)  # type: ignore[arg-type]
+        staged = Staged.of_json(request["staged"])
         work = WORK[request["work"]]
         return {"found": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
     except (RefusedError, InvalidInputError) as error:

@@ -77,17 +77,14 @@ class Task:
 
     def save(self, folder: Path) -> None:
         """Write it for `load`."""
-        paths = {role: str(path) if path else None for role, path in vars(self.staged).items()}
-        values = {**vars(self), "staged": paths, "parameters": self.parameters.model_dump(mode="json")}
+        values = {**vars(self), "staged": self.staged.as_json(), "parameters": self.parameters.model_dump(mode="json")}
         (folder / "task.json").write_text(json.dumps(values))
 
     @staticmethod
     def load(folder: Path) -> Task:
         """Read what `save` wrote."""
         values = json.loads((folder / "task.json").read_text())
-        paths: dict[str, Any] = {role: Path(path) if path else None for role, path in values.pop("staged").items()}
-        staged = Staged(**paths)
-        return Task(staged, JobParameters(**values.pop("parameters")), **values)
+        return Task(Staged.of_json(values.pop("staged")), JobParameters(**values.pop("parameters")), **values)
 
 
 class AttemptProcess:

@@ -89,6 +89,31 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
     return paths
 
 
+def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Path | None]:
+    """The mask of each camera that has one, found by its name as photos are (`check_photos`); only headers are read.
+
+    Raises:
+        ImageError: there is none for any camera, or more than one for one, or one has another aspect than its camera.
+    """
+    if not folder.is_dir():
+        raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
+    index = _index_photos(folder)
+    found: list[Path | None] = []
+    for camera in cameras:
+        paths = _matching(index, folder, camera.name)
+        if len(paths) > 1:
+            raise ImageError(f"{folder}: holds more than one mask for view {camera.name}. Leave one.")
+        found += paths or [None]
+        if paths:
+            _check_aspect(paths[0], image_size(paths[0]), camera)
+    if not any(found):
+        raise ImageError(
+            f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "
+            f"without extension, such as {cameras[0].name}."
+        )
+    return found
+
+
 def load_photo(path: Path, camera: Camera) -> Tensor:
     """Read a photo at its camera's size (antialiased bicubic): [height, width, 3] float32 in 0..1.
 

@@ -112,7 +112,7 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
     stored = _row_layout(path, header, stamp, offset) if stays_in_file(header, held_bytes) else None
     into = _Columns(header.vertex.count, 0 if stored else degree, stored)
     if header.text:
-        rows = _text_vertices(path, header)
+        rows = text_vertices(path, header)
         for start in range(0, len(rows), BLOCK_ROWS):
             into.take(start, rows[start : start + BLOCK_ROWS])
     else:
@@ -186,7 +186,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: f
     """
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
-    if _stamp(source.path) != source.stamp:
+    if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
     if source.form != "ply" or source.header is None:
         write_scene(target, replace(source.scene.faded(sh_fade), sh_dc=sh_dc.detach().to("cpu", torch.float32)))
@@ -406,7 +406,7 @@ class _AsciiHeader(io.BufferedReader):
         return re.sub(rb"[\x80-\xff]", b"?", data) if self.tell() <= self._header_bytes else data
 
 
-def _text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
+def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
     """[rows] structured array of element vertex of a text file."""
     try:
         with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
@@ -443,7 +443,8 @@ def _finite_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool
     return kept
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Size in bytes and time of last change (ns) of a file, by which it is known again."""
     try:
         status = path.stat()
     except OSError as error:
@@ -500,7 +501,7 @@ def _write_binary(
             fading.apply(rows)
         output.write(rows.view(np.uint8).data)
     _copy(file, output)
-    if _stamp(source.path) != source.stamp:
+    if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
 
 

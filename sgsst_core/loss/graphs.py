@@ -51,6 +51,7 @@ class _Key:
     image_scale: int
     tiles: tuple[tuple[int, PartitionTile], ...]
     coverage: tuple[int, ...] | None
+    regions: int
     style: int
 
 
@@ -153,7 +154,8 @@ class LossGraphs:
         if not can_be_captured(self.loss.tiling, [tile.outer.pixels for _, tile in tiles]):
             return None
         coverage = tuple(view.coverage[0].shape) if view.coverage else None
-        return _Key(tuple(image.shape), image.dtype, image_scale, tiles, coverage, id(style))
+        regions = len(view.regions or ())
+        return _Key(tuple(image.shape), image.dtype, image_scale, tiles, coverage, regions, id(style))
 
     def _captured(self, key: _Key, image: Tensor, style: Mapping[int, ScaleTarget], view: ViewTarget) -> _Graph | None:
         """The graph of a kind of evaluations; None where it fails."""
@@ -199,8 +201,12 @@ class LossGraphs:
             if scale in view.content
         }
         coverage = view.coverage and [self._place(("coverage", k), level) for k, level in enumerate(view.coverage)]
+        regions = view.regions and [
+            [self._place(("region", number, k), level) for k, level in enumerate(pyramid)]
+            for number, pyramid in enumerate(view.regions)
+        ]
         tiles = {scale: [tile] for scale, tile in key.tiles}
-        return self._place("image", image), ViewTarget(None, content, coverage, Share({}, tiles))
+        return self._place("image", image), ViewTarget(None, content, coverage, Share({}, tiles), regions)
 
     def _place(self, name: object, like: Tensor) -> Tensor:
         """A tensor that stays where it is. All graphs take the same one for the same purpose, shape and layout."""
@@ -213,4 +219,5 @@ class LossGraphs:
 def _inputs(image: Tensor, view: ViewTarget, scales: Sequence[int]) -> list[Tensor]:
     """Everything that changes from one evaluation of a kind to the next, in a fixed order."""
     features = [part for scale in scales if scale in view.content for part in view.content[scale].values()]
-    return [image, *features, *(view.coverage or [])]
+    regions = [level for pyramid in view.regions or [] for level in pyramid]
+    return [image, *features, *(view.coverage or []), *regions]

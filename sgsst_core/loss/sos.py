@@ -7,8 +7,10 @@ reaches; only tiles beyond it are computed twice. Of several ranks, each has its
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -26,7 +28,8 @@ from sgsst_core.features.vgg import (
     FeatureNetwork,
     layer_stride,
 )
-from sgsst_core.loss.nearest import Matches, StyleVectors, chosen_places, places_in
+from sgsst_core.loss.mixture import StyleMixture, mixed_target, shares_of
+from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, places_in
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
@@ -53,10 +56,20 @@ class ScaleTarget:
     Attributes:
         layers: layer to its statistics, for those that are compared and have a cell at this scale.
         vectors: that positions are matched with; None where nothing is matched.
+        regions: in place of both, what each region of the scene is compared with; empty where it has none.
     """
 
     layers: Mapping[str, LayerTarget]
     vectors: StyleVectors | None = None
+    regions: tuple[RegionTarget, ...] = ()
+
+
+@dataclass(frozen=True)
+class RegionTarget:
+    """What one region's style asks of a scale, and how much that counts."""
+
+    style: ScaleTarget
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -122,12 +135,40 @@ class ViewTarget:
         content_image: [H, W, 3], from which they can be computed again.
         coverage: position weights at powers of two, [H >> k, W >> k] each; None for equal weights.
         share: for which the content was prepared; None for one rank, whose share is always everything.
+        regions: position weights of each region, as `coverage`: its Gaussians' share of the blend weights. In the order
+            of `ScaleTarget.regions`; None where the scene has none.
     """
 
     content_image: Tensor | None = None
     content: dict[int, ContentFeatures] = field(default_factory=dict)
     coverage: list[Tensor] | None = None
     share: Share | None = None
+    regions: list[list[Tensor]] | None = None
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A share of a scale's positions, and what they are compared with.
+
+    Attributes:
+        weights: of the positions, at powers of two; None for equal ones.
+        style: what they are compared with; None where only their statistics are wanted.
+        factor: of the loss.
+    """
+
+    weights: Sequence[Tensor] | None
+    style: ScaleTarget | None = None
+    factor: float = 1.0
+
+    @staticmethod
+    def of(view: ViewTarget, style: ScaleTarget) -> list[_Part]:
+        """All of a view's positions, or those of each region."""
+        if not style.regions:
+            return [_Part(view.coverage, style)]
+        if view.regions is None or len(view.regions) != len(style.regions):
+            raise ValueError("the view was not prepared for the regions that the style has")
+        pairs = zip(view.regions, style.regions, strict=True)
+        return [_Part(weights, region.style, region.weight) for weights, region in pairs]
 
 
 class SosLoss:
@@ -240,32 +281,57 @@ class SosLoss:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
-    def style_targets(self, style: Tensor, view_size: Size) -> dict[int, ScaleTarget]:
-        """Targets of every scale that counts, for views of view_size (height, width), from a style [H, W, 3] in 0..1.
+    def style_targets(self, style: Tensor | StyleMixture, view_size: Size) -> dict[int, ScaleTarget]:
+        """Targets of every scale that counts, for views of view_size (height, width), from pictures [H, W, 3] in 0..1.
 
-        A layer that has no cell at a scale of a very small style is missing there and is left out of the loss.
+        A layer that has no cell at a scale of a very small style is missing there and is left out of the loss; of
+        several pictures, those that have cells stand for all.
 
         Raises:
             ImageError: features are to be matched, and the style is too small to have any.
         """
-        size = style_size(_size(style), view_size, self.style_scale)
-        image = resize_area(style, size).to(self.network.device)
-        scaled = {scale: downscale(image, scale) for scale in self.scales(*view_size)}
-        layers = self._style_statistics(scaled) if self.style_layers else {}
-        vectors = {scale: self._style_vectors(picture) for scale, picture in scaled.items()}
+        mixture = StyleMixture.of(style)
+        pyramids = [self._style_pyramid(picture, view_size) for picture in mixture.pictures]
+        layers = self._mixed_layers(pyramids, mixture.weights) if self.style_layers else {}
+        vectors = {
+            scale: self._style_vectors([pyramid[scale] for pyramid in pyramids], mixture.weights)
+            for scale in pyramids[0]
+        }
         if self.nearest_layers and all(found is None for found in vectors.values()):
+            height, width = _size(pyramids[0][0])
             raise ImageError(
-                f"The style is used at {image.shape[1]} x {image.shape[0]} pixels, too few to match features with. "
+                f"The style is used at {width} x {height} pixels, too few to match features with. "
                 "Give a larger picture, or larger views, or leave --style-loss at sos."
             )
-        return {scale: ScaleTarget(layers.get(scale, {}), vectors[scale]) for scale in scaled}
+        return {scale: ScaleTarget(layers.get(scale, {}), found) for scale, found in vectors.items()}
+
+    def _style_pyramid(self, picture: Tensor, view_size: Size) -> dict[int, Tensor]:
+        """A picture of the style at every scale of views of a size, on the network's device."""
+        size = style_size(_size(picture), view_size, self.style_scale)
+        image = resize_area(picture, size).to(self.network.device)
+        return {scale: downscale(image, scale) for scale in self.scales(*view_size)}
+
+    def _mixed_layers(
+        self, pyramids: Sequence[Mapping[int, Tensor]], weights: Sequence[float]
+    ) -> dict[int, dict[str, LayerTarget]]:
+        """What pictures with their weights ask of each layer at each scale."""
+        every = [self._style_statistics(pyramid) for pyramid in pyramids]
+        mixed: dict[int, dict[str, LayerTarget]] = {}
+        for scale in pyramids[0]:
+            mixed[scale] = {}
+            for layer in self.style_layers:
+                pairs = zip(every, weights, strict=True)
+                some = [(own[scale][layer], weight) for own, weight in pairs if layer in own[scale]]
+                if some:
+                    mixed[scale][layer] = mixed_target([target for target, _ in some], [weight for _, weight in some])
+        return mixed
 
     def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
         """Statistics of a style image [h, w, 3] at some scales, shared out over the ranks."""
         share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
         for scales in rounds(list(scaled), self.collectives.size):
-            passes = [_ScalePass(self, scaled[s], s, share.tiles[s], ViewTarget(), None) for s in scales]
+            passes = [_ScalePass(self, scaled[s], s, share.tiles[s], ViewTarget(), None, [_Part(None)]) for s in scales]
             for pass_, merged in zip(passes, self._first_passes(passes, keep=False)[0], strict=True):
                 parts = zip(self.style_layers, self._wait(merged)[0], strict=True)
                 targets[pass_.scale] = {
@@ -273,18 +339,32 @@ class SosLoss:
                 }
         return targets
 
-    def _style_vectors(self, image: Tensor) -> StyleVectors | None:
-        """Vectors of a style image [h, w, 3] at one scale; None where nothing is matched, or there is none.
+    def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
+        """Vectors of pictures [h, w, 3] with weights at one scale; None where nothing is matched, or there is none.
 
-        They are too many to be sent: every rank computes them all.
+        They are those of all pictures together. Where that is too many, each has its share by weight. They are too many
+        to be sent: every rank computes them all.
         """
         if not self.nearest_layers:
             return None
-        size, stride = _size(image), layer_stride(self.nearest_layers[0])
-        width = size[1] // stride
-        places = chosen_places(size[0] // stride * width)
-        if not len(places):
+        stride = layer_stride(self.nearest_layers[0])
+        counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
+        most = shares_of(counts, weights, MOST_VECTORS)
+        parts = [
+            self._vectors_of(image, chosen_places(count, some))
+            for image, count, some in zip(images, counts, most, strict=True)
+            if count
+        ]
+        if not parts:
             return None
+        return StyleVectors.of(
+            {layer: torch.cat([part[layer] for part in parts]).to(images[0].device) for layer in self.nearest_layers}
+        )
+
+    def _vectors_of(self, image: Tensor, places: Tensor) -> dict[str, Tensor]:
+        """Features [k, c] of a picture [h, w, 3] at some places of the layers that are matched, on the CPU."""
+        size = _size(image)
+        width = size[1] // layer_stride(self.nearest_layers[0])
         vectors = {
             layer: torch.empty((len(places), self.network.channels(layer)), dtype=self.network.dtype)
             for layer in self.nearest_layers
@@ -295,7 +375,7 @@ class SosLoss:
             inside, row, column = places_in(places, width, view)
             for layer, found in vectors.items():
                 found[inside] = features[layer][own.slices].cpu()[row, column]
-        return StyleVectors.of({layer: found.to(image.device) for layer, found in vectors.items()})
+        return vectors
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
         """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""
@@ -392,7 +472,7 @@ class SosLoss:
                 share.tiles[scale],
                 view,
                 self._content(view, scale, share.tiles[scale]),
-                style[scale].vectors if self.nearest_layers else None,
+                _Part.of(view, style[scale]),
             )
             for scale, image in scaled.items()
         ]
@@ -400,22 +480,26 @@ class SosLoss:
         for pass_, waiting in zip(passes, merged, strict=True):
             parts, pass_.terms = self._wait(waiting)
             with self.timer("statistics"):
-                statistics = dict(zip(self.style_layers, parts, strict=True))
-                self._compare(pass_, statistics, style[pass_.scale].layers)
+                layers = len(self.style_layers)
+                for place, part in enumerate(pass_.parts):
+                    own = parts[place * layers : (place + 1) * layers]
+                    self._compare(pass_, part, dict(zip(self.style_layers, own, strict=True)))
         yield from zip(passes, self._backward(passes, kept) if gradient else [None] * len(passes), strict=True)
 
     def _wait(self, merged: Merged) -> tuple[list[LayerStatistics], Tensor]:
         with self.timer("communication"):
             return merged()
 
-    def _compare(
-        self, pass_: _ScalePass, statistics: Mapping[str, LayerStatistics], style: Mapping[str, LayerTarget]
-    ) -> None:
-        """Style loss of one scale, added to its terms, and gradient maps, from the statistics of the whole scale."""
-        for layer, part in statistics.items():
+    def _compare(self, pass_: _ScalePass, part: _Part, statistics: Mapping[str, LayerStatistics]) -> None:
+        """Style loss of a part of a scale, added to its terms, and gradient maps; statistics are of the whole scale."""
+        style = part.style.layers if part.style else {}
+        for layer, found in statistics.items():
             if layer in style:
-                layer_terms, pass_.maps[layer] = style_loss(part, style[layer], feature_eps=self.network.rounding)
+                layer_terms, gradient = style_loss(found, style[layer], feature_eps=self.network.rounding)
+                if part.factor != 1:
+                    layer_terms, gradient = part.factor * layer_terms, gradient.times(part.factor)
                 pass_.terms = pass_.terms + layer_terms
+                pass_.maps.setdefault(layer, []).append((gradient, part))
 
     def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:
         """Pixel gradient [h, w, 3] of each scale: first of what was kept, which makes room for what was not."""
@@ -459,12 +543,12 @@ class SosLoss:
                 keep_this = next(fits) and keep
                 activations = self._forward(pass_.image, tile, keep=keep_this)
                 with self.timer("statistics"):
-                    own = [pass_.statistics(layer, tile, activations.features[layer]) for layer in self.style_layers]
+                    own = pass_.statistics(self.style_layers, tile, activations)
                     parts = [[merge(*pair) for pair in zip(parts[0], own, strict=True)]] if parts else [own]
                     terms = terms + pass_.tile_terms(tile, activations)
                 if keep_this:
                     kept[-1][tile] = activations
-            statistics = parts[0] if parts else self._no_statistics(pass_.image.device)
+            statistics = parts[0] if parts else len(pass_.parts) * self._no_statistics(pass_.image.device)
             merged.append(self.collectives.all_reduce_statistics(statistics, terms))
         return merged, kept
 
@@ -478,7 +562,10 @@ class SosLoss:
 
 
 class _ScalePass:
-    """What the tiles of one scale share: pixels, position weights, content; loss and gradient maps once known."""
+    """What the tiles of one scale share: pixels, position weights, content; loss and gradient maps once known.
+
+    Each of its parts is compared with a style of its own; content belongs to all positions.
+    """
 
     def __init__(
         self,
@@ -488,48 +575,65 @@ class _ScalePass:
         tiles: list[PartitionTile],
         view: ViewTarget,
         content: ContentFeatures | None,
-        vectors: StyleVectors | None = None,
+        parts: list[_Part],
     ) -> None:
         self.image = image
         self.scale = scale
         self.tiles = tiles
         self.size = _size(image)
-        self.maps: dict[str, StyleGradient] = {}
-        self.matches: dict[PartitionTile, Matches] = {}
+        self.parts = parts
+        self.maps: dict[str, list[tuple[StyleGradient, _Part]]] = {}
+        self.matches: dict[PartitionTile, list[Matches]] = {}
         self.terms = torch.zeros(len(TERMS), dtype=torch.float64, device=image.device)
         self._coverage = view.coverage
         self._content_weight = loss.content_weight
         self._timer = loss.timer
         self._content = content
         if content is not None:
-            self._content_count = self._all_positions(CONTENT_LAYER)
-        self._vectors = vectors
-        if vectors is not None:
-            self._nearest_layer = loss.nearest_layers[0]  # the others' cells are the same
-            count = self._all_positions(self._nearest_layer)
-            self._nearest_factor = loss.nearest_weight / torch.where(count > 0, count, torch.inf)
-            self._rounding = loss.network.rounding
+            self._content_count = self._all_positions(CONTENT_LAYER, view.coverage)
+        #: Of each part with features to be matched: the vectors, the factor of its distances, and the part.
+        self._matched: list[tuple[StyleVectors, Tensor, _Part]] = []
+        for part in parts if loss.nearest_layers else ():
+            if part.style is not None and part.style.vectors is not None:
+                self._nearest_layer = loss.nearest_layers[0]  # the others' cells are the same
+                count = self._all_positions(self._nearest_layer, part.weights)
+                factor = part.factor * loss.nearest_weight / torch.where(count > 0, count, torch.inf)
+                self._matched.append((part.style.vectors, factor, part))
+                self._rounding = loss.network.rounding
 
-    def _all_positions(self, layer: str) -> Tensor:
+    def _all_positions(self, layer: str, pyramid: Sequence[Tensor] | None) -> Tensor:
         """How many cells of a layer the whole scale has, or the sum of their weights: float64 scalar."""
         stride = layer_stride(layer)
         cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
-        weights = self.position_weights(layer, cells)
+        weights = self._weights(layer, cells, pyramid)
         if weights is not None:
             return weights.sum(dtype=torch.float64)
         return torch.full((), cells.pixels, dtype=torch.float64, device=self.image.device)
 
-    def position_weights(self, layer: str, cells: Rectangle) -> Tensor | None:
-        """Weights [h, w] of some cells of a layer: the coverage, box-averaged to the cells; None for equal weights."""
-        if self._coverage is None:
+    def _weights(self, layer: str, cells: Rectangle, pyramid: Sequence[Tensor] | None) -> Tensor | None:
+        """Weights [h, w] of some cells of a layer, box-averaged to the cells; None for equal weights."""
+        if pyramid is None:
             return None
-        return self._coverage[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
+        return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
 
-    def statistics(self, layer: str, tile: PartitionTile, features: Tensor) -> LayerStatistics:
-        """Of the cells that a tile owns; features are those of all its cells."""
-        view, own = tile.owned_cells(layer, self.size)
-        owned, weights = features[own.slices], self.position_weights(layer, view)
-        return fused_statistics(owned, weights) if can_be_fused(owned) else layer_statistics(owned, weights)
+    def _is_nowhere(self, weights: Tensor | None) -> bool:
+        """Whether a region is known to have no share of some cells; a GPU is not waited for to be asked."""
+        return len(self.parts) > 1 and weights is not None and not weights.is_cuda and not bool(weights.any())
+
+    def statistics(self, layers: Sequence[str], tile: PartitionTile, activations: Activations) -> list[LayerStatistics]:
+        """Of the cells that a tile owns: for each part those of all layers."""
+        found = []
+        for part in self.parts:
+            for layer in layers:
+                view, own = tile.owned_cells(layer, self.size)
+                owned, weights = activations.features[layer][own.slices], self._weights(layer, view, part.weights)
+                if self._is_nowhere(weights):
+                    found.append(LayerStatistics.zero(owned.shape[-1], owned.device))
+                elif can_be_fused(owned):
+                    found.append(fused_statistics(owned, weights))
+                else:
+                    found.append(layer_statistics(owned, weights))
+        return found
 
     def tile_terms(self, tile: PartitionTile, activations: Activations) -> Tensor:
         """The tile's share [5] of the terms that are sums over positions; the others follow from the whole scale."""
@@ -545,14 +649,19 @@ class _ScalePass:
 
         What was found is kept for the second pass: a few bytes a cell, and the search takes long.
         """
-        if self._vectors is None:
+        if not self._matched:
             return None
         view, own = tile.owned_cells(self._nearest_layer, self.size)
-        weights = self.position_weights(self._nearest_layer, view)
-        features = {layer: activations.features[layer][own.slices] for layer in self._vectors.parts}
-        with self._timer("matching"):
-            found = self.matches[tile] = Matches.of(features, self._vectors, self._rounding, weights)
-            return self._nearest_factor * found.distance(weights)
+        self.matches[tile] = []
+        sums = []
+        for vectors, factor, part in self._matched:
+            weights = self._weights(self._nearest_layer, view, part.weights)
+            features = {layer: activations.features[layer][own.slices] for layer in vectors.parts}
+            with self._timer("matching"):
+                found = Matches.of(features, vectors, self._rounding, weights)
+                sums.append(factor * found.distance(weights))
+            self.matches[tile].append(found)
+        return reduce(operator.add, sums)
 
     def _content_difference(self, tile: PartitionTile, features: Tensor | None) -> ContentDifference | None:
         """On owned cells; features are those of all the tile's cells. None where content does not count."""
@@ -564,7 +673,7 @@ class _ScalePass:
             self._content[tile],
             self._content_count,
             self._content_weight,
-            self.position_weights(CONTENT_LAYER, view),
+            self._weights(CONTENT_LAYER, view, self._coverage),
         )
 
     def feature_gradient(self, tile: PartitionTile) -> FeatureGradient:
@@ -573,15 +682,17 @@ class _ScalePass:
         def add(layer: str, features: Tensor, gradient: Tensor) -> None:
             view, own = tile.owned_cells(layer, self.size)
             with self._timer("statistics"):
-                if layer in self.maps:
-                    weights = self.position_weights(layer, view)
-                    self.maps[layer].add_to(gradient[own.slices], features[own.slices], weights)
-                elif layer == CONTENT_LAYER and (content := self._content_difference(tile, features)) is not None:
+                for found, part in self.maps.get(layer, ()):
+                    weights = self._weights(layer, view, part.weights)
+                    if not self._is_nowhere(weights):
+                        found.add_to(gradient[own.slices], features[own.slices], weights)
+                if layer == CONTENT_LAYER and (content := self._content_difference(tile, features)) is not None:
                     gradient[own.slices] += content.gradient()
-                if self._vectors is not None and layer in self._vectors.parts:
-                    weights, vectors = self.position_weights(layer, view), self._vectors
-                    places = gradient[own.slices], features[own.slices]
-                    self.matches[tile].add_gradient(*places, layer, vectors, self._nearest_factor, weights)
+                for place, (vectors, factor, part) in enumerate(self._matched):
+                    if layer in vectors.parts:
+                        weights = self._weights(layer, view, part.weights)
+                        places = gradient[own.slices], features[own.slices]
+                        self.matches[tile][place].add_gradient(*places, layer, vectors, factor, weights)
 
         return add
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +18,15 @@ from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTar
 from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
+
+
+@dataclass(frozen=True)
+class RegionReference:
+    """A region: its style [H', W', 3], its share [H, W] of a view (None: equal weights), and the weight of its loss."""
+
+    style: Tensor
+    share: Tensor | None
+    weight: float = 1.0
 
 
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
@@ -74,7 +84,7 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
 def sos_reference(
     network_weights: BackboneWeights,
     image: Tensor,
-    style: Tensor,
+    style: Tensor | Sequence[RegionReference],
     content: Tensor | None = None,
     *,
     content_weight: float = 1.0,
@@ -87,12 +97,13 @@ def sos_reference(
 
     Args:
         image, content: [H, W, 3] in 0..1.
-        style: [H', W', 3], already at the size at which it is used (`pyramid.style_size`).
+        style: [H', W', 3], already at the size at which it is used (`pyramid.style_size`); or that of each region.
         coverage: [H, W] position weights; None for equal weights.
         style_loss: see `style_losses`; with features that are matched, the style has at most `nearest.MOST_VECTORS`.
         coarsest: pixels of the coarsest scale's shorter side at most.
         scales: weight of each scale, from full size on; all alike where none is given.
     """
+    parts = [RegionReference(style, coverage)] if isinstance(style, Tensor) else style
     x = image.double().clone().requires_grad_()
     total = torch.zeros((), dtype=torch.float64)
     count = scale_count(image.shape[0], image.shape[1], coarsest)
@@ -101,15 +112,8 @@ def sos_reference(
         loss = torch.zeros((), dtype=torch.float64)
         side = 1 << scale
         features = features_reference(network_weights, box_average_reference(x, side))
-        wanted = features_reference(network_weights, box_average_reference(style.double(), side))
-        for layer in STYLE_LAYERS if has_statistics(style_loss) else ():
-            position = _cells(coverage, side * layer_stride(layer))
-            loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position)
-        if matched := nearest_layers(style_loss, network_weights.name):
-            position = _cells(coverage, side * layer_stride(matched[0]))
-            own, other = ([found[layer] for layer in matched] for found in (features, wanted))
-            weight = nearest_weight(style_loss, network_weights.scales.get(CONTENT_LAYER, 1.0))
-            loss = loss + weight * nearest_reference(own, other, position)
+        for part in parts:
+            loss = loss + part.weight * _part_reference(network_weights, features, part, side, style_loss)
         if content is not None and content_weight:
             difference = features[CONTENT_LAYER] - _content_reference(network_weights, content, side)
             position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
@@ -119,6 +123,27 @@ def sos_reference(
     loss = total / sum(factors)
     (gradient,) = torch.autograd.grad(loss, x)
     return loss.item(), gradient
+
+
+def _part_reference(
+    network_weights: BackboneWeights,
+    features: Mapping[str, Tensor],
+    part: RegionReference,
+    side: int,
+    style_loss: StyleLossName,
+) -> Tensor:
+    """The style terms of a region at the scale of boxes of side x side pixels, from the view's features there."""
+    wanted = features_reference(network_weights, box_average_reference(part.style.double(), side))
+    loss = torch.zeros((), dtype=torch.float64)
+    for layer in STYLE_LAYERS if has_statistics(style_loss) else ():
+        position = _cells(part.share, side * layer_stride(layer))
+        loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position)
+    if matched := nearest_layers(style_loss, network_weights.name):
+        position = _cells(part.share, side * layer_stride(matched[0]))
+        own, other = ([found[layer] for layer in matched] for found in (features, wanted))
+        weight = nearest_weight(style_loss, network_weights.scales.get(CONTENT_LAYER, 1.0))
+        loss = loss + weight * nearest_reference(own, other, position)
+    return loss
 
 
 def _content_reference(network_weights: BackboneWeights, content: Tensor, side: int) -> Tensor:

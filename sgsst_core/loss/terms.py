@@ -116,6 +116,10 @@ class StyleGradient:
     mean: Tensor  # [c]
     offset: Tensor  # [c]
 
+    def times(self, factor: float) -> StyleGradient:
+        """The gradient of the loss times a factor."""
+        return StyleGradient(self.matrix * factor, self.mean, self.offset * factor)
+
     def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
         """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
         result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)

@@ -122,7 +122,8 @@ class _Deciding:
     def _without_decisions(self) -> Plan:
         probe, settings = self.probe, self.settings
         looked = probe.survey
-        optimised = optimised_gaussians(looked, settings)
+        decided = optimised_gaussians(looked, settings)
+        optimised = decided if probe.kept is None else decided & ~probe.kept
         weighted = settings.position_weights == "on" or (
             settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
         )
@@ -134,7 +135,7 @@ class _Deciding:
         return Plan(
             survey=looked,
             optimised=optimised,
-            seen=rendered_gaussians(optimised, settings),
+            seen=rendered_gaussians(decided, settings),
             covered=probe.distinct,
             weighted=weighted,
             steps_coarse=steps_coarse,

@@ -6,15 +6,18 @@ import math
 from collections.abc import Sequence
 
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.style_losses import NEAREST_WEIGHTS
+from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
 from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
-from sgsst_core.planning.visits import Visits
+from sgsst_core.planning.visits import MAP_BYTES, MAPS_OF_A_RENDER, Visits
+from sgsst_core.scene.camera import Camera
 from sgsst_core.settings import Settings
 
 _ANOTHER_LOSS = "it is another loss than the paper's"
@@ -208,6 +211,55 @@ def _of_style_loss(probe: Probe, settings: Settings, work: Work) -> Decision:
         f"{settings.style_loss} was asked for",
         error="it is another loss than the paper's",
     )
+
+
+def of_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
+    """Of several style pictures, how they are mixed."""
+    reason = f"{len(style.pictures)} pictures were given"
+    if not has_statistics(settings.style_loss):
+        reason += "; features are matched with those of all of them, whose weights count where there are too many"
+    return [Decision("styles", f"a mixture: {style.text}", reason, error=_ANOTHER_LOSS)]
+
+
+def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
+    """What each region becomes, and what their maps take.
+
+    Args:
+        asked: the regions as they were given.
+        resolved: as the views see them.
+    """
+    weights = plan.survey.total_blend_weights
+    found = []
+    for place, region in enumerate(asked.every):
+        own, now = asked.members(place), resolved.members(place)
+        count, share = int(now.sum()), float(weights[now].sum() / weights.sum())
+        reason = region.select or "no selection names them"
+        taken = region.selected - int(own.sum())
+        if taken > 0:
+            reason += f"; {taken:,} more belong to a region that was given later, too, which has them"
+        what = f"{count:,} of {len(weights):,} Gaussians, {share:.1%} of what the views show,"
+        if place and not bool(own.any()):
+            done = f"warning: left out, because it has no Gaussians{' of its own' if taken > 0 else ''}"
+        elif region.keep:
+            done = f"{int(own.sum()):,} Gaussians stay as they are"
+        elif place and place not in resolved.active:
+            done = f"warning: left out, because no view sees its {int(own.sum()):,} Gaussians: they are of the rest"
+        elif place not in resolved.active:
+            continue  # an empty rest
+        else:
+            done = f"{what} take {region.style.text if region.style else 'the style'}"
+            done += f", with weight {region.weight:g}" if region.weight != 1 else ""
+        found.append(Decision(f"region {region.name}", done, reason, error=_ANOTHER_LOSS))
+    if not resolved.mapped:
+        return found
+    sizes = [cameras[index].width * cameras[index].height for index in plan.covered]
+    total, renders = (
+        int(MAP_BYTES * len(resolved.active) * sum(sizes)),
+        -(-len(resolved.active) // MAPS_OF_A_RENDER) + 1,
+    )
+    how = f"statistics of {len(resolved.active)} regions are weighted by their share of each pixel's blend weights"
+    how += f"; {renders} renders at a view's first visit, {total / 1e6:.1f} MB for all views"
+    return [*found, Decision("regions", how, "one style must not leak into another's region", error=_ANOTHER_LOSS)]
 
 
 def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:

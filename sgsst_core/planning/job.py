@@ -55,7 +55,7 @@ def whole_job(
         expected,
         first_visit=visits.first(coarse=False),
         first_visit_coarse=visits.first(coarse=True),
-        style=work.without_region * probe.network.rate.forward,
+        style=probe.styles * work.without_region * probe.network.rate.forward,
     )
     steps = _steps_seconds(expected, plan, settings)
     expected = replace(expected, job=steps)

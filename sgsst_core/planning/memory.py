@@ -80,12 +80,16 @@ class PeakMemory:
         return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
 
     def _content(self) -> int:
-        """Content features: of the coarsest scale from phase 1 on, of all of them from phase 2 on; or their images."""
+        """Content features: of the coarsest scale from phase 1 on, of all of them from phase 2 on; or their images.
+
+        Maps of regions are counted here, too.
+        """
         content, coarse = self.visits.content, self.visits.content_coarse
         whole = self._visited(self.settings.steps_sos)
         taken = whole * content.bytes + (self._all_visited - whole) * coarse.bytes
         images = min(self._all_visited * self.visits.images.bytes, self.visits.images.room)
-        return int(min(taken / self._ranks, content.room) + images)
+        maps = min(self._all_visited * self.visits.maps.bytes, self.visits.maps.room)
+        return int(min(taken / self._ranks, content.room) + images + maps)
 
     def _weights(self) -> int:
         weights = self.visits.weights

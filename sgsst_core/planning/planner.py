@@ -8,12 +8,15 @@ from dataclasses import replace
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.decisions import of_regions, of_styles
 from sgsst_core.planning.orbit import Orbit, orbit_decisions
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.probe import Workshop, equip, measure
+from sgsst_core.planning.probe import Probe, Workshop, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
 from sgsst_core.planning.survey import Survey, survey
@@ -36,6 +39,8 @@ def make_plan(
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
     orbit: Orbit | None = None,
+    style: StyleMixture | None = None,
+    regions: Regions | None = None,
 ) -> tuple[Plan, Workshop]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
@@ -48,14 +53,16 @@ def make_plan(
         show: told how far the survey has come.
         timer: counts the seconds of `survey`, and of all else as `planning`.
         orbit: that the cameras are of, for the plan to tell of it; None for those of files.
+        style: for the plan to tell of its pictures; None for one picture.
+        regions: of the scene; None where it has none.
 
     Returns:
         The plan, and what was built to make it, for a `Stylizer` to go on with.
 
     Raises:
         CameraError: no cameras, or none sees a Gaussian.
-        SettingsError: pruning would leave no Gaussian, the views do not have the scales that were asked for, or a
-            rasterizer that cannot be used here.
+        SettingsError: pruning would leave no Gaussian, regions keep all that the views see, the views do not have the
+            scales that were asked for, or a rasterizer that cannot be used here.
         WeightsError: no weights.
     """
     if not cameras:
@@ -70,9 +77,31 @@ def make_plan(
         if looked is None:
             with timer("survey"):
                 looked = survey(scene, fitted, workshop.rasterizer, collectives, show)
+        resolved = regions and regions.resolved(looked.total_blend_weights)
+        maps = len(resolved.active) if resolved is not None and resolved.mapped else 0
         link = probe_link(collectives, workshop.network.device)
         # Timings differ from rank to rank: one decides for all.
-        plan = collectives.broadcast(lambda: decide(measure(workshop, looked, link), settings, measured=measured))
+        plan = collectives.broadcast(
+            lambda: _decide(measure(workshop, looked, link, maps), settings, measured, style, resolved)
+        )
+        if regions is not None and resolved is not None:
+            plan = replace(plan, decisions=(*of_regions(regions, resolved, plan, fitted), *plan.decisions))
         if orbit is not None:
             plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, looked), *plan.decisions))
     return plan, workshop
+
+
+def _decide(
+    probe: Probe, settings: Settings, measured: bool, style: StyleMixture | None, regions: Regions | None
+) -> Plan:
+    """The plan of a style of one picture or several, for one region or several, as `Regions.resolved` gives them."""
+    if regions is not None:
+        own = [regions.every[place].style or style for place in regions.active]
+        count = sum(len(each.pictures) if each else 1 for each in own)
+        probe = replace(probe, kept=regions.kept, styles=count)
+    elif style is not None:
+        probe = replace(probe, styles=len(style.pictures))
+    plan = decide(probe, settings, measured=measured)
+    if style is None or len(style.pictures) == 1:
+        return plan
+    return replace(plan, decisions=(*of_styles(style, settings), *plan.decisions))

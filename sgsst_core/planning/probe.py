@@ -22,7 +22,7 @@ from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork, us
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import search
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
@@ -162,6 +162,9 @@ class Probe:
         process_bytes: of physical memory, with scene and network loaded.
         device_bytes: of a GPU's memory, likewise; 0 where a CPU computes.
         launches: of a view's loss on a GPU; None on a CPU, and where nothing follows from it.
+        styles: pictures that the style is mixed of.
+        kept: [N] bool, Gaussians that stay as they are; None where none do.
+        maps: regions whose share is rendered in each view.
     """
 
     scene: SceneFacts
@@ -177,6 +180,9 @@ class Probe:
     pruned_error: ImageError | None = None
     device_bytes: int = 0
     launches: LaunchCost | None = None
+    styles: int = 1
+    kept: Tensor | None = None
+    maps: int = 0
 
 
 @dataclass(frozen=True)
@@ -273,8 +279,11 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
-def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
+def measure(workshop: Workshop, looked: Survey, link: Link, maps: int = 0) -> Probe:
     """Time and count; one rank does it for all, because timings differ from rank to rank.
+
+    Args:
+        maps: regions whose share is rendered in each view.
 
     Raises:
         SettingsError: pruning would leave no Gaussian.
@@ -282,7 +291,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
     scene, cameras, settings = workshop.scene, workshop.cameras, workshop.settings
     seen = rendered_gaussians(optimised_gaussians(looked, settings), settings)
     distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
-    network = _network_facts(workshop, cameras[distinct[0]])
+    network = _network_facts(workshop, cameras[distinct[0]], maps)
     launches = _launch_cost(workshop, [cameras[index] for index in distinct])
     budget = int(workshop.machine.memory * MEMORY_SHARES["rasterizer"])
     raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)
@@ -304,18 +313,19 @@ def measure(workshop: Workshop, looked: Survey, link: Link) -> Probe:
         error,
         torch.cuda.memory_allocated(workshop.network.device) if workshop.machine.device == "cuda" else 0,
         launches,
+        maps=maps,
     )
 
 
 # --- the feature network -------------------------------------------------------------------------------------------
 
 
-def _network_facts(workshop: Workshop, first: Camera) -> NetworkFacts:
+def _network_facts(workshop: Workshop, first: Camera, maps: int) -> NetworkFacts:
     """Of the network on made-up pictures, and where it is not in float32, its error on the first view."""
     network, settings, loss = workshop.network, workshop.settings, _loss(workshop)
     side = min(_side(workshop, loss), max(max(camera.width, camera.height) for camera in workshop.cameras))
     fixed = 0.0
-    rate = measure_rate(loss, side)
+    rate = measure_rate(loss, side, maps)
     if workshop.machine.ranks > 1:  # as good as no pixel: what it takes is the same for any number
         fixed = measure_rate(loss, ALIGNMENT).both * ALIGNMENT**2
     return NetworkFacts(
@@ -373,8 +383,8 @@ def _side(workshop: Workshop, loss: SosLoss) -> int:
     return max(min(most, fits), ALIGNMENT)
 
 
-def measure_rate(loss: SosLoss, side: int) -> Rate:
-    """Time the feature network on a small picture of side x side pixels.
+def measure_rate(loss: SosLoss, side: int, maps: int = 0) -> Rate:
+    """Time the feature network on a small picture of side x side pixels, with statistics of so many regions, if any.
 
     The first run prepares, the fastest of the others counts: what disturbs one of them is no property of the network.
     """
@@ -383,6 +393,10 @@ def measure_rate(loss: SosLoss, side: int) -> Rate:
     vectors = style[0].vectors
     if vectors is not None:  # its time grows with their number, and is not the pixels'
         style = {0: replace(style[0], vectors=replace(vectors, units=vectors.units[:1]))}
+    if maps:
+        share = torch.full((side, side), 1 / maps, device=loss.network.device)
+        view.regions = [loss.position_weights(share)] * maps
+        style = {0: ScaleTarget({}, None, (RegionTarget(style[0]),) * maps)}
 
     def seconds(gradient: bool) -> float:
         timer = Timer(loss.network.device)

@@ -23,6 +23,10 @@ RENDER = 0.5
 COLOUR_BYTES = 12
 #: Of a pixel of the content image at all scales, float32, which is kept where steps have different colours behind it.
 _IMAGE_BYTES = 16
+#: Of a pixel of a region's map at all scales, float32.
+MAP_BYTES = 16 / 3
+#: Regions whose maps come with one render.
+MAPS_OF_A_RENDER = 3
 #: Cutting the survey's lists of a view down to the Gaussians of the job, in making them.
 _CUT = 0.25
 
@@ -73,6 +77,7 @@ class Visits:
         colours: of spherical harmonics.
         weights: kept ones; None where none are.
         content: features at all scales, with the render that they are of; `content_coarse`: of the coarsest alone.
+        maps: of the regions' shares.
         images: of the content, which features with another colour behind them are computed from.
         raster: seconds of a render and its gradient, weights computed anew; `raster_kept`: with kept ones.
         in_coarse: phase 1 makes lists, colours and weights, so that phase 2 finds them.
@@ -87,6 +92,7 @@ class Visits:
     content: Made
     content_coarse: Made
     images: Made
+    maps: Made
     raster: float
     raster_kept: float
     in_coarse: bool
@@ -114,7 +120,7 @@ class Visits:
             weights = Made(seconds, size, weighed)
         rendered = RENDER * raster.seconds if settings.content_weight else 0.0
         forward = probe.network.rate.forward if settings.content_weight else 0.0
-        room_of_content = 0 if "content" in settings.keep else room / 2
+        room_of_content = 0 if "content" in settings.keep else room / (4 if probe.maps else 2)
         share = coarse.pixels / work.pixels  # of the content's bytes, as of its pixels
         images = Made(0.0)
         if plan.surround != "background" and settings.content_weight:  # features are another colour's at every visit
@@ -122,6 +128,7 @@ class Visits:
             room_of_images, room_of_content = room_of_content / 2, 0
             images, rendered = Made(rendered, _IMAGE_BYTES * pixels, room_of_images), 0.0
         return Visits(
+            maps=_maps(plan, probe, room / 4),
             lists=lists,
             surveyed=surveyed,
             handed=min(surveyed.kept / lists.kept, 1.0) * (1 if plan.seen.all() else 1 - _CUT),
@@ -145,15 +152,24 @@ class Visits:
 
     def later(self, *, coarse: bool) -> float:
         """Seconds of every visit beside rendering and the network: content that is not kept."""
-        return (self.content_coarse if coarse else self.content).always + self.images.always
+        return (self.content_coarse if coarse else self.content).always + self.images.always + self.maps.always
 
     def first(self, *, coarse: bool) -> float:
         """Seconds of a view's first visit in a phase beside those of its later visits."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
-        lists = (1 - self.handed) * self.lists.once + self.colours.once
+        lists = (1 - self.handed) * self.lists.once + self.colours.once + self.maps.once
         keeping = self.weights.once if self.weights else 0.0
         if coarse:
             return content + lists + (0.0 if self.coarse_weights else keeping)
         if not self.in_coarse:
             return content + lists + keeping
         return content + (keeping if self.coarse_weights else 0.0)
+
+
+def _maps(plan: Plan, probe: Probe, room: float) -> Made:
+    """Of the regions' shares in all views."""
+    if not probe.maps:
+        return Made(0.0)
+    pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
+    renders = 1 + -(-probe.maps // MAPS_OF_A_RENDER)  # and one of what lies behind
+    return Made(RENDER * renders * probe.raster.seconds, MAP_BYTES * probe.maps * pixels, room)

@@ -110,8 +110,8 @@ class ExactLoss:
         """What the style asks of views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
-            style = self._stylizer.style.to(self.loss.network.device)
-            self._style_targets[size] = self.loss.style_targets(style, size)
+            styles = self._stylizer.styles.to(self.loss.network.device)
+            self._style_targets[size] = styles.targets(self.loss, size)
         return self._style_targets[size]
 
 
@@ -142,6 +142,7 @@ class ExactTwin(ExactLoss):
             photos=stylizer.photos,
             memory=memory,
             revive=settings.revive,
+            maps=stylizer.styles.maps(rasterizer, self.shown),
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:

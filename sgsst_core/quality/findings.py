@@ -18,6 +18,7 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.ply import SceneFile
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.planning.survey import Survey, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera
@@ -76,16 +77,22 @@ class Finding:
 
 
 def findings_of(
-    file: SceneFile, cameras: Sequence[Camera], style: Tensor | None, *, near: float, looked: Survey | None = None
+    file: SceneFile,
+    cameras: Sequence[Camera],
+    style: Tensor | StyleMixture | None,
+    *,
+    near: float,
+    looked: Survey | None = None,
 ) -> list[Finding]:
-    """What is extreme in a scene that was read with `drop_invalid`, its views, and a style image [H, W, 3] if given.
+    """What is extreme in a scene that was read with `drop_invalid`, its views, and a style if given.
 
     Args:
         looked: a survey of the cameras, which need not be looked at again then.
     """
     rasterizer = make_rasterizer("cpu", file.scene, near=near)  # builds nothing yet
     found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, looked=looked)]
-    return found if style is None else [*found, *style_findings(style, cameras)]
+    pictures = () if style is None else StyleMixture.of(style).pictures
+    return [*found, *(finding for picture in pictures for finding in style_findings(picture, cameras))]
 
 
 def scene_findings(file: SceneFile) -> list[Finding]:

@@ -37,6 +37,7 @@ from sgsst_core.rasterizer.arguments import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.stylizing.regions import RegionMaps
 
 #: Views whose Gram distance is measured, and pairs of each range that are compared, at most.
 MOST_VIEWS = 4
@@ -149,6 +150,7 @@ class HeldOut:
         memory: bytes that coverage, colours, warps and pictures may take; what does not fit is computed again.
         rasterizer_of: makes one of a part of the scene, for a first look at the views of a large one; None looks at
             all of it.
+        maps: renders the share of each region, which `style_targets` are those of; None where the scene has none.
 
     Attributes:
         cameras: all held-out views.
@@ -172,6 +174,7 @@ class HeldOut:
         most: int = MOST_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
+        maps: RegionMaps | None = None,
     ) -> None:
         self.scene = scene
         self.rasterizer = rasterizer
@@ -180,6 +183,7 @@ class HeldOut:
         self.first = first
         self._style_targets = style_targets
         self._rasterizer_of = rasterizer_of
+        self._maps = maps
         self._loss = SosLoss(
             loss.network,
             content_weight=0.0,
@@ -276,6 +280,9 @@ class HeldOut:
             if self.weighted:
                 coverage = self._coverage.get(index, partial(self.rasterizer.coverage, self.cameras[index]))
             target = self._loss.view_target(image, coverage)
+            if self._maps is not None:
+                shares = self._maps.render(self.cameras[index]).unbind(2)
+                target.regions = [self._loss.position_weights(share) for share in shares]
             style = self._style_targets(self.cameras[index])
             for scale, terms in self._loss.evaluate(image, style, target, gradient=False).terms.items():
                 values.setdefault(scale, []).append(terms["gram"])

@@ -8,8 +8,10 @@ on black and on white behind them: an object scan has no surround of its own.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from statistics import fmean
 
 import torch
@@ -17,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
+from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 from sgsst_core.loss.sos import resize_area
 from sgsst_core.quality.consistency import shown
 from sgsst_core.quality.lpips import Lpips, unit_features
@@ -65,7 +68,7 @@ class Judge:
 
     Args:
         lpips: with AlexNet.
-        style: style image [H, W, 3] in 0..1.
+        style: a picture [H, W, 3] in 0..1, or several with their weights: the mixture's Gram matrices and palette.
         scene: unstylized.
         rasterizer: of the scene.
         cameras: of the views; larger ones than `JUDGED_SIDE` are judged at that size. Those that see next to nothing
@@ -79,7 +82,7 @@ class Judge:
     def __init__(
         self,
         lpips: Lpips,
-        style: Tensor,
+        style: Tensor | StyleMixture,
         scene: Scene,
         rasterizer: Rasterizer,
         cameras: Sequence[Camera],
@@ -87,11 +90,16 @@ class Judge:
     ) -> None:
         self.scene = scene
         self._lpips, self._rasterizer = lpips, rasterizer
-        self._style = style.to(lpips.device, torch.float32)
+        self._style = StyleMixture.of(style).map(lambda picture: picture.to(lpips.device, torch.float32))
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
         self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
-        pixels = self._style.reshape(-1, 3)
-        self._palette = _moments(pixels, torch.ones(len(pixels), device=pixels.device))
+        self._palette = mixed_moments(
+            [
+                _moments(picture.reshape(-1, 3), picture.new_ones(picture[..., 0].numel()))
+                for picture in self._style.pictures
+            ],
+            self._style.weights,
+        )
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
         small = [resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras]
         self.cameras = [
@@ -165,13 +173,20 @@ class Judge:
 
     def _style_grams(self, view: tuple[int, int]) -> list[Tensor]:
         """The style's Gram matrices at the size that it has in the loss of such a view; at least AlexNet's least."""
-        height, width = style_size((self._style.shape[0], self._style.shape[1]), view)
+        if view not in self._targets:
+            every = [self._grams(picture, view) for picture in self._style.pictures]
+            self._targets[view] = [
+                reduce(operator.add, [weight * gram for gram, weight in zip(grams, self._style.weights, strict=True)])
+                for grams in zip(*every, strict=True)
+            ]
+        return self._targets[view]
+
+    def _grams(self, picture: Tensor, view: tuple[int, int]) -> list[Tensor]:
+        """Of one picture of the style."""
+        height, width = style_size((picture.shape[0], picture.shape[1]), view)
         enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
-        size = (round(height * enlarged), round(width * enlarged))
-        if size not in self._targets:
-            features = self._lpips.features(resize_area(self._style, size))
-            self._targets[size] = [_gram(x, torch.ones(x.shape[:2], device=x.device)) for x in features]
-        return self._targets[size]
+        features = self._lpips.features(resize_area(picture, (round(height * enlarged), round(width * enlarged))))
+        return [_gram(x, torch.ones(x.shape[:2], device=x.device)) for x in features]
 
 
 def saturated(sh_dc: Tensor) -> float:

@@ -238,4 +238,5 @@ class Measurements:
             first={int(scale): value for scale, value in first["gram"].items()} if first else None,
             most=views,
             rasterizer_of=partial(rasterizer_beside, stylizer),
+            maps=stylizer.styles.maps(rasterizer),
         )

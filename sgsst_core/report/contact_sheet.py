@@ -44,7 +44,7 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
             camera = views.cameras[index]
             renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
-    sheet = _sheet(_picture(stylizer.style), pairs)
+    sheet = _sheet(_stacked([_picture(picture) for style in stylizer.styles.all for picture in style.pictures]), pairs)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 
@@ -112,6 +112,20 @@ def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Ten
 def _picture(image: Tensor) -> Image.Image:
     values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
     return Image.fromarray(values.numpy())
+
+
+def _stacked(pictures: Sequence[Image.Image]) -> Image.Image:
+    """Pictures one below the other, as wide as the widest; one picture as it is."""
+    if len(pictures) == 1:
+        return pictures[0]
+    width = max(picture.width for picture in pictures)
+    fitted = [_fitted(picture, width, max(1, round(picture.height * width / picture.width))) for picture in pictures]
+    whole = Image.new("RGB", (width, sum(picture.height for picture in fitted)), PAPER)
+    top = 0
+    for picture in fitted:
+        whole.paste(picture, (0, top))
+        top += picture.height
+    return whole
 
 
 def _fitted(picture: Image.Image, width: int, height: int) -> Image.Image:

@@ -37,7 +37,7 @@ class Sources:
     Attributes:
         scene: the PLY file.
         dropped: Gaussians of the file that were left out because of non-finite values.
-        style: the style image.
+        styles: the style's pictures.
         cameras: the camera file or folder; None for an orbit.
         photos: folder of the content images; None for unstylized renders.
         backbone: the feature network's weights.
@@ -45,7 +45,7 @@ class Sources:
 
     scene: Path
     dropped: int
-    style: Path
+    styles: tuple[Path, ...]
     cameras: Path | None
     photos: Path | None
     backbone: BackboneWeights
@@ -115,7 +115,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
 
 def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     """What was stylized with what."""
-    backbone, style = sources.backbone, stylizer.style
+    backbone, styles = sources.backbone, _styles_json(stylizer, sources)
     return {
         "settings": stylizer.settings.model_dump(mode="json"),
         "backbone": {
@@ -130,13 +130,47 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
             "sh_degree": stylizer.sh_degree,
             "dropped": sources.dropped,
         },
-        "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
+        "style": {name: styles[0][name] for name in ("path", "width", "height")},
+        "styles": styles,
+        "regions": _regions_json(stylizer),
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.views.weighted,
             "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
         },
     }
+
+
+def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
+    """The pictures of the style, as they were used, with their shares."""
+    style, regions, paths = stylizer.style, stylizer.regions, sources.styles
+    if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
+        paths = tuple(map(Path, style.names))  # one region is everything, and has a style of its own
+    return [
+        {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
+        for path, picture, weight in zip(paths, style.pictures, style.weights, strict=True)
+    ]
+
+
+def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
+    """The regions of the scene, the rest first; none where it has none."""
+    regions = stylizer.regions
+    if regions is None:
+        return []
+    weights = stylizer.plan.survey.total_blend_weights
+    return [
+        {
+            "name": region.name,
+            "select": region.select or None,
+            "gaussians": int(regions.members(place).sum()),
+            "share": float(weights[regions.members(place)].sum() / weights.sum()),
+            "style": region.style and region.style.text,
+            "weight": region.weight,
+            "keep": region.keep,
+            "stylized": place in regions.active,
+        }
+        for place, region in enumerate(regions.every)
+    ]
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
     figures = draw_figures(report)
     return _ENVIRONMENT.get_template("report.html").render(
         scene=PurePath(report["scene"]["path"]).name,
-        style=PurePath(report["style"]["path"]).name,
+        style=_style_names(report),
         facts=_facts(report),
         result=_result(report),
         bought=_bought(report),
@@ -105,6 +105,15 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         program=f"{report['program']['name']} {report['program']['version']}",
         created=report["created"],
     )
+
+
+def _style_names(report: dict[str, Any]) -> str:
+    """The style's pictures; reports of before there were several name one alone."""
+    styles = report.get("styles", [report["style"]])
+    names = [PurePath(style["path"]).name for style in styles]
+    if len(names) == 1:
+        return names[0]
+    return ", ".join(f"{name} ({style['weight']:.0%})" for name, style in zip(names, styles, strict=True))
 
 
 def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, views_path: Path | None = None) -> None:

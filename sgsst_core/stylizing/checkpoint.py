@@ -23,6 +23,8 @@ from torch import Tensor
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
@@ -128,16 +130,25 @@ def versions() -> dict[str, str]:
 
 
 def fingerprint(
-    scene: Scene, cameras: Sequence[Camera], style: Tensor, settings: Settings, weights: str, photos: str = ""
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor | StyleMixture,
+    settings: Settings,
+    weights: str,
+    photos: str = "",
+    regions: Regions | None = None,
 ) -> str:
     """SHA-256 over all that decides the course of a job.
 
     Args:
         weights: digest of the feature network's.
         photos: whatever identifies the content images; empty for unstylized renders.
+        regions: of the scene; None where it has none.
     """
     digest = hashlib.sha256(repr((weights, photos)).encode())
-    for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest, style):
+    mixture = StyleMixture.of(style)
+    arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
+    for tensor in (*arrays, *mixture.pictures):
         digest.update(repr(tuple(tensor.shape)).encode())
         if isinstance(tensor, StoredHarmonics):
             tensor.for_blocks(
@@ -145,11 +156,25 @@ def fingerprint(
             )
         else:
             digest.update(tensor.contiguous().numpy().data)
+    if len(mixture.pictures) > 1:
+        digest.update(repr(mixture.weights).encode())
+    if regions is not None:
+        _add_regions(digest, regions)
     for camera in cameras:
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
     digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
     return digest.hexdigest()
+
+
+def _add_regions(digest: Any, regions: Regions) -> None:
+    """Which Gaussians belong together, and what becomes of them; not what they are called."""
+    digest.update(regions.labels.contiguous().numpy().data)
+    for region in regions.every:
+        pictures, weights = (region.style.pictures, region.style.weights) if region.style else ((), ())
+        digest.update(repr((region.keep, region.weight, weights)).encode())
+        for picture in pictures:
+            digest.update(repr(tuple(picture.shape)).encode() + picture.contiguous().numpy().tobytes())
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, job: str) -> None:

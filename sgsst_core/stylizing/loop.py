@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import has_converged, has_reached
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -213,7 +214,7 @@ def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
 def stylize(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor,
+    style: Tensor | StyleMixture,
     settings: Settings,
     *,
     weights: BackboneWeights | None = None,

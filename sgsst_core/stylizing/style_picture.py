@@ -1,7 +1,8 @@
-"""The style image as a job uses it: turned, and in the scene's colours, where that is asked."""
+"""The style's pictures as a job uses them: turned, and in the scene's colours, where that is asked."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -10,21 +11,22 @@ from scipy import ndimage
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
 from sgsst_core.stylizing.warm_start import in_colours_of, in_luminance_of
 
 
-def prepared_style(style: Tensor, settings: Settings, sh_dc: Tensor, weights: Tensor) -> Tensor:
-    """A style image [H, W, 3] in 0..1 as the settings want it; itself where they want nothing.
+def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+    """A style, of pictures [H, W, 3] in 0..1, as the settings want it; itself where they want nothing.
 
     Args:
         sh_dc: [N, 3], of the scene.
         weights: [N] float64, total blend weights, at least one positive.
     """
     if settings.style_rotation:
-        style = turned(style, settings.style_rotation)
+        style = style.map(lambda picture: turned(picture, settings.style_rotation))
     if settings.keep_colours == "match":
         # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
         # 2017, section 5.2.
@@ -34,8 +36,8 @@ def prepared_style(style: Tensor, settings: Settings, sh_dc: Tensor, weights: Te
     return style
 
 
-def check_style_size(style: Tensor, cameras: Sequence[Camera], scale: float) -> None:
-    """Prove that no view asks for a style image [H, W, 3] of more than `MAX_RESOLUTION` pixels on its longer side.
+def check_style_size(style: Tensor | StyleMixture, cameras: Sequence[Camera], scale: float) -> None:
+    """Prove that no view asks for a style picture [H, W, 3] of more than `MAX_RESOLUTION` pixels on its longer side.
 
     Args:
         cameras: at the sizes that they are stylized at.
@@ -46,8 +48,10 @@ def check_style_size(style: Tensor, cameras: Sequence[Camera], scale: float) -> 
     """
     if scale <= 1:
         return
-    for size in {(camera.height, camera.width) for camera in cameras}:
-        height, width = style_size((style.shape[0], style.shape[1]), size, scale)
+    pictures = StyleMixture.of(style).pictures
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    for size, picture in itertools.product(sizes, pictures):
+        height, width = style_size((picture.shape[0], picture.shape[1]), size, scale)
         if max(height, width) > MAX_RESOLUTION:
             raise SettingsError(
                 f"--style-scale {scale:g} would make the style image {width:,} x {height:,} pixels for views of "

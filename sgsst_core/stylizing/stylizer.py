@@ -20,6 +20,8 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -43,14 +45,13 @@ from sgsst_core.stylizing.evaluation import (
     mean_loss,
 )
 from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
+from sgsst_core.stylizing.regions import JobStyles, neighbours_change_by_region
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
-from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.surround import Colour, drawn_colour
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.unseen import neighbours_change
 from sgsst_core.stylizing.views import Views
-from sgsst_core.stylizing.warm_start import luminance_start, warm_start
 from sgsst_core.timing import Timer
 
 
@@ -61,13 +62,14 @@ class Stylizer:
         plan: of this scene, these cameras and settings: from `make_plan`, or of an earlier run of the same job.
         scene: what to stylize.
         cameras: the views; larger ones are brought down to `settings.max_resolution`.
-        style: [H, W, 3] in 0..1.
+        style: a picture [H, W, 3] in 0..1, or several with their weights.
         settings: see `Settings`.
         weights: of the feature network.
         photos: content image of a camera by its index, at its (brought down) size; None for unstylized renders.
         collectives: of the ranks that stylize the scene together. Every rank has a stylizer with the same arguments and
             calls the same methods in the same order; `state`, `stylized` and the like, which only read, need no other.
         workshop: what was built to make the plan; None builds it anew.
+        regions: of the scene, each with its own style or kept; the plan was made for them. None for one style for all.
 
     Attributes:
         collectives: of all ranks that take part.
@@ -82,13 +84,14 @@ class Stylizer:
         plan: Plan,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor,
+        style: Tensor | StyleMixture,
         settings: Settings,
         *,
         weights: BackboneWeights,
         photos: PhotoLoader | None = None,
         collectives: Collectives = ALONE,
         workshop: Workshop | None = None,
+        regions: Regions | None = None,
     ) -> None:
         self.plan = plan
         self.settings = settings
@@ -105,10 +108,12 @@ class Stylizer:
         self.latest: list[int] = []
         self.weights = weights = weights_for(weights, settings)
         self.photos = photos
-        self.style = style = prepared_style(style, settings, scene.sh_dc, plan.survey.total_blend_weights)
+        weights_of_views = plan.survey.total_blend_weights
+        self.regions = regions = regions and regions.resolved(weights_of_views)
+        self.styles = JobStyles.prepared(StyleMixture.of(style), regions, settings, scene.sh_dc, weights_of_views)
         forget_device_peak(plan.device)
         self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
-        self._style = style.to(self.network.device)
+        self._styles = self.styles.to(self.network.device)
         self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
@@ -128,6 +133,9 @@ class Stylizer:
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         start = self.transferred() if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
+        kept = regions.kept[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
+        #: Of the Gaussians that are rendered, those that stay as they are; None where none do.
+        self._kept = kept.to(rasterizer.device)[:, None] if kept.any() else None
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
         self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit, chroma_of)
         self._generator = torch.Generator().manual_seed(settings.seed)
@@ -144,18 +152,26 @@ class Stylizer:
         cls,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor,
+        style: Tensor | StyleMixture,
         settings: Settings,
         *,
         weights: BackboneWeights | None = None,
         photos: PhotoLoader | None = None,
         rasterizer: str | None = None,
         collectives: Collectives = ALONE,
+        regions: Regions | None = None,
     ) -> Self:
         """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised."""
         weights = weights or load_network_weights("auto")
         plan, workshop = make_plan(
-            scene, cameras, settings, weights=weights, rasterizer=rasterizer, collectives=collectives
+            scene,
+            cameras,
+            settings,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
+            style=StyleMixture.of(style),
+            regions=regions,
         )
         return cls(
             plan,
@@ -167,13 +183,14 @@ class Stylizer:
             photos=photos,
             collectives=collectives,
             workshop=workshop,
+            regions=regions,
         )
 
     def transferred(self) -> Tensor:
         """Colours [N, 3] of the Gaussians that are rendered, with the style's mean and spread in closed form."""
         seen, own = self.plan.seen, self.scene.sh_dc[self.plan.seen]
-        transfer = luminance_start if self._keeps_chroma else warm_start
-        found = transfer(own, self.plan.survey.total_blend_weights[seen], self.style)
+        weights = self.plan.survey.total_blend_weights[seen]
+        found = self.styles.transferred(own, weights, seen, keep_chroma=self._keeps_chroma)
         # Of what no view decides, colours follow from what becomes of the others: see `stylized`.
         return torch.where(self.plan.optimised[seen][:, None], found, own)
 
@@ -249,8 +266,14 @@ class Stylizer:
             regions=plan.survey.regions if plan.weighted else None,
             background=settings.background,
             drawn=plan.surround != "background",
+            maps=self.styles.maps(rasterizer, plan.seen),
             collectives=self.group,
         )
+
+    @property
+    def style(self) -> StyleMixture:
+        """The style of what no region says otherwise."""
+        return self.styles.own
 
     @property
     def phase(self) -> Phase:
@@ -309,7 +332,7 @@ class Stylizer:
         size = (camera.height, camera.width)
         if size not in self._style_targets:
             started = time.perf_counter()
-            self._style_targets[size] = self.loss.style_targets(self._style, size)
+            self._style_targets[size] = self._styles.targets(self.loss, size)
             self.style_seconds += time.perf_counter() - started
         return self._style_targets[size]
 
@@ -379,6 +402,8 @@ class Stylizer:
                 with self.timer("communication"):
                     gradient = self.collectives.all_reduce(gradient / self.group.size)
             gradient = gradient / len(views)
+        if self._kept is not None:
+            gradient = gradient.masked_fill(self._kept, 0)  # Adam leaves colours of no gradient as they are
         return gradient, results
 
     def _read(self, largest: Tensor, results: Sequence[SosResult]) -> Evaluation:
@@ -509,8 +534,14 @@ class Stylizer:
             result[self.plan.seen] = self.sh_dc.detach().cpu()
             if self.settings.unseen == "neighbours":
                 weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
-                change = neighbours_change(self.scene.means, result - self.scene.sh_dc, weights)
-                result[weights <= 0] += change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
+                change = result - self.scene.sh_dc
+                regions = self.regions
+                takes = weights <= 0 if regions is None else (weights <= 0) & ~regions.kept
+                if regions is None:
+                    change = neighbours_change(self.scene.means, change, weights)
+                else:
+                    change = neighbours_change_by_region(self.scene.means, change, weights, regions)[takes]
+                result[takes] += change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
             self._stylized = result
         return self._stylized
 

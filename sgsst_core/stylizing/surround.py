@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.settings import PlannedSurround
 
 #: Red, green, blue in 0..1.
@@ -23,22 +24,31 @@ Colour = tuple[float, float, float]
 _BITS = 53  # of a float64's fraction
 
 
-def drawn_colour(kind: PlannedSurround, seed: int, step: int, view: int, style: Tensor) -> Colour | None:
+def drawn_colour(kind: PlannedSurround, seed: int, step: int, view: int, style: Tensor | StyleMixture) -> Colour | None:
     """What is behind a view in the step after `step` others; None for the background of the settings.
 
     Args:
         kind: "random" for a uniform colour, "palette" for that of a random pixel of the style.
         seed: of the job, not negative.
         view: index of its camera.
-        style: [H, W, 3] in 0..1, on the CPU.
+        style: pictures [H, W, 3] in 0..1, on the CPU; of several, one is drawn by its weight.
     """
     if kind == "background":
         return None
     red, green, blue = _uniform(seed, step, view)
     if kind == "palette":
-        pixels = style.reshape(-1, 3)
+        pixels = _drawn_picture(StyleMixture.of(style), green).reshape(-1, 3)
         red, green, blue = pixels[int(red * len(pixels))].tolist()
     return red, green, blue
+
+
+def _drawn_picture(style: StyleMixture, number: float) -> Tensor:
+    """One of the pictures, by their weights and a number in [0, 1)."""
+    for picture, weight in zip(style.pictures, style.weights, strict=True):
+        number -= weight
+        if number < 0:
+            return picture
+    return style.pictures[-1]  # the weights' sum may be rounded down
 
 
 def _uniform(*numbers: int) -> Colour:

@@ -20,6 +20,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
+from sgsst_core.stylizing.regions import RegionMaps
 from sgsst_core.stylizing.surround import Colour, put_behind
 
 
@@ -44,6 +45,7 @@ class Views:
         regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
         background: what the rasterizer has behind the Gaussians.
         drawn: steps have other colours behind the Gaussians: images of the content are kept for them, not features.
+        maps: renders the share of each of the scene's regions; None where it has none.
         collectives: of the ranks that render each view together; `loss` has the same.
     """
 
@@ -63,6 +65,7 @@ class Views:
         regions: Sequence[Rectangle] | None = None,
         background: Colour = (0.0, 0.0, 0.0),
         drawn: bool = False,
+        maps: RegionMaps | None = None,
         collectives: Collectives = ALONE,
     ) -> None:
         self.scene = scene
@@ -87,7 +90,12 @@ class Views:
         self._shown: Shelf[_ShownKey, ShownGaussians] = Shelf(shown)
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4 - shown, _tensor_bytes)
         self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
-        kept = memory // 2 if keep_content else 0
+        #: Room for content, of which maps of regions take one half.
+        content = memory // 2 if maps is None else memory // 4
+        self._region_weights: Shelf[int, list[list[Tensor]]] = Shelf(
+            0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
+        )
+        kept = content if keep_content else 0
         images = kept // 2 if drawn else 0
         self._images: Shelf[_ImageKey, Tensor] = Shelf(images, _tensor_bytes)
         self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept - images)
@@ -96,6 +104,7 @@ class Views:
         self.weighted = weighted
         self.revive = revive
         self._background = background
+        self._maps = maps
         self._drawn = drawn
 
     def __len__(self) -> int:
@@ -214,6 +223,11 @@ class Views:
         """Coverage [H >> k, W >> k] of a view at powers of two, on the network's device; kept where memory allows."""
         return self._coverage.get(index, lambda: self._position_weights(index))
 
+    def region_weights(self, index: int) -> list[list[Tensor]] | None:
+        """The share of each region in a view, as `coverage`; None where the scene has none."""
+        maps = self._maps
+        return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
+
     def put_behind(self, index: int, image: Tensor, colour: Colour, scale: int = 0) -> Tensor:
         """Image [h, w, 3] of a view, at a scale, with another colour behind the Gaussians, on the network's device."""
         return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], colour, self._background)
@@ -229,7 +243,7 @@ class Views:
         """
         coverage = self.coverage(index) if self.weighted else None
         share = self._share(index, scales, coverage)
-        target = ViewTarget(coverage=coverage, share=share)
+        target = ViewTarget(coverage=coverage, share=share, regions=self.region_weights(index))
         if self.loss.content_weight and behind is not None:
             for scale, content in self._content_images(index, scales).items():
                 over = self._content_behind(index, content, behind, scale)
@@ -282,6 +296,13 @@ class Views:
         some = band[0] < band[1]
         rows = self.rasterizer.coverage(camera, band) if some else self._nothing(0, camera.width)
         return self.loss.position_weights(self.collectives.all_gather_rows(rows, self._bands[index]))
+
+    def _rendered_regions(self, index: int, maps: RegionMaps) -> list[list[Tensor]]:
+        band, camera = self._own_band(index), self.cameras[index]
+        some = band[0] < band[1]
+        rows = maps.render(camera, band) if some else self._nothing(0, camera.width, maps.count)
+        whole = self.collectives.all_gather_rows(rows, self._bands[index])
+        return [self.loss.position_weights(weights) for weights in whole.unbind(2)]
 
     def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
         return self.loss.content_features(image(), scale, tiles)

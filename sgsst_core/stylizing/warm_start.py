@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 from sgsst_core.scene.luminance import luminance
 
 #: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
@@ -21,77 +22,107 @@ from sgsst_core.scene.luminance import luminance
 _FLAT = 1e-9
 
 
-def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor) -> Tensor:
+def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
     """DC coefficients with the style's colours, clamped to what a picture can show (0..1).
 
     Args:
         sh_dc: [N, 3] float32.
         weights: [N] float64, total blend weights, at least one positive.
-        style: [H, W, 3] in 0..1.
+        style: pictures [H, W, 3] in 0..1; of several, the moments are the mixture's.
 
     Returns:
         [N, 3] float32.
     """
     colours = 0.5 + SH_C0 * sh_dc.double()
     mean, covariance = _moments(colours, weights.double() / weights.double().amax())
-    pixels = style.reshape(-1, 3).double()
-    wanted_mean, wanted = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
+    wanted_mean, wanted = _style_moments(StyleMixture.of(style))
     matched = (colours - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
     return ((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype)
 
 
-def in_colours_of(style: Tensor, sh_dc: Tensor, weights: Tensor) -> Tensor:
-    """A style image [H, W, 3] in 0..1 with mean and covariance of a scene's colours: the map the other way round.
+def in_colours_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+    """A style, of pictures [H, W, 3] in 0..1, with mean and covariance of a scene's colours: the inverse map.
+
+    Of several pictures, those are the mixture's: all take the same map.
 
     Args:
         sh_dc, weights: as in `warm_start`.
     """
     colours = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
     wanted_mean, wanted = _moments(colours, weights.double() / weights.double().amax())
-    pixels = style.reshape(-1, 3).double()
-    mean, covariance = _moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device))
-    matched = (pixels - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
-    return matched.clamp(0, 1).to(style.dtype).reshape(style.shape)
+    mean, covariance = _style_moments(style)
+    turned = _monge_map(covariance, wanted.to(mean)).T
+
+    def match(picture: Tensor) -> Tensor:
+        matched = (picture.reshape(-1, 3).double() - mean) @ turned + wanted_mean.to(mean)
+        return matched.clamp(0, 1).to(picture.dtype).reshape(picture.shape)
+
+    return style.map(match)
 
 
-def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor) -> Tensor:
+def _style_moments(style: StyleMixture) -> tuple[Tensor, Tensor]:
+    """Mean [3] and covariance [3, 3] of a style's pixels, float64."""
+    found = []
+    for picture in style.pictures:
+        pixels = picture.reshape(-1, 3).double()
+        found.append(_moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device)))
+    return mixed_moments(found, style.weights)
+
+
+def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
     """As `warm_start`, in luminance alone: mean and spread of the style's, clamped to 0..1, with the colours' chroma.
 
     Returns:
         [N, 3] float32.
     """
     own = luminance(COLOUR_OFFSET + SH_C0 * sh_dc.double())
-    wanted = luminance(style.reshape(-1, 3).double()).to(own)
-    matched = _matched(own, weights.double(), wanted.mean(), wanted.std(correction=0))
+    matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(StyleMixture.of(style)))
     return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
 
 
-def in_luminance_of(style: Tensor, sh_dc: Tensor, weights: Tensor) -> Tensor:
-    """A style image [H, W, 3] in 0..1 without colour, its luminance with mean and deviation of a scene's.
+def in_luminance_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+    """A style, of pictures [H, W, 3] in 0..1, without colour, its luminance with mean and deviation of a scene's.
+
+    Of several pictures, those are the mixture's: all take the same map.
 
     Args:
         sh_dc, weights: as in `warm_start`.
     """
-    colours = luminance((COLOUR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1))
-    share = weights.double() / weights.double().amax()
-    share = share / share.sum()
-    mean = (share * colours).sum()
-    spread = (share * (colours - mean).square()).sum().sqrt()
-    own = luminance(style.reshape(-1, 3).double())
-    equal = torch.ones(len(own), dtype=own.dtype, device=own.device)
-    matched = _matched(own, equal, mean.to(own), spread.to(own))
-    return matched.to(style.dtype).reshape(*style.shape[:2], 1).expand(style.shape).contiguous()
+    wanted = _luminance_moments(luminance((COLOUR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
+    own = _style_luminance(style)
+
+    def match(picture: Tensor) -> Tensor:
+        matched = _matched(luminance(picture.double()), own, wanted)
+        return matched.to(picture.dtype)[..., None].expand(picture.shape).contiguous()
+
+    return style.map(match)
 
 
-def _matched(values: Tensor, weights: Tensor, mean: Tensor, spread: Tensor) -> Tensor:
-    """Values [n] moved and stretched to a mean and a deviation, clamped to 0..1; flat ones are moved alone."""
+def _style_luminance(style: StyleMixture) -> tuple[Tensor, Tensor]:
+    """Mean and deviation of the luminance of a style's pixels."""
+    found = [luminance(picture.reshape(-1, 3).double()) for picture in style.pictures]
+    parts = [_luminance_moments(values, torch.ones_like(values)) for values in found]
+    if len(parts) == 1:
+        return parts[0]
+    moments = [(mean[None], spread.square()[None, None]) for mean, spread in parts]
+    mean, variance = mixed_moments(moments, style.weights)
+    return mean[0], variance[0, 0].sqrt()
+
+
+def _luminance_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean and deviation of values [n]."""
     share = weights / weights.amax()
     share = share / share.sum()
-    own = (share * values).sum()
-    deviation = (share * (values - own).square()).sum().sqrt()
-    flat = deviation <= _FLAT**0.5 * own.abs().clamp_min(torch.finfo(values.dtype).tiny)
-    factor = torch.where(flat, 0.0, spread / torch.where(flat, 1.0, deviation))
-    return ((values - own) * factor + mean).clamp(0, 1)
+    mean = (share * values).sum()
+    return mean, (share * (values - mean).square()).sum().sqrt()
+
+
+def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, Tensor]) -> Tensor:
+    """Values moved and stretched from a mean and a deviation to others, clamped to 0..1; flat ones are moved alone."""
+    (mean, deviation), (wanted_mean, wanted_deviation) = own, (part.to(values) for part in wanted)
+    flat = deviation <= _FLAT**0.5 * mean.abs().clamp_min(torch.finfo(values.dtype).tiny)
+    factor = torch.where(flat, 0.0, wanted_deviation / torch.where(flat, 1.0, deviation))
+    return ((values - mean) * factor + wanted_mean).clamp(0, 1)
 
 
 def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

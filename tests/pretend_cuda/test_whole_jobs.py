@@ -23,6 +23,7 @@ from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
 from worker.request import Resume, SceneRequest, StylizeRequest
+from worker.styles import StyleFile
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -45,7 +46,9 @@ def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 3
     ply, file, style = write_files(inputs, scene, cameras(2, *size))
     options = {"steps_coarse": 2, "steps_sos": 2, "coarsest_side": 16, "early_stop": False, **settings}
     source = SceneRequest(scene=ply, cameras=file)
-    return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
+    return StylizeRequest(
+        source, (StyleFile(style),), None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options)
+    )
 
 
 def go_on(job: Job, steps: int | None = None) -> Result:

@@ -124,7 +124,7 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     """Find the files of a job, and prove what can be proved without the inspecting process."""
     received, parameters, webhook = parts
     inputs, paths = _resolve_inputs(context, caller, received)
-    check_roles(inputs, orbit=parameters.orbit is not None)
+    check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights)
     if webhook:
         check_url(webhook, context.settings)
     checked = context.inspector.recall("validate", inputs, parameters) is not None
@@ -172,9 +172,11 @@ async def _from_json(request: Request, context: Context) -> Parts:
         raise BadRequestError("The body is not UTF-8.") from error
     job = JobFromUploads.model_validate(parse_json(text, "body"))
     job.parameters.settings()
-    named = [("scene", job.scene), ("style", job.style)]
+    styles = [job.style] if isinstance(job.style, str) else job.style
+    named = [("scene", job.scene), *(("style", each) for each in styles)]
     named += [("cameras", each) for each in job.cameras] + [("photos", each) for each in job.photos]
-    return Received(uploads=named), job.parameters, job.webhook
+    uploads = [(place, *each) for place, each in enumerate(named)]
+    return Received(uploads=uploads), job.parameters, job.webhook
 
 
 def _resolve_inputs(
@@ -184,10 +186,10 @@ def _resolve_inputs(
     They stay for now.
     """
     inputs = list(received.files)
-    ids = [upload_id for _, upload_id in received.uploads if is_id(upload_id)]
+    ids = [upload_id for _, _, upload_id in received.uploads if is_id(upload_id)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
     digests = []
-    for role, upload_id in received.uploads:
+    for _, role, upload_id in received.uploads:
         upload = uploads.get(upload_id)
         if upload is None:
             raise RefusedInputError(
@@ -197,9 +199,10 @@ def _resolve_inputs(
             )
         digests.append(_upload_digest(context, upload, role))
     rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
-    for number, ((role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
+    for number, ((place, role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
         name = clean_name(role, uploads[upload_id].filename, number)
-        inputs.append({"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
+        # in the order in which they came: that of styles is that of their weights
+        inputs.insert(place, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
     return inputs, {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
 
 

@@ -65,6 +65,26 @@ def second_reader(path: Path) -> dict[str, np.ndarray]:
     return {name: values[:, i] for i, name in enumerate(names)}
 
 
+def test_several_styles(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    other = files.style.with_name("other:2.png")
+    Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
+    told = ["--style", f"{files.style}:1", "--style", f"{other}:3", "--steps-sos", "2", "--surround", "palette"]
+    assert main([part for part in files.stylize() if part not in ("--style", str(files.style))] + told) == 0
+    shares = f"{files.style.name} 25%, other:2.png 75%"
+    assert f"a mixture: {shares}" in capsys.readouterr().out
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    assert [(Path(each["path"]).name, each["weight"]) for each in report["styles"]] == [
+        (files.style.name, 0.25),
+        ("other:2.png", 0.75),
+    ]
+    assert "(75%)" in files.out.with_name("stylized.report.html").read_text()
+    plan = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", *told[:4]]
+    assert main([*plan, "--out", str(files.out.with_suffix(".json"))]) == 0
+    assert shares in files.out.with_suffix(".json").read_text()
+    assert main([*files.stylize(), "--style", f"{other}:0"]) == 2
+    assert "the weight 0 is no finite number above 0" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("form", ["compressed.ply", "spz"])
 def test_stylize_reads_and_writes_packed_scenes(
     files: Files, capsys: pytest.CaptureFixture[str], form: PackedForm

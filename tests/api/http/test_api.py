@@ -206,6 +206,33 @@ def test_missing_and_surplus_files(client: httpx.Client, files: dict[str, bytes]
     refused(client.post("/v1/jobs", files=form(files, cameras=("a.exe", b"x"))), 422, "invalid-cameras")
 
 
+def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes]) -> None:
+    """In their order, however they come; and one weight for each."""
+    other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
+    headers = {
+        "Tus-Resumable": "1.0.0",
+        "Upload-Length": str(len(files["style"])),
+        "Upload-Metadata": "filename eS5wbmc=",
+    }
+    upload = client.post("/v1/uploads", headers=headers).json()["id"]
+    patch = {"Tus-Resumable": "1.0.0", "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+    client.patch(f"/v1/uploads/{upload}", headers=patch, content=files["style"])
+    parts = [part for part in form(files) if part[0] != "style"]
+    parts += [("style", (None, upload)), ("style", ("b.png", other)), ("style", ("c.png", other))]
+    told = {"parameters": '{"style_weights": [2, 1, 1], "preset": "preview"}'}
+    answer = client.post("/v1/jobs?dry_run=true", files=parts, data=told)
+    assert answer.status_code == 200, answer.text
+    decisions = {each["item"]: each["decision"] for each in answer.json()["plan"]["decisions"]}
+    assert decisions["styles"] == "a mixture: y.png 50%, b.png 25%, c.png 25%"
+    wrong = client.post("/v1/jobs", files=parts, data={"parameters": '{"style_weights": [2, 1]}'})
+    assert refused(wrong, 422, "invalid-request")["input"] == "style_weights"
+    twice = [*parts, ("style", ("B.png", other))]
+    refused(client.post("/v1/jobs", files=twice), 422, "invalid-request")
+    for values in ("[0, 1, 1]", "[-1, 1, 1]", "[]", '["a", 1, 1]'):
+        bad = client.post("/v1/jobs", files=parts, data={"parameters": f'{{"style_weights": {values}}}'})
+        assert bad.status_code == 422
+
+
 def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> None:
     for name in (
         "../../../../etc/passwd",
@@ -262,10 +289,10 @@ def value_of(option: Declared) -> object:
 def test_the_command_line_sends_every_parameter(
     service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0]}
+    told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
     texts = {"background": "white"}
     ply, _, style = write_files(tmp_path, ball())
-    command = ["submit", str(ply), "--style", str(style), "--url", service.url, "--json"]
+    command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
     for name, option in declared(JobParameters).items():
         told[name] = told.get(name) or value_of(option)
         command += [f"--{name.replace('_', '-')}"]

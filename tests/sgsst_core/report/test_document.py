@@ -40,7 +40,7 @@ def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evalu
 
 @pytest.fixture(scope="module")
 def sources(tiny_weights: BackboneWeights) -> Sources:
-    return Sources(Path("a/scene.ply"), 2, Path("style.png"), Path("cameras.json"), None, tiny_weights)
+    return Sources(Path("a/scene.ply"), 2, (Path("style.png"),), Path("cameras.json"), None, tiny_weights)
 
 
 def test_evaluation_views_are_spread_over_those_that_see_anything(

@@ -517,7 +517,7 @@ def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_t
     )
     before = stylizer.evaluate(stylizer.evaluation_views)
     stopped = run(stylizer)
-    sources = Sources(tmp_path / "ball.ply", 0, Path("style.png"), Path("cameras.json"), None, tiny_weights)
+    sources = Sources(tmp_path / "ball.ply", 0, (Path("style.png"),), Path("cameras.json"), None, tiny_weights)
     after = stylizer.evaluate(stylizer.evaluation_views)
     report = json.loads(json.dumps(build_report(stylizer, sources, stopped, before, after)))
     (tmp_path / "sheet.jpg").write_bytes(sample_sheet())

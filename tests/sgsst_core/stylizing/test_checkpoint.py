@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.terms import TERMS, LossTerms
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
@@ -298,3 +299,16 @@ def test_fingerprint_leaves_budgets_free() -> None:
     scene, views, image = wall(), cameras(), style()
     free = make_settings(max_seconds=3, memory_limit=10**9, measure=0.0)
     assert fingerprint(scene, views, image, free, "w") == fingerprint(scene, views, image, make_settings(), "w")
+
+
+def test_the_fingerprint_of_several_styles_tells_them_and_their_weights_apart() -> None:
+    scene, views, settings = wall(), cameras(), make_settings()
+    pictures = [style(), style().flip(0)]
+    alone = fingerprint(scene, views, style(), settings, "w")
+    assert fingerprint(scene, views, StyleMixture.weighted(pictures[:1], [3]), settings, "w") == alone
+    mixtures = [([0, 1], [1, 1]), ([0, 1], [1, 2]), ([1, 0], [1, 2])]
+    found = {
+        fingerprint(scene, views, StyleMixture.weighted([pictures[i] for i in order], weights), settings, "w")
+        for order, weights in mixtures
+    }
+    assert len(found | {alone}) == 4

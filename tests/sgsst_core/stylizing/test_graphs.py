@@ -135,7 +135,7 @@ def test_several_views_a_step_and_a_resumed_run(
         assert stylizer.graphs is not None
         assert stylizer.graphs.captured == (2 if stylizer is graphs else 1)
         assert stylizer.graphs.problem is None
-    sources = Sources(Path("scene.ply"), 0, Path("style.png"), None, None, tiny_weights)
+    sources = Sources(Path("scene.ply"), 0, (Path("style.png"),), None, None, tiny_weights)
     report = build_report(graphs, sources, "finished", graphs.start(), graphs.evaluate([0]))
     assert report["graphs"] == {"captured": 2, "problem": None}
     assert report["seconds_by_part"]["network"] > 0

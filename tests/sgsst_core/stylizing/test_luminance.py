@@ -12,6 +12,7 @@ from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
@@ -89,7 +90,8 @@ def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: Ba
     colours = (COLOUR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
     image = rasterizer.render(colours, view)
     size = (view.height, view.width)
-    used = resize_area(stylizer.style, style_size((stylizer.style.shape[0], stylizer.style.shape[1]), size))
+    (painting,) = stylizer.style.pictures
+    used = resize_area(painting, style_size((painting.shape[0], painting.shape[1]), size))
     _, pixels = sos_reference(stylizer.weights, image, used, image, coarsest=24)
     exact = rasterizer.colour_gradient(pixels, view) * SH_C0 * (colours > 0)
     assert stylizer.weights.grey
@@ -125,7 +127,8 @@ def test_the_style_takes_the_scenes_luminance() -> None:
     colours = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
     settings = make_settings(keep_colours="luminance")
-    found = prepared_style(0.5 + 0.1 * picture(64, 64, seed=2).float(), settings, (colours - 0.5) / SH_C0, weights)
+    painting = StyleMixture.of(0.5 + 0.1 * picture(64, 64, seed=2).float())
+    (found,) = prepared_style(painting, settings, (colours - 0.5) / SH_C0, weights).pictures
     assert torch.equal(found[..., 0], found[..., 1])
     share, values = weights / weights.sum(), luminance(colours.double())
     mean = float((share * values).sum())
@@ -135,13 +138,33 @@ def test_the_style_takes_the_scenes_luminance() -> None:
     )
 
 
+def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
+    """A dark picture and a bright one stay dark and bright: the mixture has the scene's mean and deviation."""
+    colours = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
+    dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
+    mixture = StyleMixture.weighted([dark.float(), bright.float()], [3, 1])
+    ones = torch.ones(5000, dtype=torch.float64)
+    found = prepared_style(mixture, make_settings(keep_colours="luminance"), (colours - 0.5) / SH_C0, ones)
+    first, second = (luminance(each.double()) for each in found.pictures)
+    assert float(first.mean()) < float(second.mean())
+    values = luminance(colours.double())
+    mean = 0.75 * first.mean() + 0.25 * second.mean()
+    second_moment = 0.75 * first.square().mean() + 0.25 * second.square().mean()
+    torch.testing.assert_close(mean, values.mean(), atol=1e-5, rtol=0)
+    torch.testing.assert_close((second_moment - mean**2).sqrt(), values.std(correction=0), atol=0, rtol=1e-3)
+    start = luminance_start((colours - 0.5) / SH_C0, ones, mixture)
+    # Some are as dark as a picture can be.
+    wanted = 0.75 * luminance(dark).mean() + 0.25 * luminance(bright).mean()
+    torch.testing.assert_close(luminance(0.5 + SH_C0 * start.double()).mean(), wanted, atol=5e-3, rtol=0)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
 def test_flat_styles_and_scenes_are_finite(value: float) -> None:
     settings = make_settings(keep_colours="luminance")
     flat, some = torch.full((5, 4, 3), value), 0.3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     ones = torch.ones(20, dtype=torch.float64)
     for scene_colours, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):
-        found = prepared_style(painting, settings, scene_colours, ones)
+        (found,) = prepared_style(StyleMixture.of(painting), settings, scene_colours, ones).pictures
         assert bool(found.isfinite().all())
         wanted = luminance((0.5 + SH_C0 * scene_colours).clamp(0, 1)).mean()
         torch.testing.assert_close(found.mean(), wanted, atol=1e-4, rtol=0)

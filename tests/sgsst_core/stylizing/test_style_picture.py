@@ -9,6 +9,7 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
@@ -82,7 +83,8 @@ def test_matched_colours_have_the_scenes_mean_and_covariance() -> None:
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
     settings = make_settings("standard", keep_colours="match")
     style = 0.5 + 0.05 * torch.randn(64, 64, 3, generator=generator)
-    found = prepared_style(style, settings, (colours - 0.5) / SH_C0, weights).reshape(-1, 3).double()
+    (image,) = prepared_style(StyleMixture.of(style), settings, (colours - 0.5) / SH_C0, weights).pictures
+    found = image.reshape(-1, 3).double()
     share = (weights / weights.sum())[:, None]
     inside = colours.double().clamp(0, 1)
     mean = (share * inside).sum(dim=0)
@@ -93,12 +95,13 @@ def test_matched_colours_have_the_scenes_mean_and_covariance() -> None:
 
 def test_a_flat_style_takes_the_scenes_mean() -> None:
     settings = make_settings("standard", keep_colours="match")
-    found = prepared_style(torch.full((4, 4, 3), 0.9), settings, torch.zeros(10, 3), torch.ones(10).double())
+    grey = StyleMixture.of(torch.full((4, 4, 3), 0.9))
+    (found,) = prepared_style(grey, settings, torch.zeros(10, 3), torch.ones(10).double()).pictures
     torch.testing.assert_close(found, torch.full((4, 4, 3), 0.5))
 
 
 def test_without_wishes_the_style_is_itself() -> None:
-    style = picture()
+    style = StyleMixture.of(picture())
     assert prepared_style(style, make_settings("standard"), torch.zeros(2, 3), torch.ones(2).double()) is style
 
 
@@ -134,9 +137,10 @@ def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, keep_colours="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), picture()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    assert stylizer.style.shape == (60, 40, 3)
+    (used,) = stylizer.style.pictures
+    assert used.shape == (60, 40, 3)
     assert stylizer.loss.style_scale == 2
     weights = stylizer.plan.survey.total_blend_weights
-    wanted = prepared_style(style, settings, scene.sh_dc, weights)
-    assert torch.equal(stylizer.style, wanted)
+    (wanted,) = prepared_style(StyleMixture.of(style), settings, scene.sh_dc, weights).pictures
+    assert torch.equal(used, wanted)
     stylizer.run_step()

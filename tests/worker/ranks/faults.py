@@ -20,6 +20,7 @@ from sgsst_core.settings import make_settings
 from tests.small_scenes import wall, write_files
 from worker.ranks.rank import RankProcess, RankTask
 from worker.request import SceneRequest, StylizeRequest
+from worker.styles import StyleFile
 
 Place = Literal[
     "render",
@@ -113,7 +114,9 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
     ply, cameras, style = write_files(inputs, wall())
     options = {"steps_sos": steps, "early_stop": False, "keep": ("ranks",), "rebalance": False, **settings}
     source = SceneRequest(scene=ply, cameras=cameras)
-    return StylizeRequest(source, style, None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options))
+    return StylizeRequest(
+        source, (StyleFile(style),), None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options)
+    )
 
 
 def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:

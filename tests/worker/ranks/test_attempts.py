@@ -212,7 +212,7 @@ def test_a_bad_input_is_told_at_once_and_not_tried_again(cluster: Cluster, tmp_p
 def command(request: StylizeRequest, *options: str) -> list[str]:
     """`sgsst stylize` of the same job."""
     source = request.source
-    files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.style)]
+    files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
     settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--keep-everything"]
     return ["stylize", *files, "--out", str(request.out), *settings, "--workers", "2", *options]
 

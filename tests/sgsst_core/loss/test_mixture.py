@@ -1,0 +1,115 @@
+"""Several style pictures as one style."""
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.statistics import layer_statistics_reference, merge_all
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.mixture import StyleMixture, mixed_moments, mixed_target, normalised, shares_of
+from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.terms import LayerTarget
+from tests.sgsst_core.pictures import picture
+
+
+def features(seed, count=40, offset=0.0):
+    generator = torch.Generator().manual_seed(seed)
+    return offset + torch.rand((count, 5, 6), dtype=torch.float64, generator=generator)
+
+
+def assert_same(found, wanted, **tolerances):
+    for name in ("gram", "mean", "std"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), **tolerances)
+
+
+def test_a_mixture_has_the_moments_of_all_positions_together():
+    """Pictures with as many positions as their weights say, as if they were one picture."""
+    parts = [features(1, 40), features(2, 10, offset=0.3)]
+    statistics = [layer_statistics_reference(part) for part in parts]
+    mixed = mixed_target([LayerTarget.of(part) for part in statistics], normalised([4, 1]))
+    assert_same(mixed, LayerTarget.of(merge_all(statistics)), rtol=1e-12, atol=1e-14)
+
+
+def test_digits_do_not_cancel_at_large_means():
+    """Deviations of 1e-6 about means of 1e6: the second moment less the squared mean would have no digit left."""
+    targets = [
+        LayerTarget(torch.eye(2).double(), torch.full((2,), 1e6).double(), torch.tensor(s, dtype=torch.float64))
+        for s in ([1e-6, 0.0], [2e-6, 0.0])
+    ]
+    mixed = mixed_target(targets, [0.5, 0.5])
+    torch.testing.assert_close(mixed.std, torch.tensor([2.5**0.5 * 1e-6, 0], dtype=torch.float64), rtol=1e-9, atol=0)
+
+
+def test_equal_pictures_are_one_picture():
+    target = LayerTarget.of(layer_statistics_reference(features(3)))
+    assert_same(mixed_target([target] * 3, normalised([0.2, 3, 1])), target, rtol=1e-13, atol=1e-15)
+
+
+def test_one_picture_is_itself(tiny_weights):
+    loss, style = SosLoss(FeatureNetwork(tiny_weights), coarsest=40), picture(90, 70)
+    alone = loss.style_targets(style, (100, 80))
+    weighted = loss.style_targets(StyleMixture.weighted([style], [0.3]), (100, 80))
+    for scale, target in alone.items():
+        for layer, wanted in target.layers.items():
+            assert torch.equal(weighted[scale].layers[layer].gram, wanted.gram)
+            assert torch.equal(weighted[scale].layers[layer].std, wanted.std)
+
+
+def test_targets_are_those_of_each_picture_at_its_own_size(tiny_weights):
+    pictures, weights = [picture(300, 90, seed=1), picture(40, 64, seed=2)], [3.0, 1.0]
+    loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=40)
+    mixed = loss.style_targets(StyleMixture.weighted(pictures, weights), (64, 80))
+    single = [loss.style_targets(each, (64, 80)) for each in pictures]
+    for scale, target in mixed.items():
+        assert set(target.layers) == set(STYLE_LAYERS)
+        for layer, found in target.layers.items():
+            wanted = mixed_target([each[scale].layers[layer] for each in single], [0.75, 0.25])
+            assert_same(found, wanted, rtol=1e-13, atol=1e-15)
+
+
+def test_a_tiny_picture_leaves_layers_without_cells_to_the_others(tiny_weights):
+    loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64))
+    large, tiny = picture(64, 64), picture(7, 7, seed=2)
+    mixed = loss.style_targets(StyleMixture.weighted([large, tiny], [1, 9]), (64, 64))[0].layers
+    alone = loss.style_targets(large, (64, 64))[0].layers
+    assert_same(mixed["relu4_1"], alone["relu4_1"], rtol=0, atol=0)
+    assert not torch.equal(mixed["relu1_1"].mean, alone["relu1_1"].mean)
+
+
+def test_features_are_matched_with_those_of_all_pictures(tiny_weights):
+    network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights.name, content=False))
+    loss = SosLoss(network, style_loss="nnfm", content_weight=0)
+    pictures = [picture(40, 48, seed=1), picture(64, 32, seed=2)]
+    mixed = loss.style_targets(StyleMixture.weighted(pictures, [1, 5]), (64, 64))[0].vectors.units
+    single = [loss.style_targets(each, (64, 64))[0].vectors.units for each in pictures]
+    assert torch.equal(mixed, torch.cat(single))
+
+
+def test_too_many_vectors_are_shared_out_by_weight():
+    assert shares_of([MOST_VECTORS, MOST_VECTORS], [0.75, 0.25], MOST_VECTORS) == [6144, 2048]
+    assert shares_of([3, 10**6], [0.9, 0.1], MOST_VECTORS) == [3, 819]
+    assert shares_of([10**6, 10**6], [1 - 1e-9, 1e-9], MOST_VECTORS)[1] == 1
+    assert shares_of([3, 4], [0.1, 0.9], MOST_VECTORS) == [3, 4]
+
+
+@pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])
+def test_weights_that_are_no_shares(weights):
+    with pytest.raises(SettingsError, match="style picture"):
+        normalised(weights)
+
+
+def test_weights_of_any_size_add_up_to_one():
+    assert normalised([1e308, 1e308]) == (0.5, 0.5)
+    assert normalised([1e-300, 3e-300]) == pytest.approx((0.25, 0.75))
+    assert normalised([0.3]) == (1.0,)
+
+
+def test_colour_moments_of_a_mixture():
+    pixels = [torch.rand(30, 3, generator=torch.Generator().manual_seed(s)).double() for s in (1, 2)]
+    moments = [(part.mean(0), part.T.cov(correction=0)) for part in pixels]
+    mean, covariance = mixed_moments(moments, [0.5, 0.5])
+    together = torch.cat(pixels)
+    torch.testing.assert_close(mean, together.mean(0))
+    torch.testing.assert_close(covariance, together.T.cov(correction=0))

@@ -1,0 +1,158 @@
+"""The loss of several regions, each with its own style."""
+
+import pytest
+import torch
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.statistics import layer_statistics, merge
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.regions import Region, Regions, check_regions
+from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss, resize_area
+from sgsst_core.loss.sos_reference import RegionReference, sos_reference
+from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.scene.pyramid import style_size
+from tests.sgsst_core.pictures import picture, relative_error
+
+SIZE = (112, 150)
+
+
+def shares(size, count):
+    """Maps of some regions and of what belongs to none: they add up to 1. The first ones have borders."""
+    raw = torch.stack([picture(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
+    raw[0, :, size[1] // 2 :] = 0
+    raw[1, : size[0] // 2] = 0
+    return list((raw / raw.sum(dim=0))[:count])
+
+
+def targets_of(loss, styles, weights):
+    every = [loss.style_targets(style, SIZE) for style in styles]
+    return {
+        scale: ScaleTarget({}, None, tuple(RegionTarget(own[scale], w) for own, w in zip(every, weights, strict=True)))
+        for scale in every[0]
+    }
+
+
+def evaluate(network, image, content, styles, maps, weights, **options):
+    dtype = network.dtype
+    loss = SosLoss(network, coarsest=60, **options)
+    view = loss.view_target(content.to(dtype))
+    view.regions = [loss.position_weights(share) for share in maps]
+    return loss.evaluate(image.to(dtype), targets_of(loss, [s.to(dtype) for s in styles], weights), view)
+
+
+@pytest.fixture
+def case():
+    styles = [resize_area(picture(90, 130, seed=s) ** s, style_size((90, 130), SIZE)) for s in (1, 2, 3)]
+    return picture(*SIZE, seed=5), picture(*SIZE, seed=6), styles, shares(SIZE, 3), [1.0, 0.3, 7.0]
+
+
+@pytest.mark.parametrize("tile_size", [None, 64])
+@pytest.mark.parametrize("style_loss", ["sos", "mixed"])
+def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss):
+    image, content, styles, maps, weights = case
+    parts = [RegionReference(*part) for part in zip(styles, maps, weights, strict=True)]
+    expected, gradient = sos_reference(tiny_weights, image, parts, content, coarsest=60, style_loss=style_loss)
+    layers = layers_of(style_loss, tiny_weights.name, content=True)
+    network = FeatureNetwork(tiny_weights, layers, torch.float64)
+    found = evaluate(network, *case, tile_size=tile_size, style_loss=style_loss)
+    assert found.loss == pytest.approx(expected, rel=1e-9)
+    assert relative_error(found.image_gradient, gradient) < 1e-9
+
+
+def test_float32_tiles_agree_with_the_whole_in_float64(tiny_weights, case):
+    whole = evaluate(FeatureNetwork(tiny_weights, dtype=torch.float64), *case)
+    tiled = evaluate(FeatureNetwork(tiny_weights), *case, tile_size=64, keep_activations=False)
+    assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
+    assert relative_error(tiled.image_gradient, whole.image_gradient) < 1e-5
+
+
+def test_the_order_of_regions_does_not_matter(tiny_weights, case):
+    image, content, *parts = case
+    network = FeatureNetwork(tiny_weights, dtype=torch.float64)
+    found = [
+        evaluate(network, image, content, *([part[i] for i in order] for part in parts))
+        for order in ([0, 1, 2], [2, 0, 1])
+    ]
+    assert found[1].loss == pytest.approx(found[0].loss, rel=1e-13)
+    assert relative_error(found[1].image_gradient, found[0].image_gradient) < 1e-12
+
+
+def test_one_region_of_everything_is_a_view_without_regions(tiny_weights, case):
+    """To the bit: the same statistics with the same position weights."""
+    image, content, styles, maps, _ = case
+    network = FeatureNetwork(tiny_weights)
+    loss = SosLoss(network, coarsest=60)
+    content = content.float()
+    plain = loss.evaluate(image.float(), loss.style_targets(styles[0], SIZE), loss.view_target(content, maps[2]))
+    view = loss.view_target(content, maps[2])
+    view.regions = [loss.position_weights(maps[2])]
+    found = loss.evaluate(image.float(), targets_of(loss, styles[:1], [1.0]), view)
+    assert torch.equal(found.values, plain.values)
+    assert torch.equal(found.image_gradient, plain.image_gradient)
+
+
+def test_a_region_that_a_view_does_not_show_adds_nothing(tiny_weights, case):
+    image, content, styles, maps, weights = case
+    network = FeatureNetwork(tiny_weights, dtype=torch.float64)
+    without = evaluate(network, image, content, styles[:2], maps[:2], weights[:2])
+    blind = [*maps[:2], torch.zeros(SIZE)]
+    found = evaluate(network, image, content, styles, blind, weights)
+    assert torch.equal(found.values, without.values)
+    assert torch.equal(found.image_gradient, without.image_gradient)
+
+
+def test_weights_scale_the_style_terms_alone(tiny_weights, case):
+    image, content, styles, maps, _ = case
+    network = FeatureNetwork(tiny_weights, dtype=torch.float64)
+    one, two = (evaluate(network, image, content, styles, maps, [w] * 3) for w in (1.0, 2.0))
+    for scale, terms in one.terms.items():
+        for name, value in terms.items():
+            assert two.terms[scale][name] == pytest.approx(value if name == "content" else 2 * value, rel=1e-12)
+
+
+def test_statistics_of_two_regions_together_are_merged_statistics():
+    """What holds exactly of a union: its map is the sum of both, and its moments are theirs, merged."""
+    features = torch.rand(9, 13, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    first, second = shares((9, 13), 2)
+    whole = layer_statistics(features, first + second)
+    parts = merge(layer_statistics(features, first), layer_statistics(features, second))
+    for name in ("count", "mean", "centred"):
+        torch.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=1e-12, atol=1e-13)
+
+
+# --- which Gaussians -----------------------------------------------------------------------------------------------
+
+
+def regions(labels, **keeps):
+    names = ("rest", "a", "b")
+    every = tuple(Region(name, keep=keeps.get(name, False)) for name in names)
+    return Regions(every, torch.tensor(labels, dtype=torch.uint8))
+
+
+def test_regions_that_no_view_sees_become_the_rest():
+    found = regions([0, 1, 2, 2]).resolved(torch.tensor([1.0, 0, 0, 2]))
+    assert found.labels.tolist() == [0, 0, 2, 2]
+    assert found.active == (0, 2)
+    assert found.mapped
+
+
+def test_kept_regions_stay_kept_where_no_view_sees_them():
+    found = regions([0, 1, 2, 2], a=True).resolved(torch.tensor([1.0, 0, 1, 2]))
+    assert found.kept.tolist() == [False, True, False, False]
+    assert not found.kept_in_view
+
+
+def test_a_region_of_all_that_is_seen_needs_no_map():
+    found = regions([0, 1, 1]).resolved(torch.tensor([0.0, 1, 1]))
+    assert found.active == (1,)
+    assert not found.mapped
+
+
+def test_nothing_to_do_is_an_error():
+    kept = regions([1, 1, 2], a=True, b=True)
+    with pytest.raises(SettingsError, match=r"Every Gaussian is kept \(a, b\)"):
+        check_regions(kept)
+    partly = regions([0, 1, 2], a=True, b=True)
+    check_regions(partly)
+    with pytest.raises(SettingsError, match="that a view sees is kept"):
+        partly.resolved(torch.tensor([0.0, 1, 1]))

@@ -1,0 +1,45 @@
+"""Style pictures as users name them."""
+
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.errors import SettingsError
+from worker.styles import MOST_PICTURES, StyleFile, parse_style, parse_styles
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "weight"),
+    [
+        ("a.jpg", "a.jpg", 1.0),
+        ("a.jpg:0.7", "a.jpg", 0.7),
+        ("a.jpg:2e-3", "a.jpg", 0.002),
+        ("a:b.jpg", "a:b.jpg", 1.0),
+        ("a:1:b.jpg:.5", "a:1:b.jpg", 0.5),
+        ("a.jpg:", "a.jpg:", 1.0),
+        ("a.jpg:x", "a.jpg:x", 1.0),
+        (":3", ":3", 1.0),
+    ],
+)
+def test_only_a_number_at_the_end_is_a_weight(text: str, path: str, weight: float) -> None:
+    assert parse_style(text) == StyleFile(Path(path), weight)
+
+
+def test_a_file_of_the_whole_name_wins(tmp_path: Path) -> None:
+    odd = tmp_path / "poster:2"
+    odd.touch()
+    assert parse_style(str(odd)) == StyleFile(odd)
+    assert parse_style(f"{odd}:3") == StyleFile(odd, 3.0)
+
+
+@pytest.mark.parametrize("weight", ["0", "-1", "1e999"])
+def test_weights_that_cannot_be(weight: str) -> None:
+    with pytest.raises(SettingsError, match=f"the weight {weight} is no finite number above 0"):
+        parse_style(f"a.jpg:{weight}")
+
+
+def test_how_many_there_may_be() -> None:
+    assert len(parse_styles(["a.jpg"] * MOST_PICTURES)) == MOST_PICTURES
+    for count in (0, MOST_PICTURES + 1):
+        with pytest.raises(SettingsError, match=f"There are {count} style pictures"):
+            parse_styles(["a.jpg"] * count)

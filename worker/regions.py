@@ -1,0 +1,256 @@
+"""Regions as users ask for them: on the command line, in JSON, and what both become. Imports no PyTorch.
+
+SPEC, what a region selects, is one of
+
+    box=X0,Y0,Z0,X1,Y1,Z1      between two opposite corners
+    sphere=X,Y,Z,R             no farther than R from a point
+    half-space=A,B,C,D         where A x + B y + C z >= D
+    property=NAME>VALUE        by a property of the PLY; also >=, <, <=, =, !=
+    mask=FILE.npy              a flag for each Gaussian, in the file's order
+    masks=FOLDER               pictures of some views, white where the region is
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.settings import checked
+from worker.styles import MOST_PICTURES, StyleFile, parse_style
+
+#: Gaussians that no selection names.
+REST = "rest"
+#: Regions beside the rest at most.
+MOST_REGIONS = 16
+_NAME = r"[A-Za-z][A-Za-z0-9_-]{0,31}"
+_COMPARISON = re.compile(r"(?P<name>[^<>=!]+)(?P<sign>>=|<=|!=|>|<|=)(?P<value>.+)", re.DOTALL)
+_COUNTS = {"box": 6, "sphere": 4, "half-space": 4}
+Kind = Literal["box", "sphere", "half-space", "property", "mask", "masks"]
+_HOW = "Give box=, sphere=, half-space=, property=, mask= or masks=: see `sgsst stylize --help`."
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which Gaussians a region has.
+
+    Attributes:
+        kind: by what.
+        text: as it was given.
+        numbers: of a box, a sphere, a half-space, or that a property is compared with.
+        name, sign: of a property, and how it is compared.
+        path: of a mask, or of a folder of masks.
+    """
+
+    kind: Kind
+    text: str
+    numbers: tuple[float, ...] = ()
+    name: str = ""
+    sign: str = ""
+    path: Path | None = None
+
+
+@dataclass(frozen=True)
+class RegionRequest:
+    """A region that was asked for.
+
+    Attributes:
+        name: `REST` for the Gaussians that no region selects.
+        selection: None for the rest.
+        styles: pictures of its style; empty for the job's own.
+        weight: of its style in the loss.
+        keep: leave its Gaussians as they are.
+    """
+
+    name: str
+    selection: Selection | None = None
+    styles: tuple[StyleFile, ...] = ()
+    weight: float = 1.0
+    keep: bool = False
+
+
+class RegionOptions(BaseModel):
+    """A region in JSON."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        json_schema_extra={"examples": [{"name": "face", "select": "sphere=0,1.4,0,0.3", "style": "wave.jpg"}]},
+    )
+
+    name: Annotated[str, Field(pattern=f"^{_NAME}$")] = Field(
+        description="`rest` for the Gaussians that no region selects.", examples=["face"]
+    )
+    select: Annotated[str, Field(max_length=1000)] | None = Field(
+        None,
+        description="Which Gaussians it has, but for the rest: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, "
+        "half-space=A,B,C,D (where A x + B y + C z >= D) or property=NAME>VALUE (also >=, <, <=, =, !=).",
+        examples=["half-space=0,1,0,0.5"],
+    )
+    style: (
+        Annotated[str, Field(min_length=1, max_length=300)]
+        | Annotated[
+            list[Annotated[str, Field(min_length=1, max_length=300)]], Field(min_length=1, max_length=MOST_PICTURES)
+        ]
+        | None
+    ) = Field(
+        None,
+        description="Name of the `style` file, of those that were sent, that it is drawn to, which then is no part of "
+        "the job's own style; NAME:WEIGHT in a list of several. Without, the job's own style.",
+        examples=["wave.jpg"],
+    )
+    weight: float = Field(1.0, gt=0, le=1e12, allow_inf_nan=False, description="Of its style in the loss.")
+    keep: bool = Field(False, description="Leave its Gaussians as they are, to the last bit.")
+
+    @property
+    def style_texts(self) -> list[str]:
+        """Its style files, as they were given."""
+        return [] if self.style is None else [self.style] if isinstance(self.style, str) else self.style
+
+    def request(self, file: Callable[[StyleFile], StyleFile] = lambda file: file) -> RegionRequest:
+        """What is asked for.
+
+        Args:
+            file: finds a style picture by its name.
+
+        Raises:
+            SettingsError: it makes no sense.
+        """
+        selection = None if self.select is None else parse_selection(self.select, f"region {self.name}")
+        styles = tuple(file(parse_style(text)) for text in self.style_texts)
+        return RegionRequest(self.name, selection, styles, self.weight, self.keep)
+
+
+def parse_selection(text: str, where: str) -> Selection:
+    """A SPEC.
+
+    Args:
+        where: it was given, for messages.
+
+    Raises:
+        SettingsError: it is none.
+    """
+    kind, separator, value = text.partition("=")
+    if separator and kind in _COUNTS:
+        return Selection(kind, text, _numbers(kind, value, where))  # type: ignore[arg-type]
+    if separator and value and kind in ("mask", "masks"):
+        return Selection(kind, text, path=Path(value))  # type: ignore[arg-type]
+    if separator and kind == "property":
+        match = _COMPARISON.fullmatch(value)
+        if match is None:
+            raise SettingsError(f"{where}: {text!r} is no comparison such as property=opacity>0.5. Give one.")
+        return Selection(
+            "property", text, (_number(match["value"], text, where),), match["name"].strip(), match["sign"]
+        )
+    raise SettingsError(f"{where}: {text!r} selects nothing that is known. {_HOW}")
+
+
+def _numbers(kind: str, value: str, where: str) -> tuple[float, ...]:
+    parts = value.split(",")
+    if len(parts) != _COUNTS[kind]:
+        raise SettingsError(f"{where}: {kind}={value} has {len(parts)} numbers; it takes {_COUNTS[kind]}.")
+    numbers = tuple(_number(part, value, where) for part in parts)
+    if kind == "sphere" and numbers[3] <= 0:
+        raise SettingsError(f"{where}: the sphere's radius {numbers[3]:g} is not above 0. Give a larger one.")
+    if kind == "half-space" and not any(numbers[:3]):
+        raise SettingsError(f"{where}: half-space={value} has no direction. Give one that is not 0,0,0.")
+    return numbers
+
+
+def _number(text: str, whole: str, where: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise SettingsError(f"{where}: {text!r} in {whole!r} is no finite number.")
+    return number
+
+
+def region_options(
+    regions: Sequence[str], styles: Sequence[str], weights: Sequence[str], keeps: Sequence[str]
+) -> tuple[RegionOptions, ...]:
+    """Regions from the command line's texts.
+
+    Args:
+        regions: NAME:SPEC each.
+        styles: NAME=FILE[:WEIGHT] each; several of one name are mixed.
+        weights: NAME=WEIGHT each.
+        keeps: NAME each.
+
+    Raises:
+        SettingsError: they make no sense.
+    """
+    found: dict[str, RegionOptions] = {}
+    for text in regions:
+        name, separator, spec = text.partition(":")
+        if not separator or not re.fullmatch(_NAME, name):
+            raise SettingsError(f"--region {text}: is not NAME:SPEC, such as face:sphere=0,1.4,0,0.3. {_HOW}")
+        if name in found:
+            raise SettingsError(f"--region {text}: there is a region {name} already. Give each its own name.")
+        found[name] = checked(RegionOptions, {"name": name, "select": spec})
+    given = set(found)
+
+    def known(name: str, option: str) -> RegionOptions:
+        if name != REST and name not in given:
+            names = ", ".join([*found, REST]) if REST not in found else ", ".join(found)
+            raise SettingsError(f"{option}: there is no region {name!r}. There are {names}.")
+        return found.get(name, RegionOptions(name=REST))
+
+    for text in styles:
+        name, _, file = text.partition("=")
+        region = known(name, f"--region-style {text}")
+        if not file:
+            raise SettingsError(f"--region-style {text}: is not NAME=FILE. Name a picture.")
+        found[name] = region.model_copy(update={"style": [*region.style_texts, file]})
+    for text in weights:
+        name, _, value = text.partition("=")
+        region = known(name, f"--region-weight {text}")
+        weight = _number(value, text, "--region-weight")
+        if not 0 < weight <= 1e12:
+            raise SettingsError(f"--region-weight {text}: the weight is not above 0, or too large. Give another.")
+        found[name] = region.model_copy(update={"weight": weight})
+    for name in keeps:
+        found[name] = known(name, f"--region-keep {name}").model_copy(update={"keep": True})
+    return tuple(found.values())
+
+
+def region_requests(
+    options: Iterable[RegionOptions], file: Callable[[StyleFile], StyleFile] = lambda file: file
+) -> tuple[RegionRequest, ...]:
+    """What some regions ask for, the rest first; see `RegionOptions.request`.
+
+    Raises:
+        SettingsError: one makes no sense, there are too many, or two of one name.
+    """
+    found = [each.request(file) for each in options]
+    names = [region.name for region in found]
+    for region in found:
+        if len(region.styles) > MOST_PICTURES:
+            raise SettingsError(
+                f"Region {region.name!r} has {len(region.styles)} style pictures; {MOST_PICTURES} may be."
+            )
+        if names.count(region.name) > 1:
+            raise SettingsError(f"There are two regions {region.name!r}. Give each its own name.")
+        if (region.name == REST) != (region.selection is None):
+            why = "needs a SPEC" if region.name != REST else "is what no other region has, and takes no SPEC"
+            raise SettingsError(f"Region {region.name!r} {why}. {_HOW}")
+        if region.keep and (region.styles or region.weight != 1):
+            raise SettingsError(f"Region {region.name!r} is kept as it is, and has no style or weight. Leave one out.")
+    if len([name for name in names if name != REST]) > MOST_REGIONS:
+        raise SettingsError(f"There are {len(found)} regions; {MOST_REGIONS} may be.")
+    rest = next((region for region in found if region.name == REST), None)
+    return (*([rest] if rest else []), *(region for region in found if region.name != REST))
+
+
+def in_folder(region: RegionRequest, folder: Path) -> RegionRequest:
+    """The region with its masks in a folder."""
+    if region.selection is None or region.selection.path is None:
+        return region
+    return replace(region, selection=replace(region.selection, path=folder / region.selection.path))

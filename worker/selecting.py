@@ -1,0 +1,122 @@
+"""Regions of a scene that has been read: which Gaussians each selection names, and their styles' pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import ImageError, SceneError
+from sgsst_core.files.images import find_masks, load_photo
+from sgsst_core.files.ply import SceneFile
+from sgsst_core.files.ply_columns import read_property
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Region, Regions, check_regions
+from sgsst_core.planning.masks import count_votes, decide_by_votes
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.selection import in_box, in_half_space, in_sphere, where_property
+from worker.regions import REST, RegionRequest, Selection
+from worker.styles import StyleFile
+
+
+def select_regions(
+    requests: Sequence[RegionRequest],
+    file: SceneFile,
+    cameras: Sequence[Camera],
+    near: float,
+    load: Callable[[Sequence[StyleFile]], StyleMixture],
+) -> Regions | None:
+    """The regions that were asked for; None where none were. Of regions that overlap, the later one has the Gaussians.
+
+    Args:
+        requests: see `worker.regions.region_requests`.
+        cameras: that masks are matched with, at the sizes that they are stylized at.
+        near: plane, as for stylizing.
+        load: reads the pictures of a style.
+
+    Raises:
+        InvalidInputError: a file cannot be used, or every Gaussian is kept.
+    """
+    if not requests:
+        return None
+    labels = torch.zeros(len(file.scene), dtype=torch.uint8)
+    every = [Region(REST)]
+    for request in requests:
+        style = load(request.styles) if request.styles else None
+        if request.selection is None:
+            every[0] = Region(REST, "", style, request.weight, request.keep)
+            continue
+        own = select(request.selection, file, cameras, near)
+        labels[own] = len(every)
+        every.append(Region(request.name, request.selection.text, style, request.weight, request.keep, int(own.sum())))
+    regions = Regions(tuple(every), labels)
+    check_regions(regions)
+    return regions
+
+
+def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
+    """[N] bool, which Gaussians of a scene a selection names; see `select_regions`."""
+    means, numbers, path = file.scene.means, selection.numbers, selection.path
+    match selection.kind:
+        case "box":
+            return in_box(means, numbers)
+        case "sphere":
+            return in_sphere(means, numbers)
+        case "half-space":
+            return in_half_space(means, numbers)
+        case "property":
+            return where_property(read_property(file, selection.name), selection.sign, numbers[0])
+        case "mask":
+            assert path is not None
+            return read_mask(path, file)
+        case "masks":
+            assert path is not None
+            return shown_by_masks(path, file, cameras, near)
+
+
+def read_mask(path: Path, file: SceneFile) -> Tensor:
+    """A flag [N] for each Gaussian of the scene, from a flag of each row of its file.
+
+    Raises:
+        SceneError: no .npy file, or of another shape or with other values than 0 and 1.
+    """
+    rows = len(file.scene) if file.kept is None else len(file.kept)
+    try:
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
+    if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
+        raise SceneError(f"{path}: holds no array of flags or numbers. Write it with numpy.save.")
+    if found.shape != (rows,):
+        raise SceneError(
+            f"{path}: has the shape {found.shape}; {file.path} has {rows:,} Gaussians, so that it has to be ({rows},)."
+        )
+    flags = found == 1
+    if not bool((flags | (found == 0)).all()):
+        raise SceneError(f"{path}: has values other than 0 and 1. Give a flag for each Gaussian.")
+    return torch.from_numpy(np.array(flags if file.kept is None else flags[file.kept]))
+
+
+def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
+    """[N] bool, which Gaussians masks of some views show: see `planning.masks`.
+
+    Raises:
+        ImageError: no masks, or masks that cannot be used.
+    """
+    found = [(camera, path) for camera, path in zip(cameras, find_masks(folder, cameras), strict=True) if path]
+    masks = [partial(_load_mask, path, camera) for camera, path in found]
+    rasterizer = make_rasterizer("cpu", file.scene, near=near)
+    inside, total = count_votes(rasterizer, [camera for camera, _ in found], masks, len(file.scene))
+    if not bool((total > 0).any()):
+        raise ImageError(f"{folder}: no view that has a mask sees a Gaussian. Give masks of other views.")
+    return decide_by_votes(file.scene.means, inside, total)
+
+
+def _load_mask(path: Path, camera: Camera) -> Tensor:
+    """[H, W] in 0..1: white is in."""
+    return load_photo(path, camera).mean(dim=2)
