@@ -11,6 +11,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.options import Option
 from sgsst_core.settings import checked
 from worker.options import StylizeOptions
+from worker.regions import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_PICTURES
 
 #: A name is shown in terminals, and kept by databases that know no zero bytes.
@@ -33,9 +34,31 @@ class JobParameters(StylizeOptions):
         None,
         min_length=1,
         max_length=MOST_PICTURES,
-        description="Weight of each style image, in the order in which they are sent: they are mixed in proportion. "
-        "Without, they count alike.",
+        description="Weight of each style image that is no region's, in the order in which they are sent: they are "
+        "mixed in proportion. Without, they count alike.",
     )
+    regions: Annotated[list[RegionOptions] | None, Option(instead="--region NAME:SPEC")] = Field(
+        None,
+        max_length=MOST_REGIONS + 1,
+        description="Regions of the scene, each with a style of its own or kept. Where they overlap, the later one "
+        "counts. Masks are for `sgsst stylize` alone.",
+    )
+
+    @property
+    def region_requests(self) -> tuple[RegionRequest, ...]:
+        """The regions that are asked for.
+
+        Raises:
+            SettingsError: they make no sense, or are chosen by masks.
+        """
+        found = region_requests(self.regions or (), exists=lambda path: False)
+        for region in found:
+            if region.selection is not None and region.selection.path is not None:
+                raise SettingsError(
+                    f"Region {region.name!r} is selected by {region.selection.kind}=, which the service does not take: "
+                    "masks are for the command line (sgsst stylize). Give a box, a sphere, a half-space or a property."
+                )
+        return found
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:

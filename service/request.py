@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from service.files.names import RESULT
-from service.files.staging import Staged
+from service.files.staging import Staged, clean_name, region_styles
 from service.parameters import JobParameters
+from worker.regions import RegionRequest
 from worker.request import SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 
@@ -17,9 +19,23 @@ def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:
 
 
 def _styles(staged: Staged, parameters: JobParameters) -> tuple[StyleFile, ...]:
-    """The style's pictures; those without weights count alike."""
-    weights = parameters.style_weights or [1.0] * len(staged.styles)
-    return tuple(StyleFile(path, weight) for path, weight in zip(staged.styles, weights, strict=True))
+    """The pictures of the job's own style: those that no region has. Without weights they count alike."""
+    taken = region_styles(parameters.region_requests)
+    own = [path for path in staged.styles if path.name not in taken]
+    weights = parameters.style_weights or [1.0] * len(own)
+    return tuple(StyleFile(path, weight) for path, weight in zip(own, weights, strict=True))
+
+
+def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
+    """The regions, with the paths of their styles."""
+    paths = {path.name: path for path in staged.styles}
+
+    def staged_file(file: StyleFile) -> StyleFile:
+        return replace(file, path=paths[clean_name("style", str(file.path), 0)])
+
+    return tuple(
+        replace(region, styles=tuple(map(staged_file, region.styles))) for region in parameters.region_requests
+    )
 
 
 def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest:
@@ -32,4 +48,5 @@ def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest
         parameters.backbone,
         False,
         parameters.settings(),
+        _regions(staged, parameters),
     )

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -113,17 +113,17 @@ class RegionOptions(BaseModel):
         """Its style files, as they were given."""
         return [] if self.style is None else [self.style] if isinstance(self.style, str) else self.style
 
-    def request(self, file: Callable[[StyleFile], StyleFile] = lambda file: file) -> RegionRequest:
+    def request(self, exists: Callable[[Path], bool] = Path.exists) -> RegionRequest:
         """What is asked for.
 
         Args:
-            file: finds a style picture by its name.
+            exists: as for `parse_style`.
 
         Raises:
             SettingsError: it makes no sense.
         """
         selection = None if self.select is None else parse_selection(self.select, f"region {self.name}")
-        styles = tuple(file(parse_style(text)) for text in self.style_texts)
+        styles = tuple(parse_style(text, exists) for text in self.style_texts)
         return RegionRequest(self.name, selection, styles, self.weight, self.keep)
 
 
@@ -222,14 +222,14 @@ def region_options(
 
 
 def region_requests(
-    options: Iterable[RegionOptions], file: Callable[[StyleFile], StyleFile] = lambda file: file
+    options: Iterable[RegionOptions], exists: Callable[[Path], bool] = Path.exists
 ) -> tuple[RegionRequest, ...]:
     """What some regions ask for, the rest first; see `RegionOptions.request`.
 
     Raises:
         SettingsError: one makes no sense, there are too many, or two of one name.
     """
-    found = [each.request(file) for each in options]
+    found = [each.request(exists) for each in options]
     names = [region.name for region in found]
     for region in found:
         if len(region.styles) > MOST_PICTURES:
@@ -247,10 +247,3 @@ def region_requests(
         raise SettingsError(f"There are {len(found)} regions; {MOST_REGIONS} may be.")
     rest = next((region for region in found if region.name == REST), None)
     return (*([rest] if rest else []), *(region for region in found if region.name != REST))
-
-
-def in_folder(region: RegionRequest, folder: Path) -> RegionRequest:
-    """The region with its masks in a folder."""
-    if region.selection is None or region.selection.path is None:
-        return region
-    return replace(region, selection=replace(region.selection, path=folder / region.selection.path))

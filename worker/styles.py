@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,14 +28,17 @@ class StyleFile:
         return str(self.path) if self.weight == 1 else f"{self.path}:{self.weight!r}"
 
 
-def parse_style(text: str) -> StyleFile:
+def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> StyleFile:
     """FILE or FILE:WEIGHT. A file whose whole name ends like a weight is that file.
+
+    Args:
+        exists: tells whether there is a file.
 
     Raises:
         SettingsError: the weight is not above 0, or not finite.
     """
     match = _WEIGHTED.fullmatch(text)
-    if match is None or Path(text).exists():
+    if match is None or exists(Path(text)):
         return StyleFile(Path(text))
     weight = float(match["weight"])
     if not (math.isfinite(weight) and weight > 0):

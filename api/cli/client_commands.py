@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -18,8 +18,11 @@ from rich.table import Table
 
 from api.cli.options import with_options
 from api.cli.progress_bars import clock
+from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
+from api.client.inputs import different_names
 from service.parameters import JobParameters
 from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm, form_of_name, packed_name
+from worker.regions import RegionOptions, region_options, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:
@@ -62,6 +65,10 @@ def submit(
     ],
     cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
     images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    region: RegionOption = None,
+    region_style: RegionStyleOption = None,
+    region_weight: RegionWeightOption = None,
+    region_keep: RegionKeepOption = None,
     *,
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
@@ -79,7 +86,11 @@ def submit(
     styles = parse_styles(style)
     if len(styles) > 1:
         told["style_weights"] = [file.weight for file in styles]
-    pictures = [file.path for file in styles]
+    regions = region_options(region or (), region_style or (), region_weight or (), region_keep or ())
+    theirs = [file for each in region_requests(regions) for file in each.styles]
+    pictures = [file.path for file in (*styles, *theirs)]
+    if regions:
+        told["regions"] = _regions_to_send(regions, different_names(pictures)[len(styles) :])
     chosen = {"name": scene.stem, **told, **_parse_parameters(parameters)}
     with _client(url, key) as client:
         if dry_run:
@@ -101,6 +112,20 @@ def submit(
         if not as_json:
             error_console.print(job.id)
         _conclude(client, _follow(client, job.id, as_json), out, as_json)
+
+
+def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Regions in JSON.
+
+    Args:
+        names: under which their styles' pictures are sent, in the order of `region_requests`.
+    """
+    told = {each.name: each.model_dump(mode="json", exclude_defaults=True) for each in regions}
+    left = iter(names)
+    for request in region_requests(regions):
+        if request.styles:
+            told[request.name]["style"] = [f"{next(left)}:{file.weight!r}" for file in request.styles]
+    return list(told.values())
 
 
 def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:

@@ -28,7 +28,7 @@ def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photo
         RequestError: something is not there.
     """
     found = [("scene", scene, scene.name)]
-    found += [("style", path, name) for path, name in zip(styles, _different_names(styles), strict=True)]
+    found += [("style", path, name) for path, name in zip(styles, different_names(styles), strict=True)]
     found += [("cameras", path, path.name) for path in (camera_files(cameras) if cameras else [])]
     found += [("photos", path, name) for path, name in (photo_files(photos) if photos else [])]
     for _, path, _ in found:
@@ -37,7 +37,7 @@ def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photo
     return [InputFile(role, path, name, path.stat().st_size) for role, path, name in found]
 
 
-def _different_names(paths: Sequence[Path]) -> list[str]:
+def different_names(paths: Sequence[Path]) -> list[str]:
     """A name for each file: its own, but for those that another one has already."""
     names: list[str] = []
     for number, path in enumerate(paths, 1):

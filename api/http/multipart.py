@@ -18,11 +18,10 @@ from starlette.requests import ClientDisconnect
 
 from service.errors import RefusedInputError, ServiceError, TooLargeError
 from service.files.blobs import BlobFolder, Receiver
-from service.files.staging import MAX_CAMERA_FILES, ROLES, clean_name
+from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_headers import read_scene_header
-from worker.styles import MOST_PICTURES
 
 #: Bytes of a text field, which is JSON of parameters or an id.
 _MAX_TEXT = 1 << 16
@@ -164,7 +163,7 @@ class _Form:
     def __init__(self, boundary: bytes, blobs: BlobFolder, settings: ServiceSettings) -> None:
         self.received = Received()
         self._blobs, self._settings = blobs, settings
-        self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_PICTURES + 1
+        self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + 1
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
         self._parts = 0
         self._headers: dict[bytes, bytes] = {}

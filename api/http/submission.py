@@ -18,8 +18,8 @@ from service.errors import (
     ServiceError,
     TooLargeError,
 )
+from service.files.staging import MOST_STYLES
 from service.parameters import JobParameters
-from worker.styles import MOST_PICTURES
 
 
 class JobFromUploads(BaseModel):
@@ -40,8 +40,9 @@ class JobFromUploads(BaseModel):
     )
 
     scene: str = Field(description="Id of the upload with the 3DGS scene: PLY, compressed PLY, SPZ or .splat.")
-    style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_PICTURES)] = Field(
-        description="Id of the upload with the style image; of several, which are mixed by `style_weights`, a list."
+    style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_STYLES)] = Field(
+        description="Id of the upload with the style image; or a list of several, which are mixed by `style_weights`, "
+        "or are those of `regions`."
     )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
@@ -59,8 +60,9 @@ _FORM = {
             "type": "array",
             "items": _FILE,
             "minItems": 1,
-            "maxItems": MOST_PICTURES,
-            "description": "Style image; or the id of an upload. Several are mixed by `style_weights`.",
+            "maxItems": MOST_STYLES,
+            "description": "Style image; or the id of an upload. Several are mixed by `style_weights`; those that "
+            "`regions` name are theirs.",
         },
         "cameras": {
             "type": "array",
@@ -117,7 +119,7 @@ REFUSALS: tuple[ServiceError, ...] = (
         "All views have 30,000,000,000 pixels; 20,000,000,000 may be.", "too-many-pixels", input="cameras"
     ),
     RefusedInputError("style.jpg: has 20000 x 20000 pixels; 100,000,000 may be.", "image-too-large", input="style"),
-    RefusedInputError("There are more than 2025 files.", "too-many-files"),
+    RefusedInputError("There are more than 2041 files.", "too-many-files"),
     RefusedInputError(
         "view 'view_0' (5187x3361): its 9,000,000 visible Gaussians touch raster tiles 3,000,000,000 times, more than "
         "can be addressed. Render at a lower resolution.",

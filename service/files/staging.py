@@ -9,9 +9,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from service.errors import RefusedInputError
+from worker.regions import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
 ROLES = ("scene", "style", "cameras", "photos")
+#: Pictures of a job's own style, and as many again of its regions.
+MOST_STYLES = MOST_PICTURES + MOST_REGIONS
 #: A COLMAP model is at most cameras, images, points3D, rigs, frames; transforms.json may have a companion.
 MAX_CAMERA_FILES = 8
 _CAMERA_SUFFIXES = {".json", ".bin", ".txt"}
@@ -61,26 +64,39 @@ def _last_bytes(part: str) -> str:
     return part.encode()[-_MAX_NAME:].decode(errors="ignore")
 
 
-def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool, weights: Sequence[float] | None = None) -> None:
+def region_styles(regions: Sequence[RegionRequest]) -> list[str]:
+    """Names of the style files that regions have, as they are kept."""
+    return [clean_name("style", str(file.path), 0) for region in regions for file in region.styles]
+
+
+def check_roles(
+    inputs: Sequence[Mapping[str, Any]],
+    *,
+    orbit: bool,
+    weights: Sequence[float] | None = None,
+    of_regions: Sequence[str] = (),
+) -> None:
     """Prove that a job has the files that it needs, and no others.
 
     Args:
         orbit: there are no camera files then.
-        weights: one for each style picture; None where they count alike.
+        weights: one for each picture of the job's own style; None where they count alike.
+        of_regions: names of the style pictures that regions have.
 
     Raises:
         RefusedInputError: otherwise.
     """
     found = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
-    for role, most in (("scene", 1), ("style", MOST_PICTURES)):
+    for role, most in (("scene", 1), ("style", MOST_STYLES)):
         if not 1 <= len(found[role]) <= most:
             what = "is missing" if not found[role] else f"is there {len(found[role])} times"
             times = "once" if most == 1 else f"once, or up to {most} of them"
             raise RefusedInputError(f"The file {role!r} {what}. Send it {times}.", "invalid-request", input=role)
-    if weights is not None and len(weights) != len(found["style"]):
+    own = _check_region_styles([entry["name"] for entry in found["style"]], of_regions)
+    if weights is not None and len(weights) != own:
         raise RefusedInputError(
-            f"style_weights has {len(weights)} values for {len(found['style'])} files 'style'. Give one for each, in "
-            "their order.",
+            f"style_weights has {len(weights)} values for {own} files 'style' that are no region's. Give one for each, "
+            "in their order.",
             "invalid-request",
             input="style_weights",
         )
@@ -106,6 +122,24 @@ def check_roles(inputs: Sequence[Mapping[str, Any]], *, orbit: bool, weights: Se
     if twice:
         raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}.", "invalid-request")
     _check_folders(found["photos"])
+
+
+def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int:
+    """Prove that regions' styles have been sent; returns how many are left for the job's own style."""
+    missing = next((name for name in of_regions if name not in names), None)
+    if missing is not None:
+        raise RefusedInputError(
+            f"A region's style is {missing!r}, but there is no file 'style' of that name; there are "
+            f"{', '.join(names)}. Send it.",
+            "invalid-request",
+            input="style",
+        )
+    own = len([name for name in names if name not in of_regions])
+    if not own:
+        raise RefusedInputError(
+            "Every file 'style' is a region's. Send one more for what no region has.", "invalid-request", input="style"
+        )
+    return own
 
 
 def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None:

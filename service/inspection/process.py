@@ -16,6 +16,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,6 +35,7 @@ from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
 from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
@@ -43,7 +45,7 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.style_picture import check_style_size
-from worker.inputs import check_something_in_view, load_styles, read_cameras_of
+from worker.inputs import check_something_in_view, load_styles, read_cameras_of, read_regions
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
 
@@ -61,6 +63,17 @@ class RefusedError(Exception):
         self.code = code
 
 
+@dataclass(frozen=True)
+class _Read:
+    """What was read of a job: `orbit` is that which the cameras are of, where they are."""
+
+    scene: Scene
+    cameras: list[Camera]
+    orbit: Orbit | None
+    style: StyleMixture
+    regions: Regions | None
+
+
 def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
     """Read every input of a job as the job would; nothing is rendered.
 
@@ -73,10 +86,8 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
     return _read_inputs(staged, parameters, limits)[0]
 
 
-def _read_inputs(
-    staged: Staged, parameters: JobParameters, limits: dict[str, Any]
-) -> tuple[dict[str, Any], Scene, list[Camera], Orbit | None, StyleMixture]:
-    """What `validate` finds, and what it has read: scene, cameras, the orbit that these are of, and the style."""
+def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> tuple[dict[str, Any], _Read]:
+    """What `validate` finds, and what it has read."""
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
@@ -97,7 +108,8 @@ def _read_inputs(
     with _ErrorsOf("style"):
         for path in staged.styles:
             _check_pixel_count(path, limits)
-        style = load_styles(stylize_request(staged, parameters).styles)
+        job = stylize_request(staged, parameters)
+        style = load_styles(job.styles)
         found["style"] = [style.pictures[0].shape[1], style.pictures[0].shape[0]]
     with _ErrorsOf("cameras"):
         check_choice(source)
@@ -115,22 +127,32 @@ def _read_inputs(
         found |= {"views": len(cameras), "pixels": pixels}
     with _ErrorsOf("style"):
         check_style_size(style, cameras, settings.style_scale)
+    with _ErrorsOf("regions"):
+        regions = read_regions(job, file, cameras)
     with _ErrorsOf("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
         for path in paths:
             _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
-    return found, file.scene, cameras, orbit, style
+    return found, _Read(file.scene, cameras, orbit, style, regions)
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
-    found, scene, cameras, orbit, style = _read_inputs(staged, parameters, limits)
+    found, read = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
     made, _ = make_plan(
-        scene, cameras, request.settings, weights=weights, measured=True, show=show, orbit=orbit, style=style
+        read.scene,
+        read.cameras,
+        request.settings,
+        weights=weights,
+        measured=True,
+        show=show,
+        orbit=read.orbit,
+        style=read.style,
+        regions=read.regions,
     )
     seconds = memory = on_device = None
     if made.prediction:

@@ -29,7 +29,7 @@ from api.http.schemas import (
 )
 from api.http.submission import BODY, REFUSALS, JobFromUploads
 from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError, TooLargeError
-from service.files.staging import check_roles, clean_name
+from service.files.staging import check_roles, clean_name, region_styles
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
@@ -124,7 +124,8 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     """Find the files of a job, and prove what can be proved without the inspecting process."""
     received, parameters, webhook = parts
     inputs, paths = _resolve_inputs(context, caller, received)
-    check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights)
+    styles = region_styles(parameters.region_requests)
+    check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, of_regions=styles)
     if webhook:
         check_url(webhook, context.settings)
     checked = context.inspector.recall("validate", inputs, parameters) is not None

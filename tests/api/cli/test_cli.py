@@ -85,6 +85,58 @@ def test_several_styles(files: Files, capsys: pytest.CaptureFixture[str]) -> Non
     assert "the weight 0 is no finite number above 0" in capsys.readouterr().err
 
 
+def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    other = files.style.with_name("other.png")
+    Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
+    told = ["--region", "right:half-space=1,0,0,0.5", "--region-style", f"right={other}", "--region-weight", "right=2"]
+    told += ["--region", "left:half-space=-1,0,0,0.5", "--region-keep", "left", "--region", "far:sphere=0,0,99,1"]
+    assert main(files.stylize("--steps-sos", "2", "--warm-start", "--revive", *told)) == 0
+    said = capsys.readouterr().out
+    assert "take other.png, with weight 2" in said
+    assert "region far:           warning: left out, because it has no Gaussians" in said
+    before, after = second_reader(files.ply), second_reader(files.out)
+    kept = before["x"] <= -0.5
+    for name, values in before.items():
+        assert np.array_equal(values[kept].view(np.uint32), after[name][kept].view(np.uint32))
+    assert (after["f_dc_0"][~kept] != before["f_dc_0"][~kept]).all()
+    report = json.loads(files.out.with_name("stylized.report.json").read_text())
+    found = {each["name"]: each for each in report["regions"]}
+    assert found["right"] | {"gaussians": 0, "share": 0} == {
+        "name": "right",
+        "select": "half-space=1,0,0,0.5",
+        "gaussians": 0,
+        "share": 0,
+        "style": "other.png",
+        "weight": 2.0,
+        "keep": False,
+        "stylized": True,
+    }
+    assert found["left"]["gaussians"] == kept.sum()
+    assert not found["far"]["stylized"]
+    assert sum(each["share"] for each in report["regions"]) == pytest.approx(1)
+    plan = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style), "--backbone", "vgg16"]
+    assert main([*plan, *told, "--out", str(files.out.with_suffix(".json"))]) == 0
+    assert "region right" in files.out.with_suffix(".json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--region", "a:cube=1"], "selects nothing that is known"),
+        (["--region", "a:mask=nowhere.npy"], "cannot be read as .npy"),
+        (["--region", "a:property=colour>1"], "no property 'colour'"),
+        (["--region-keep", "rest"], "Every Gaussian is kept (rest)"),
+        (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),
+    ],
+)
+def test_regions_that_cannot_be_used(
+    files: Files, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert main(files.stylize(*options)) == 2
+    assert message in capsys.readouterr().err
+    assert not files.out.exists()
+
+
 @pytest.mark.parametrize("form", ["compressed.ply", "spz"])
 def test_stylize_reads_and_writes_packed_scenes(
     files: Files, capsys: pytest.CaptureFixture[str], form: PackedForm

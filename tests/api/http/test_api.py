@@ -233,6 +233,38 @@ def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes])
         assert bad.status_code == 422
 
 
+def test_regions_have_styles_by_their_files_names(client: httpx.Client, files: dict[str, bytes]) -> None:
+    other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
+    parts = [*form(files), ("style", ("night sky.png", other))]
+
+    def answer(*regions: dict[str, Any], files: Any = parts, **more: Any) -> httpx.Response:
+        told = {"parameters": json.dumps({"regions": regions, "preset": "preview", **more})}
+        return client.post("/v1/jobs?dry_run=true", files=files, data=told)
+
+    right = {"name": "right", "select": "half-space=1,0,0,0", "style": "night sky.png", "weight": 2}
+    good = answer(right, {"name": "left", "select": "box=-9,-9,-9,-1,9,9", "keep": True}, style_weights=[1])
+    assert good.status_code == 200, good.text
+    decisions = {each["item"]: each["decision"] for each in good.json()["plan"]["decisions"]}
+    assert "take night sky.png, with weight 2" in decisions["region right"]
+    assert "stay as they are" in decisions["region left"]
+    assert "regions" in decisions
+    wrong: list[tuple[httpx.Response, str]] = [
+        (answer({**right, "style": "day.png"}), "invalid-request"),
+        (answer(right, style_weights=[1, 1]), "invalid-request"),
+        (answer(right, files=form(files, style=("night sky.png", other))), "invalid-request"),
+        (answer({"name": "a", "select": "mask=a.npy"}), "invalid-settings"),
+        (answer({"name": "a", "select": "masks=/etc"}), "invalid-settings"),
+        (answer({"name": "a", "select": "sphere=1"}), "invalid-settings"),
+        (answer({"name": "a"}), "invalid-settings"),
+        (answer({"name": "a", "select": "property=nothing>1"}), "invalid-scene"),
+        (answer({"name": "a", "select": "half-space=0,0,1,-99", "keep": True}), "invalid-settings"),
+    ]
+    for refusal, code in wrong:
+        refused(refusal, 422, code)
+    for bad in ({"name": "a b", "select": "sphere=0,0,0,1"}, {"name": "a", "weight": 0}, {"nam": 1}):
+        assert answer(bad).status_code == 422
+
+
 def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> None:
     for name in (
         "../../../../etc/passwd",
@@ -290,9 +322,15 @@ def test_the_command_line_sends_every_parameter(
     service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
+    told["regions"] = [
+        {"name": "left", "select": "half-space=-1,0,0,0", "style": ["3_style.png:0.5"], "weight": 2.0},
+        {"name": "rest", "keep": True},
+    ]
     texts = {"background": "white"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
+    command += ["--region", "left:half-space=-1,0,0,0", "--region-style", f"left={style}:0.5"]
+    command += ["--region-weight", "left=2", "--region-keep", "rest"]
     for name, option in declared(JobParameters).items():
         told[name] = told.get(name) or value_of(option)
         command += [f"--{name.replace('_', '-')}"]

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -19,6 +21,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.regions import JobStyles
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 from tests.networks import tiny_weights
@@ -41,6 +44,7 @@ def gradient(
     speeds: tuple[float, ...] | None = None,
     memory: int = 1 << 34,
     style_loss: StyleLossName = "sos",
+    regions: Regions | None = None,
 ) -> tuple[Tensor, float, list[bool]]:
     """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
     network = FeatureNetwork(tiny_weights(), layers_of(style_loss, "vgg16", content=True), dtype)
@@ -51,6 +55,9 @@ def gradient(
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     looked = survey(scene, [camera], rasterizer)
     weighted = looked.uncovered_share > 0.01
+    picture_ = StyleMixture.of(picture(90, 110, seed=4, dtype=dtype))
+    regions = regions and regions.resolved(looked.total_blend_weights)
+    styles = JobStyles.prepared(picture_, regions, make_settings(), scene.sh_dc, looked.total_blend_weights)
     views = Views(
         scene,
         [camera],
@@ -59,11 +66,12 @@ def gradient(
         covered=[0],
         weighted=weighted,
         regions=looked.regions if weighted else None,
+        maps=styles.maps(rasterizer),
         collectives=collectives,
     )
     scales = range(loss.scale_count(camera.height, camera.width))
     target = views.target(0, scales)
-    targets = loss.style_targets(picture(90, 110, seed=4, dtype=dtype), (camera.height, camera.width))
+    targets = styles.targets(loss, (camera.height, camera.width))
     colours = views.colours(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
     result = loss.evaluate(views.render(0, colours), targets, target, scales)
     assert result.image_gradient is not None
@@ -100,6 +108,21 @@ def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() ->
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
     for found, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
+        assert relative_error(found, expected) < 1e-9
+        assert found_loss == pytest.approx(loss, rel=1e-9)
+
+
+@pytest.mark.parametrize("style_loss", ["sos", "mixed"])
+def test_regions_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
+    """On three ranks, of which some have no pixel of a region; one of the regions is kept."""
+    scene, camera = wall(), cameras(1, 128, 96)[0]
+    other = StyleMixture.of(picture(64, 80, seed=5, dtype=torch.float64))
+    every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", keep=True))
+    labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
+    regions = Regions(every, labels.clamp(max=2))
+    arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss, regions
+    expected, loss, _ = gradient(ALONE, *arguments)
+    for found, found_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(found, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 

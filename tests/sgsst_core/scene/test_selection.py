@@ -1,0 +1,43 @@
+"""Which Gaussians lie somewhere, or have a property."""
+
+import pytest
+import torch
+
+from sgsst_core.scene.selection import in_box, in_half_space, in_sphere, where_property
+
+NAN = float("nan")
+MEANS = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1, 2, 1], [-3, 0, 0], [NAN, 0, 0]])
+
+
+def test_a_box_has_its_borders_and_corners_in_any_order():
+    wanted = [True, True, False, False, False]
+    assert in_box(MEANS, (0, 0, 0, 1, 1, 1)).tolist() == wanted
+    assert in_box(MEANS, (1, 0, 1, 0, 1, 0)).tolist() == wanted
+
+
+def test_a_sphere_has_its_border():
+    assert in_sphere(MEANS, (0, 0, 0, 3**0.5)).tolist() == [True, True, False, False, False]
+    assert in_sphere(MEANS, (0, 0, 0, 3)).tolist() == [True, True, True, True, False]
+
+
+def test_a_half_space_is_where_its_normal_points():
+    assert in_half_space(MEANS, (1, 0, 0, 1)).tolist() == [False, True, True, False, False]
+    assert in_half_space(MEANS, (-2, 0, 0, 6)).tolist() == [False, False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("sign", "wanted"),
+    [
+        (">", [False, False, True, False]),
+        (">=", [False, True, True, False]),
+        ("<", [True, False, False, False]),
+        ("<=", [True, True, False, False]),
+        ("=", [False, True, False, False]),
+        ("!=", [True, False, True, False]),
+    ],
+)
+def test_comparisons(sign, wanted):
+    """With 0.1 as float32 has it, too; NaN compares with nothing."""
+    values = torch.tensor([0.0, 0.1, 0.2, NAN])
+    assert where_property(values, sign, 0.1).tolist() == wanted
+    assert where_property(values.double() * 10, sign, 1.0)[[0, 2, 3]].tolist() == [wanted[0], wanted[2], wanted[3]]

@@ -1,0 +1,252 @@
+"""Regions of a scene in the optimiser: what is kept, what changes, and by which style."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Region, Regions
+from sgsst_core.loss.sos import ViewTarget
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.regions import RegionMaps, neighbours_change_by_region
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.pictures import relative_error
+from tests.small_scenes import ball, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def other_style() -> Tensor:
+    return style().flip(0, 2) ** 2
+
+
+def halves(scene: Scene, left: Region | None = None, right: Region | None = None) -> Regions:
+    """The scene left and right of x = 0; the rest is the left."""
+    labels = (scene.means[:, 0] >= 0).to(torch.uint8)
+    return Regions((left or Region("rest"), right or Region("right", style=StyleMixture.of(other_style()))), labels)
+
+
+def make(weights: BackboneWeights, scene: Scene, regions: Regions | None, image: Tensor | None = None, **values: Any):
+    settings = make_settings(**{"steps_coarse": 2, "steps_sos": 4, "coarsest_side": 24, **values})
+    image = style() if image is None else image
+    return Stylizer.planned(scene, cameras(), image, settings, weights=weights, regions=regions)
+
+
+# --- maps ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.3, 1.0, 0.1)])
+@pytest.mark.parametrize("name", ["cpu", "cached", "reference"])
+def test_maps_add_up_to_the_coverage(name: Any, background: tuple[float, float, float]) -> None:
+    scene, (view, *_) = ball(), cameras()
+    labels = torch.arange(len(scene), dtype=torch.uint8) % 5
+    labels[labels == 4] = 200
+    rasterizer = make_rasterizer(name, scene, background=background)
+    maps = RegionMaps(labels, (0, 1, 2, 3, 200), rasterizer).render(view)
+    assert maps.shape == (view.height, view.width, 5)
+    torch.testing.assert_close(maps.sum(dim=2), rasterizer.coverage(view), atol=1e-5, rtol=0)
+    black = make_rasterizer("cpu", scene)
+    alone = black.render((labels == 200).float()[:, None].expand(-1, 3).contiguous(), view)[:, :, 0]
+    torch.testing.assert_close(maps[:, :, 4].float(), alone, atol=1e-5, rtol=0)
+    assert bool((maps[rasterizer.coverage(view) == 0] == 0).all())
+
+
+def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
+    scene, (view, *_) = wall(), cameras()
+    labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
+    rasterizer = make_rasterizer("cpu", scene, background=(0.2, 0.4, 0.6))
+    maps = RegionMaps(labels, (0, 1), rasterizer).render(view)
+    assert bool((maps[:, : view.width // 4, 1] == 0).all())
+    assert float(maps[:, -4:, 1].min()) > 0.9
+
+
+# --- what is kept --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"warm_start": True, "revive": True},
+        {"unseen": "neighbours", "views_per_step": 2, "background": (1.0, 0.5, 0.0)},
+        {"keep": ("unseen",), "surround": "random"},
+        {"kept_weights": "half", "keep_colours": "match", "style_loss": "mixed"},
+    ],
+)
+@pytest.mark.parametrize("kept", ["rest", "right"])
+def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str, values: dict[str, Any]) -> None:
+    scene = wall(60, 40, sh_degree=1)  # reaches beyond the views
+    scene.sh_dc[::7] = -0.0
+    keep = {"left": Region("rest", keep=True)} if kept == "rest" else {"right": Region("right", keep=True)}
+    regions = halves(scene, **keep)
+    stylizer = make(tiny_weights, scene, regions, **values)
+    assert run(stylizer) == "finished"
+    bits, before = stylizer.stylized().view(torch.int32), scene.sh_dc.view(torch.int32)
+    assert torch.equal(bits[regions.kept], before[regions.kept])
+    changed = (bits != before).any(dim=1)
+    assert bool(changed[stylizer.plan.optimised].all())
+    assert bool(changed[~regions.kept].all()) == (values.get("unseen") != "keep")
+    assert not bool((stylizer.plan.optimised & regions.kept).any())
+
+
+def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> None:
+    scene = wall(60, 40)
+    near = (scene.means[:, 0].abs() < 2.35) & (scene.means[:, 1].abs() < 1.8)
+    regions = Regions((Region("rest"), Region("middle", keep=True)), near.to(torch.uint8))
+    assert bool((~near).any())
+    with pytest.raises(SettingsError, match="Every Gaussian that a view sees is kept"):
+        make(tiny_weights, scene, regions)
+
+
+# --- which style ---------------------------------------------------------------------------------------------------
+
+
+def test_a_region_of_everything_is_a_job_with_its_style(tiny_weights: BackboneWeights) -> None:
+    """To the bit, what no view sees included."""
+    scene = wall(60, 40, sh_degree=1)
+    whole = Regions(
+        (Region("rest"), Region("all", style=StyleMixture.of(other_style()))), torch.ones(len(scene), dtype=torch.uint8)
+    )
+    found, wanted = make(tiny_weights, scene, whole), make(tiny_weights, scene, None, other_style())
+    for stylizer in (found, wanted):
+        run(stylizer)
+    assert torch.equal(found.stylized(), wanted.stylized())
+    assert [record.loss for record in found.history] == [record.loss for record in wanted.history]
+
+
+def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    labels = torch.zeros(len(scene), dtype=torch.uint8)
+    empty = Regions((Region("rest"), Region("empty", style=StyleMixture.of(other_style()))), labels)
+    found, wanted = make(tiny_weights, scene, empty), make(tiny_weights, scene, None)
+    for stylizer in (found, wanted):
+        run(stylizer)
+    assert torch.equal(found.stylized(), wanted.stylized())
+    (line,) = [each for each in found.plan.decisions if each.item == "region empty"]
+    assert line.decision == "warning: left out, because it has no Gaussians"
+
+
+def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
+    """And not to the other's: flat dark and flat bright pictures tell them apart."""
+    scene = wall()
+    dark, bright = torch.full((40, 40, 3), 0.1), torch.full((40, 40, 3), 0.9)
+    regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))
+    stylizer = make(tiny_weights, scene, regions, dark, steps_sos=60, content_weight=0.0, early_stop=False)
+    run(stylizer)
+    labels, found = regions.labels[stylizer.plan.seen], stylizer.stylized()[stylizer.plan.seen]
+    far = scene.means[stylizer.plan.seen][:, 0].abs() > 0.5  # features at the border see both
+    left, right = (float((0.5 + 0.28209479 * found[(labels == place) & far]).mean()) for place in (0, 1))
+    assert left < 0.4 < 0.6 < right
+
+
+def test_colours_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    dark, bright = torch.full((40, 40, 3), 0.2), torch.full((40, 40, 3), 0.7)
+    regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))
+    stylizer = make(tiny_weights, scene, regions, dark, warm_start=True)
+    seen = stylizer.plan.optimised
+    colours = 0.5 + 0.28209479 * stylizer.transferred()
+    for place, grey in enumerate((0.2, 0.7)):
+        torch.testing.assert_close(
+            colours[regions.labels[stylizer.plan.seen] == place].mean(), torch.tensor(grey), atol=1e-3, rtol=0
+        )
+    assert bool(seen.any())
+
+
+def test_the_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    one = halves(scene, left=Region("rest", style=StyleMixture.of(style())))
+    two = Regions(
+        (Region("rest"), Region("b", style=one.every[1].style), Region("a", style=one.every[0].style)),
+        torch.where(one.labels == 1, 1, 2).to(torch.uint8),
+    )
+    gradients = []
+    for regions in (one, two):
+        stylizer = make(tiny_weights, scene, regions)
+        gradients.append(stylizer.gradient(0, range(stylizer.scale_count(0)))[0])
+    assert relative_error(gradients[1], gradients[0]) < 1e-6
+
+
+# --- around it -----------------------------------------------------------------------------------------------------
+
+
+def test_unseen_gaussians_follow_their_own_region() -> None:
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.9, 0, 0], [0.1, 0, 0], [5, 0, 0]])
+    change = torch.tensor([[1.0] * 3, [2.0] * 3, [0.0] * 3, [0.0] * 3, [0.0] * 3])
+    weights = torch.tensor([1.0, 1, 0, 0, 0]).double()
+    labels = torch.tensor([0, 1, 0, 1, 2], dtype=torch.uint8)
+    regions = Regions((Region("rest"), Region("a"), Region("b", keep=True)), labels)
+    found = neighbours_change_by_region(means, change, weights, regions)
+    assert found[2:, 0].tolist() == [1.0, 2.0, 0.0]
+    without = replace(regions, labels=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8))
+    found = neighbours_change_by_region(means, change, weights, without)
+    assert found[2, 0] == 1.5  # nothing of its region is optimised
+
+
+def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+    scene = wall()
+    regions = halves(scene, left=Region("rest", weight=2.0))
+    whole, first = (make(tiny_weights, scene, regions) for _ in range(2))
+    run(whole)
+    for _ in range(3):
+        first.run_step()
+    save_checkpoint(tmp_path / "c", Checkpoint(first.state(), first.plan, 1, "r", versions()), "job")
+    checkpoint = load_checkpoint(tmp_path / "c", "job")
+    again = Stylizer(checkpoint.plan, scene, cameras(), style(), first.settings, weights=tiny_weights, regions=regions)
+    again.load_state(checkpoint.state)
+    run(again)
+    assert torch.equal(again.stylized(), whole.stylized())
+
+
+def test_the_fingerprint_knows_regions() -> None:
+    scene, views, settings = wall(), cameras(), make_settings()
+    regions = halves(scene)
+    moved = replace(regions, labels=1 - regions.labels)
+    right = regions.every[1]
+    others = [replace(right, weight=2.0), replace(right, style=None), replace(right, keep=True)]
+    every = [None, regions, moved, *(replace(regions, every=(regions.every[0], other)) for other in others)]
+    found = [fingerprint(scene, views, style(), settings, "w", "", each) for each in every]
+    assert len(set(found)) == len(every)
+    assert found[0] == fingerprint(scene, views, style(), settings, "w")
+
+
+def test_the_exact_twin_has_the_same_regions(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    stylizer = make(tiny_weights, scene, halves(scene))
+    twin = ExactTwin(stylizer)
+    scales = list(range(stylizer.scale_count(0)))
+    own, exact = stylizer.gradient(0, scales)[0], twin.gradient(0, scene.sh_dc, scales)[0]
+    assert relative_error(own, exact[stylizer.plan.seen]) < 1e-6
+
+
+def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
+    scene, settings = wall(), make_settings(steps_sos=20, coarsest_side=24)
+    plan, _ = make_plan(scene, cameras(), settings, weights=tiny_weights, regions=halves(scene))
+    lines = {line.item: line for line in plan.decisions}
+    assert "2 renders at a view's first visit, 0.1 MB for all views" in lines["regions"].decision
+    assert "% of what the views show, take the style" in lines["region rest"].decision
+    assert "take picture 1" in lines["region right"].decision
+
+
+def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    stylizer = make(tiny_weights, scene, halves(scene))
+    view = stylizer.views.target(0, [0])
+    targets = stylizer.style_targets(stylizer.views.cameras[0])
+    image = stylizer.views.render(0, stylizer.views.colours(0, stylizer.sh_dc.detach()))
+    bare = ViewTarget(view.content_image, view.content, view.coverage, view.share)
+    with pytest.raises(ValueError, match="not prepared for the regions"):
+        stylizer.loss.evaluate(image, targets, bare, [0])

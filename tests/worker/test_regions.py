@@ -1,0 +1,98 @@
+"""Regions as users ask for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sgsst_core.errors import SettingsError
+from worker.regions import MOST_REGIONS, REST, RegionOptions, parse_selection, region_options, region_requests
+from worker.styles import MOST_PICTURES, StyleFile
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "numbers"),
+    [
+        ("box=0,1,2,-3,4.5,6e1", "box", (0, 1, 2, -3, 4.5, 60)),
+        ("sphere=0,0,0,1", "sphere", (0, 0, 0, 1)),
+        ("half-space= 0, 1 ,0,-2", "half-space", (0, 1, 0, -2)),
+    ],
+)
+def test_places(text: str, kind: str, numbers: tuple[float, ...]) -> None:
+    found = parse_selection(text, "region a")
+    assert (found.kind, found.numbers, found.text) == (kind, numbers, text)
+
+
+def test_properties_and_masks() -> None:
+    found = parse_selection("property=f_rest_0<=-0.5", "region a")
+    assert (found.name, found.sign, found.numbers) == ("f_rest_0", "<=", (-0.5,))
+    assert parse_selection("mask=a=b.npy", "region a").path == Path("a=b.npy")
+    assert parse_selection("masks=some folder", "region a").path == Path("some folder")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "selects nothing that is known"),
+        ("cube=1", "selects nothing that is known"),
+        ("box", "selects nothing that is known"),
+        ("mask=", "selects nothing that is known"),
+        ("box=1,2,3", "has 3 numbers; it takes 6"),
+        ("sphere=0,0,0,x", "'x' in '0,0,0,x' is no finite number"),
+        ("sphere=0,0,nan,1", "is no finite number"),
+        ("sphere=0,0,0,0", "radius 0 is not above 0"),
+        ("half-space=0,0,0,1", "has no direction"),
+        ("property=opacity", "is no comparison"),
+        ("property=opacity>>1", "is no finite number"),
+        ("property=>1", "is no comparison"),
+    ],
+)
+def test_what_selects_nothing(text: str, message: str) -> None:
+    with pytest.raises(SettingsError, match=f"^region a: .*{message}"):
+        parse_selection(text, "region a")
+
+
+def test_the_command_lines_texts_come_together(tmp_path: Path) -> None:
+    odd = tmp_path / "b:2"
+    odd.touch()
+    options = region_options(
+        ["a:sphere=0,0,0,1", "c:half-space=0,1,0,0"],
+        ["a=x.jpg:0.5", f"a={odd}", "rest=y=z.jpg"],
+        ["a=3", "rest=0.5"],
+        ["c"],
+    )
+    rest, first, second = region_requests(options)
+    assert (rest.name, rest.selection, rest.styles, rest.weight) == (REST, None, (StyleFile(Path("y=z.jpg")),), 0.5)
+    assert first.styles == (StyleFile(Path("x.jpg"), 0.5), StyleFile(odd))
+    assert (first.weight, first.keep, second.keep, second.styles) == (3, False, True, ())
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        ((["a"], [], [], []), "is not NAME:SPEC"),
+        ((["1a:sphere=0,0,0,1"], [], [], []), "is not NAME:SPEC"),
+        ((["a:sphere=0,0,0,1", "a:sphere=0,0,0,2"], [], [], []), "there is a region a already"),
+        (([], ["b=x.jpg"], [], []), "there is no region 'b'. There are rest"),
+        ((["a:sphere=0,0,0,1"], ["a"], [], []), "is not NAME=FILE"),
+        ((["a:sphere=0,0,0,1"], [], ["a=0"], []), "not above 0"),
+        ((["a:sphere=0,0,0,1"], [], ["a=x"], []), "no finite number"),
+        ((["a:sphere=0,0,0,1"], ["a=x.jpg:0"], [], []), "the weight 0 is no finite number above 0"),
+        ((["a:sphere=0,0,0,1"], ["a=x.jpg"], [], ["a"]), "is kept as it is, and has no style or weight"),
+        ((["rest:sphere=0,0,0,1"], [], [], []), "takes no SPEC"),
+        ((["a:" + "x" * 1001], [], [], []), "at most 1000 characters"),
+        (([f"a{n}:sphere=0,0,0,1" for n in range(MOST_REGIONS + 1)], [], [], []), f"; {MOST_REGIONS} may be"),
+        ((["a:sphere=0,0,0,1"], ["a=x.jpg"] * (MOST_PICTURES + 1), [], []), f"; {MOST_PICTURES} may be"),
+    ],
+)
+def test_texts_that_make_no_sense(texts: tuple[list[str], list[str], list[str], list[str]], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        region_requests(region_options(*texts))
+
+
+def test_a_region_of_json_needs_a_selection() -> None:
+    with pytest.raises(SettingsError, match="needs a SPEC"):
+        region_requests([RegionOptions(name="a")])
+    with pytest.raises(SettingsError, match="two regions 'rest'"):
+        region_requests([RegionOptions(name=REST, keep=True)] * 2)

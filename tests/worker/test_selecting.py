@@ -1,0 +1,173 @@
+"""Regions of a scene that has been read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from sgsst_core.errors import ImageError, SceneError, SettingsError
+from sgsst_core.files.images import save_png
+from sgsst_core.files.ply import SceneFile, read_scene, write_packed
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.gaussians import Scene
+from tests.small_scenes import cameras, wall, write_files
+from worker.inputs import load_styles
+from worker.regions import RegionRequest, parse_selection
+from worker.selecting import select, select_regions
+
+
+def region(name: str, spec: str, **values: Any) -> RegionRequest:
+    return RegionRequest(name, parse_selection(spec, name), **values)
+
+
+def labels_of(file: SceneFile, *requests: RegionRequest) -> list[int]:
+    found = select_regions(requests, file, cameras(), 0.2, load_styles)
+    assert found is not None
+    return found.labels.tolist()
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> SceneFile:
+    return read_scene(write_files(tmp_path, wall(6, 4))[0])
+
+
+def with_property(path: Path, values: np.ndarray, *, text: bool = False, order: str = "<") -> None:
+    """The PLY with one more property, `extra`."""
+    rows = PlyData.read(path)["vertex"].data
+    kinds = [*rows.dtype.descr, ("extra", values.dtype.newbyteorder("=").str)]
+    more = np.empty(len(rows), kinds)
+    for name in rows.dtype.names or ():
+        more[name] = rows[name]
+    more["extra"] = values
+    PlyData([PlyElement.describe(more, "vertex")], text=text, byte_order=order).write(path)
+
+
+def test_the_later_region_has_what_both_select(file: SceneFile) -> None:
+    wide, narrow = region("a", "half-space=1,0,0,-1"), region("b", "half-space=1,0,0,1")
+    x = file.scene.means[:, 0]
+    assert labels_of(file, wide, narrow) == [0 if v < -1 else 1 if v < 1 else 2 for v in x.tolist()]
+    assert labels_of(file, narrow, wide) == [0 if v < -1 else 2 for v in x.tolist()]
+    found = select_regions((narrow, wide), file, cameras(), 0.2, load_styles)
+    assert found is not None
+    assert [each.selected for each in found.every] == [0, int((x >= 1).sum()), int((x >= -1).sum())]
+
+
+@pytest.mark.parametrize("kind", ["i4", "u1", "f8", "f4"])
+@pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
+def test_any_property_of_the_file(tmp_path: Path, kind: str, text: bool, order: str) -> None:
+    path = write_files(tmp_path, wall(6, 4))[0]
+    values = np.arange(24).astype(kind)
+    with_property(path, values, text=text, order=order)
+    selection = parse_selection("property=extra>=20", "a")
+    assert select(selection, read_scene(path), cameras(), 0.2).tolist() == (values >= 20).tolist()
+    assert int(select(parse_selection("property=extra=7", "a"), read_scene(path), cameras(), 0.2).sum()) == 1
+
+
+def test_properties_of_all_scenes_are_there_in_any_form(tmp_path: Path, file: SceneFile) -> None:
+    packed = tmp_path / "wall.spz"
+    write_packed(packed, file.scene, "spz")
+    for source in (file, read_scene(packed)):
+        assert select(parse_selection("property=opacity>4", "a"), source, cameras(), 0.2).all()
+        assert not select(parse_selection("property=z<2", "a"), source, cameras(), 0.2).any()
+        with pytest.raises(SceneError, match=r"no property 'extra'. There are f_dc_0, "):
+            select(parse_selection("property=extra>4", "a"), source, cameras(), 0.2)
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.float64])
+def test_a_mask_of_the_gaussians(tmp_path: Path, file: SceneFile, kind: type) -> None:
+    wanted = np.arange(24) % 3 == 0
+    np.save(tmp_path / "m.npy", wanted.astype(kind))
+    assert labels_of(file, region("a", f"mask={tmp_path}/m.npy")) == wanted.astype(int).tolist()
+
+
+def test_rows_that_were_dropped_are_dropped_of_masks_and_properties_too(tmp_path: Path) -> None:
+    scene = wall(6, 4)
+    scene.means[3, 0] = torch.nan
+    path = write_files(tmp_path, wall(6, 4))[0]
+    with_property(path, np.arange(24).astype("f4"))
+    rows = PlyData.read(path)["vertex"].data.copy()
+    rows["x"][3] = np.nan
+    PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+    file = read_scene(path, drop_invalid=True)
+    mask = np.zeros(24)
+    mask[[3, 5]] = 1
+    np.save(tmp_path / "m.npy", mask)
+    wanted = [0, 0, 0, 0, 1, *[0] * 18]  # the file's row 5 is the scene's row 4
+    assert labels_of(file, region("a", f"mask={tmp_path}/m.npy")) == wanted
+    assert labels_of(file, region("a", "property=extra=5")) == wanted
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros(23), r"has the shape \(23,\); .* has 24 Gaussians"),
+        (np.zeros((24, 1)), r"has the shape \(24, 1\)"),
+        (np.full(24, 2), "values other than 0 and 1"),
+        (np.full(24, np.nan), "values other than 0 and 1"),
+        (np.array(["a"] * 24), "no array of flags or numbers"),
+        (np.array([None] * 24), "cannot be read as .npy"),
+        (b"no npy at all", "cannot be read as .npy"),
+        (None, "cannot be read as .npy"),
+    ],
+)
+def test_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile, array: Any, message: str) -> None:
+    path = tmp_path / "m.npy"
+    if isinstance(array, bytes):
+        path.write_bytes(array)
+    elif array is not None:
+        np.save(path, array, allow_pickle=True)
+    with pytest.raises(SceneError, match=message):
+        labels_of(file, region("a", f"mask={path}"))
+
+
+def test_masks_of_some_views(tmp_path: Path) -> None:
+    """White where the scene's right half is drawn: the views' names find them, one view needs none."""
+    scene: Scene = wall()
+    file = read_scene(write_files(tmp_path, scene)[0])
+    views, folder = cameras(), tmp_path / "masks"
+    folder.mkdir()
+    right = (scene.means[:, 0] > 0).float()[:, None].expand(-1, 3).contiguous()
+    for view in views[:2]:
+        save_png(folder / f"{view.name}.png", make_rasterizer("cpu", scene).render(right, view))
+    found = select(parse_selection(f"masks={folder}", "a"), file, views, 0.2)
+    clear = scene.means[:, 0].abs() > 0.15
+    assert torch.equal(found[clear], scene.means[clear, 0] > 0)
+
+
+def test_folders_of_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile) -> None:
+    views, empty = cameras(), tmp_path / "none"
+    empty.mkdir()
+    for folder, message in ((tmp_path / "nowhere", "not a folder of masks"), (empty, "no mask for any of 3 views")):
+        with pytest.raises(ImageError, match=message):
+            labels_of(file, region("a", f"masks={folder}"))
+    save_png(empty / f"{views[0].name}.png", torch.zeros(10, 64, 3))
+    with pytest.raises(ImageError, match="another aspect"):
+        labels_of(file, region("a", f"masks={empty}"))
+
+
+def test_nothing_left_to_do(file: SceneFile) -> None:
+    everything = region("a", "half-space=1,0,0,-100", keep=True)
+    with pytest.raises(SettingsError, match=r"Every Gaussian is kept \(a\)"):
+        labels_of(file, everything)
+    assert select_regions((), file, cameras(), 0.2, load_styles) is None
+
+
+def test_styles_are_read(tmp_path: Path, file: SceneFile) -> None:
+    from worker.styles import StyleFile
+
+    save_png(tmp_path / "s.png", torch.full((8, 8, 3), 0.5))
+    request = region("a", "half-space=1,0,0,0", styles=(StyleFile(tmp_path / "s.png"),), weight=2.0)
+    found = select_regions((request,), file, cameras(), 0.2, load_styles)
+    assert found is not None
+    assert isinstance(found.every[1].style, StyleMixture)
+    assert (found.every[1].style.names, found.every[1].weight, found.every[1].select) == (
+        ("s.png",),
+        2.0,
+        "half-space=1,0,0,0",
+    )
