@@ -6,7 +6,9 @@ that is refused on purpose (a limit) is one that checks the refusal.
 
 from __future__ import annotations
 
+from sgsst_core.bench.stability import form_cases as forms
 from sgsst_core.bench.stability import gaussian_cases as gaussians
+from sgsst_core.bench.stability import job_cases as jobs
 from sgsst_core.bench.stability import optimisation_cases as optimisation
 from sgsst_core.bench.stability import picture_cases as pictures
 from sgsst_core.bench.stability import precision_cases as precision
@@ -16,6 +18,9 @@ from sgsst_core.bench.stability.case import Case, CaseResult, Group, Measurement
 __all__ = ["Case", "CaseResult", "Group", "Measurement", "all_cases", "measure"]
 
 
+_GROUPS = (gaussians, views, pictures, optimisation, precision, jobs, forms)
+
+
 def all_cases() -> list[Case]:
     """Every case, group by group."""
-    return [case for module in (gaussians, views, pictures, optimisation, precision) for case in module.cases()]
+    return [case for module in _GROUPS for case in module.cases()]

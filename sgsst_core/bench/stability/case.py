@@ -25,7 +25,9 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 
-Group = Literal["Gaussians", "views", "style and content", "stiff optimisation", "precision"]
+Group = Literal[
+    "Gaussians", "views", "style and content", "stiff optimisation", "precision", "jobs", "files and orbits"
+]
 
 #: Images and coverage in float32 agree with float64 to this share of the brightest colour.
 IMAGE_BOUND = 1e-4

@@ -1,0 +1,189 @@
+"""Hard cases of whole jobs: styles, scenes and settings that leave nothing to compare, or far too much."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from sgsst_core.bench.stability.case import Case, CaseResult, repeated, texture, vgg16
+from sgsst_core.bench.stability.situations import Situation, coloured, crowd, make, small_network, strain, views
+from sgsst_core.errors import SgsstError
+from sgsst_core.loss.feature_scale import PUBLISHED, with_scales
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.luminance import luminance
+from sgsst_core.scene.stored_harmonics import held
+
+_MEASURE = "loss and gradient at the end, relative to float64; finite, bounded, repeated, not above the start"
+
+
+def cases() -> list[Case]:
+    """All cases of this group."""
+    found = [Case(name, "jobs", _MEASURE, partial(_strained, situation)) for name, situation in _SITUATIONS.items()]
+    found += [
+        Case(name, "jobs", "jobs that were not refused", partial(_refused, situation))
+        for name, situation in _REFUSED.items()
+    ]
+    return [*found, Case("chroma of colours from 1e-6 to 1e3", "jobs", "change of chroma, relative", _chroma)]
+
+
+def _strained(situation: Callable[[], Situation], full: bool) -> CaseResult:
+    return strain(situation())
+
+
+def _refused(situation: Callable[[], Situation], full: bool) -> CaseResult:
+    """With an error of its own, before the first step or in it, and not with a broken result."""
+    try:
+        make(situation()).run_step()
+    except SgsstError as error:
+        return CaseResult(0.0, 0.0, f"refused: {error}")
+    return CaseResult(1.0, 0.0, "was not refused")
+
+
+def _flat(red: float, green: float, blue: float, height: int = 12, width: int = 16) -> Tensor:
+    return torch.tensor([red, green, blue], dtype=torch.float32).expand(height, width, 3).clone()
+
+
+def _grey(scene: Scene) -> Scene:
+    return replace(scene, sh_dc=scene.sh_dc[:, :1].expand(-1, 3).clone())
+
+
+def _shaped(scale: tuple[float, float, float], count: int = 40) -> Scene:
+    scene = crowd(count)
+    return replace(scene, scales=torch.tensor(scale).log().repeat(count, 1))
+
+
+def _coincident() -> Scene:
+    return replace(repeated(40, scale=1.0), sh_dc=torch.randn(40, 3, generator=torch.Generator().manual_seed(2)))
+
+
+def _opacities(*logits: float) -> Scene:
+    scene = crowd(60)
+    return replace(scene, opacities=torch.tensor(logits).repeat(60)[:60])
+
+
+def _with_harmonics(size: float, degree: int = 2) -> Scene:
+    scene = crowd(degree=degree)
+    return replace(scene, sh_rest=held(scene.sh_rest) * size)
+
+
+def _scan(**settings: object) -> Situation:
+    """One colour, little of the view, and that colour behind it."""
+    scene = coloured(replace(crowd(20), scales=torch.full((20, 3), math.log(0.2))), 0.4, 0.4, 0.4)
+    return Situation(scene, _flat(0.4, 0.4, 0.4), settings, falls=False)
+
+
+def _job(
+    scene: Callable[[], Scene] = crowd, style: Callable[[], Tensor] | None = None, **settings: object
+) -> Situation:
+    return Situation(scene(), texture(30, 26, 7) if style is None else style(), settings)
+
+
+def _unlike(scene: Callable[[], Scene], style: Callable[[], Tensor], **settings: object) -> Situation:
+    """As `_job`, of which the loss need not fall: what is compared is equal from the start, or cannot be met."""
+    return replace(_job(scene, style, **settings), falls=False)
+
+
+def _scaled(factor: float) -> Situation:
+    scales = dict.fromkeys(("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu4_2", "relu5_1"), factor)
+    return replace(_job(), weights=with_scales(small_network(), scales))
+
+
+def _black_views(scale: str) -> Situation:
+    """The real network; with the factors that the paper's scale is about, which need not be found anew for this."""
+    weights = vgg16()
+    if scale == "paper":
+        weights = with_scales(weights, dict.fromkeys(PUBLISHED, 20.0))
+    job = _job(lambda: coloured(crowd(), 0.0, 0.0, 0.0), feature_scale=scale, steps_coarse=0, steps_sos=1)
+    return replace(job, weights=weights, cameras=views()[:1])
+
+
+def _tiny_views(width: int, height: int, **settings: object) -> Situation:
+    return replace(_job(**settings), cameras=views(width, height), falls=False)
+
+
+_SITUATIONS: dict[str, Callable[[], Situation]] = {
+    "style of one pixel, 1 x 1, in a job": lambda: _job(style=lambda: _flat(0.9, 0.5, 0.1, 1, 1)),
+    "style of one row": lambda: _job(style=lambda: texture(1, 60, 3)),
+    "style of one column": lambda: _job(style=lambda: texture(60, 1, 3)),
+    "flat style: black": lambda: _job(style=lambda: _flat(0, 0, 0)),
+    "flat style: white": lambda: _job(style=lambda: _flat(1, 1, 1)),
+    "flat style: one colour": lambda: _job(style=lambda: _flat(0.9, 0.3, 0.1)),
+    "strokes larger than the view": lambda: _job(style_scale=4),
+    "strokes larger than a view of 3 x 2": lambda: _tiny_views(3, 2, style_scale=4),
+    "strokes smaller than a pixel": lambda: _job(style=lambda: texture(3, 3, 1), style_scale=0.25),
+    "thin style turned by 33 degrees": lambda: _job(style=lambda: texture(2, 200, 1), style_rotation=33),
+    "thin style turned by -271 degrees": lambda: _job(style=lambda: texture(300, 3, 1), style_rotation=-271),
+    "style of one pixel turned by 45 degrees": lambda: _job(
+        style=lambda: _flat(0.1, 0.2, 0.9, 1, 1), style_rotation=45
+    ),
+    "colours matched to a scene of one colour": lambda: _job(
+        lambda: coloured(crowd(), 0.2, 0.5, 0.7), keep_colours="match"
+    ),
+    "colours matched to a grey scene": lambda: _job(lambda: _grey(crowd()), keep_colours="match"),
+    "colours of a flat style matched": lambda: _job(style=lambda: _flat(1, 1, 1), keep_colours="match"),
+    "luminance of a scene of one colour": lambda: _job(
+        lambda: coloured(crowd(), 0.2, 0.5, 0.7), keep_colours="luminance"
+    ),
+    "luminance of a grey scene": lambda: _job(lambda: _grey(crowd()), keep_colours="luminance"),
+    "luminance of a black scene": lambda: _job(lambda: coloured(crowd(), 0, 0, 0), keep_colours="luminance"),
+    "luminance of a flat style": lambda: _job(style=lambda: _flat(0, 0, 0), keep_colours="luminance"),
+    "one Gaussian in a job": lambda: _job(lambda: repeated(1, scale=1.0)),
+    "all Gaussians at one place": lambda: _job(_coincident),
+    "needles": lambda: _job(lambda: _shaped((3.0, 1e-5, 1e-5))),
+    "points": lambda: _job(lambda: _shaped((1e-8, 1e-8, 1e-8))),
+    "Gaussians larger than the world": lambda: _job(lambda: _shaped((1e5, 1e5, 1e5))),
+    "opacity 0 and 1": lambda: _job(lambda: _opacities(-80.0, 80.0, 0.0)),
+    "opacity 1 alone": lambda: _job(lambda: _opacities(90.0)),
+    "hardly any opacity": lambda: _job(lambda: _opacities(-5.4)),
+    "surround in the object's colour": lambda: _scan(surround="palette"),
+    "surround of random colours, style of one": lambda: _scan(surround="random"),
+    "scan of one colour, warm start": lambda: _scan(warm_start=True, surround="background"),
+    "scan of one colour, warm start in luminance": lambda: _scan(
+        warm_start=True, surround="palette", keep_colours="luminance"
+    ),
+    "nearest neighbours in a flat style": lambda: _unlike(crowd, lambda: _flat(0.5, 0.5, 0.5), style_loss="nnfm"),
+    "nearest neighbours of a black scene": lambda: _unlike(
+        lambda: coloured(crowd(), 0, 0, 0), lambda: _flat(0, 0, 0), style_loss="nnfm"
+    ),
+    "both losses, a flat style": lambda: _unlike(crowd, lambda: _flat(1, 1, 1), style_loss="mixed"),
+    "content weight 0": lambda: _job(content_weight=0),
+    "content weight 1e12 in a job": lambda: _unlike(crowd, lambda: texture(30, 26, 7), content_weight=1e12),
+    "features 1e4 times as large": lambda: _scaled(1e4),
+    "features 1e4 times as small": lambda: _scaled(1e-4),
+    "black views, features at the paper's scale": lambda: _black_views("paper"),
+    "black views, features at one scale": lambda: _black_views("even"),
+    "harmonics of 1e4 that fade by half": lambda: _unlike(
+        lambda: _with_harmonics(1e4), lambda: texture(30, 26, 7), sh_fade=0.5
+    ),
+    "harmonics of 1e30 that fade out": lambda: _job(lambda: _with_harmonics(1e30), sh_fade=1.0),
+    "scales weighted 1e12 to 1e-12": lambda: _job(scales=(1e12, 1e-12)),
+    "the coarsest scale of a tiny view alone": lambda: _job(scales=(0.0, 1.0)),
+}
+
+_REFUSED: dict[str, Callable[[], Situation]] = {
+    "nearest neighbours in a style without a cell": lambda: _job(style=lambda: texture(3, 3, 1), style_loss="nnfm"),
+    "both losses, a style without a cell": lambda: _job(style=lambda: texture(1, 60, 1), style_loss="mixed"),
+    "a scale that no view has": lambda: _job(scales=(0.0, 0.0, 1.0)),
+}
+
+
+def _chroma(full: bool) -> CaseResult:
+    """Colours that are far apart in size keep their chroma to a rounding of the larger of before and after."""
+    scene = crowd(60)
+    sizes = torch.logspace(-6, 3, 60)[:, None]
+    scene = replace(scene, sh_dc=scene.sh_dc * sizes)
+    job = make(Situation(scene, texture(30, 26, 7), {"keep_colours": "luminance", "steps_sos": 20 if full else 4}))
+    while job.step < job.total:
+        job.run_step()
+    found = job.stylized().double()
+    change = found - scene.sh_dc.double()
+    size = torch.maximum(found.abs(), scene.sh_dc.double().abs()).amax(1, keepdim=True)
+    error = float(((change - change.mean(1, keepdim=True)).abs() / size).max())
+    if not bool(torch.isfinite(found).all()):
+        error = math.inf
+    return CaseResult(error, 2**-23, f"luminance moved by up to {float(luminance(change).abs().max()):.2g}")

@@ -1,0 +1,183 @@
+"""Whole jobs so small that hundreds of them can be run: what a scene, a style and settings come to together.
+
+Cases and the random search (`benchmarks.stability_search`) hold them against the same bounds: finite colours, steps no
+longer than Adam's, the same bits again, a loss that does not rise, and loss and gradient of the last picture as in
+float64.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, ordinary
+from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer
+
+#: Loss and pixel gradient of the last picture against float64, relative.
+TWIN_BOUND = 1e-4
+#: Adam's longest step in learning rates: that of a gradient which was 0 in all steps before.
+LONGEST_STEP = 0.1 / math.sqrt(0.001) + 0.1
+#: By how much more than at the start a loss may be at the end.
+RISE = 1e-3
+#: Losses as small as this are rounding of what was equal at the start.
+NO_LOSS = 1e-3
+STEPS, LEARNING_RATE = 4, 0.02
+_CHANNELS = 8
+
+
+@dataclass(frozen=True)
+class Situation:
+    """A job.
+
+    Attributes:
+        style: [H, W, 3].
+        settings: on top of `small_settings`.
+        cameras: none for `views`.
+        falls: the loss may not end above the start, where steps have the surround that it is judged with. False where a
+            step of any length overshoots: what is compared is equal, or nearly so, before the first one.
+        weights: of the network; None for `small_network`.
+    """
+
+    scene: Scene
+    style: Tensor
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    cameras: tuple[Camera, ...] = ()
+    falls: bool = True
+    weights: BackboneWeights | None = None
+
+
+def views(width: int = 24, height: int = 20) -> tuple[Camera, ...]:
+    """Two cameras side by side."""
+    first = camera(width, height, focal=0.75 * max(width, height))
+    pose = first.world_to_camera.clone()
+    pose[0, 3] = -0.3
+    return replace(first, name="left"), replace(first, name="right", world_to_camera=pose)
+
+
+def crowd(count: int = 60, *, seed: int = 0, degree: int = 0) -> Scene:
+    """Gaussians that cover most of each view, as trained ones do."""
+    scene = ordinary(count, seed=seed, degree=degree)
+    return replace(scene, scales=scene.scales + 2.2, sh_dc=0.6 * scene.sh_dc)
+
+
+def coloured(scene: Scene, red: float, green: float, blue: float) -> Scene:
+    """The same scene in one colour (0..1)."""
+    colour = (torch.tensor([red, green, blue], dtype=torch.float32) - COLOUR_OFFSET) / SH_C0
+    return replace(scene, sh_dc=colour.expand(len(scene), 3).clone())
+
+
+@functools.cache
+def small_network() -> BackboneWeights:
+    """VGG16's layers with 8 channels each and random weights (He et al. 2015), the same ones in every process."""
+    generator = torch.Generator().manual_seed(8)
+    layers, channels = {}, 3
+    for block, count in enumerate(BLOCKS["vgg16"], start=1):
+        for index in range(1, count + 1):
+            weight = torch.randn(_CHANNELS, channels, 3, 3, generator=generator) * math.sqrt(2 / (9 * channels))
+            layers[f"conv{block}_{index}"] = weight, torch.randn(_CHANNELS, generator=generator)
+            channels = _CHANNELS
+    scale, shift = torch.full((3,), 255.0), -torch.tensor(CAFFE_MEAN)
+    return BackboneWeights("vgg16", "random", "0" * 64, layers, scale, shift)
+
+
+def make(situation: Situation) -> Stylizer:
+    """A stylizer of a situation, before its first step."""
+    values: dict[str, Any] = {
+        "steps_coarse": 1,
+        "steps_sos": STEPS,
+        "learning_rate": LEARNING_RATE,
+        "early_stop": False,
+        "coarsest_side": 16,
+        "memory_limit": 1 << 28,
+    }
+    settings = make_settings(**(values | dict(situation.settings)))
+    weights = situation.weights or small_network()
+    cameras = situation.cameras or views()
+    return Stylizer.planned(situation.scene, cameras, situation.style, settings, weights=weights)
+
+
+def strain(situation: Situation) -> CaseResult:
+    """Run a situation twice: the error against float64 at the end, infinite where any other bound is broken.
+
+    Raises:
+        SgsstError: what the situation is refused with.
+    """
+    jobs = [make(situation) for _ in range(2)]
+    begun = jobs[0].sh_dc.detach().clone()
+    before = mean_loss(jobs[0].evaluate(jobs[0].evaluation_views), jobs[0].loss.weights)
+    for job in jobs:
+        run(job)
+    job = jobs[0]
+    after = mean_loss(job.evaluate(job.evaluation_views), job.loss.weights)
+    colours, moved = job.stylized(), float((job.sh_dc.detach() - begun).abs().max())
+    judged = job.plan.surround == "background"  # else steps have another loss than what is judged
+    most = job.total * job.settings.learning_rate * LONGEST_STEP
+    broken = [
+        what
+        for what, holds in {
+            "colours are not finite": bool(torch.isfinite(colours).all()) and math.isfinite(moved),
+            "the loss is not finite": math.isfinite(before) and math.isfinite(after),
+            f"colours moved by {moved:.3g} in {job.total} steps": moved <= most + 1e-5 * float(begun.abs().max()),
+            "another run has other bits": torch.equal(colours, jobs[1].stylized()),
+            f"the loss rose from {before:.6g} to {after:.6g}": not (situation.falls and judged)
+            or after <= max((1 + RISE) * before, NO_LOSS),
+        }.items()
+        if not holds
+    ]
+    error, flips = twin_error(job)
+    note = "; ".join(broken) or f"loss {before:.3g} to {after:.3g}; {flips} ReLU and pool decisions flipped"
+    return CaseResult(math.inf if broken else error, TWIN_BOUND, note)
+
+
+def twin_error(job: Stylizer) -> tuple[float, int]:
+    """Relative error of loss and pixel gradient of a view's present picture against float64, and flipped decisions.
+
+    Of features that are matched, the loss alone: another nearest vector, as near, is no error.
+    """
+    index = job.views.covered[0]
+    picture = job.views.render(index, job.views.colours(index, job.sh_dc.detach()))
+    content = job.views.content(index)
+    coverage = job.views.coverage(index)[0] if job.views.weighted else None
+    double = DecisionsOf(job.weights, job.network)
+    found, exact = (_evaluate(job, network, picture, content, coverage) for network in (job.network, double))
+    assert found.image_gradient is not None
+    assert exact.image_gradient is not None
+    if not bool(torch.isfinite(found.image_gradient).all()):
+        return math.inf, double.flips
+    error = abs(found.loss - exact.loss) / max(abs(exact.loss), 1.0)
+    if not job.loss.nearest_layers:
+        off = float((found.image_gradient.double() - exact.image_gradient).norm())
+        error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
+    return error, double.flips
+
+
+def _evaluate(
+    job: Stylizer, network: FeatureNetwork, picture: Tensor, content: Tensor, coverage: Tensor | None
+) -> SosResult:
+    settings = job.settings
+    loss = SosLoss(
+        network,
+        content_weight=settings.content_weight,
+        style_loss=settings.style_loss,
+        coarsest=settings.coarsest_side,
+        style_scale=settings.style_scale,
+        scales=job.loss.weights,
+    )
+    targets = loss.style_targets(job.style.to(network.dtype), (picture.shape[0], picture.shape[1]))
+    return loss.evaluate(picture.to(network.dtype), targets, loss.view_target(content.to(network.dtype), coverage))

@@ -1,0 +1,16 @@
+"""Hard cases of whole jobs: the smallest ones that have everything."""
+
+from __future__ import annotations
+
+import pytest
+
+from sgsst_core.bench.stability import Case
+from sgsst_core.bench.stability import job_cases as jobs
+from tests.stability.hard_cases import check
+
+pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
+
+
+@pytest.mark.parametrize("case", jobs.cases(), ids=lambda case: case.name)
+def test_stays_within_its_bound(case: Case) -> None:
+    check(case)
