@@ -19,7 +19,7 @@ from typing import Any
 
 from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder
+from service.files.blobs import Blobs
 from service.files.names import CHECKPOINT, RESULT
 from service.files.staging import stage
 from service.parameters import JobParameters, stored_parameters
@@ -52,7 +52,7 @@ class RunningAttempt:
         grant: Grant,
         folder: Path,
         store: Store,
-        blobs: BlobFolder,
+        blobs: Blobs,
         artifacts: Artifacts,
         settings: ServiceSettings,
         cluster: bool,
@@ -152,9 +152,7 @@ class RunningAttempt:
         self._folder.mkdir(parents=True)
         digests = sorted({entry["sha256"] for entry in job.inputs})
         rows = self._store.inputs.blobs(digests)
-        staged = stage(
-            self._folder, job.inputs, {sha256: self._blobs.path(row.location) for sha256, row in rows.items()}
-        )
+        staged = stage(self._folder, job.inputs, self._blobs.bring(rows, self._folder))
         out = self._folder / "out"
         out.mkdir()
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
