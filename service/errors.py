@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sgsst_core.errors import SgsstError
+from sgsst_core.errors import InfrastructureError, SgsstError
 
 
 class ServiceError(SgsstError):
@@ -61,7 +61,7 @@ class QueueFullError(ServiceError):
     code, status = "queue-full", 429
 
 
-class NoSpaceError(ServiceError):
+class NoSpaceError(ServiceError, InfrastructureError):
     """The disk is too full to take more in."""
 
     code, status = "insufficient-storage", 507
@@ -71,6 +71,12 @@ class BusyError(ServiceError):
     """What is needed is in use; the same request will succeed later."""
 
     code, status = "busy", 503
+
+
+class StoreError(ServiceError, InfrastructureError):
+    """The store of files cannot be reached, or has lost or damaged a file; the cause says what has happened."""
+
+    code, status = "store-unavailable", 503
 
 
 class LeaseLostError(ServiceError):

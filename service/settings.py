@@ -17,7 +17,9 @@ class ServiceSettings(BaseSettings):
     Attributes:
         data: folder of database, inputs and results.
         database: SQLAlchemy URL; None for SQLite in `data`. PostgreSQL: `postgresql+psycopg://user@host/name`.
-        artifacts: fsspec URL of the results; None for a folder in `data`. S3: `s3://bucket/prefix`.
+        artifacts: fsspec URL of the store of files: results, and inputs unless it is a local folder; None for a folder
+            in `data`. S3: `s3://bucket/prefix`.
+        file_cache_bytes: of inputs that a host keeps of what is in the store of files.
         host, port: where the API listens.
         require_keys: whether requests need an API key; None: unless the API is bound to loopback.
         max_request_bytes: of one request's body; uploads in parts may be larger.
@@ -64,6 +66,7 @@ class ServiceSettings(BaseSettings):
     max_photos: int = Field(2_000, gt=0)
     max_jobs_per_key: int = Field(100, gt=0)
     min_free_bytes: int = Field(2 * GB, ge=0)
+    file_cache_bytes: int = Field(50 * GB, ge=0)
     inspection_seconds: float = Field(120, gt=0)
     inspection_bytes: int = Field(8 * GB, gt=0)
     dry_run_seconds: float = Field(600, gt=0)

@@ -90,3 +90,9 @@ class DivergedError(SgsstError):
     """Colours or gradients have left the range in which the optimiser works."""
 
     code = "diverged"
+
+
+class InfrastructureError(SgsstError):
+    """A machine, a network or a store of files has failed: nothing is wrong with what the user handed in."""
+
+    code = "infrastructure"

@@ -23,7 +23,7 @@ from api.http.routes import artifacts, events, jobs, operations, uploads
 from api.http.schemas import ANSWERS
 from api.http.submission import JobFromUploads
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder
+from service.files.stored_blobs import open_blobs
 from service.inspection.inspector import Inspector
 from service.inspection.packer import Packer
 from service.settings import ServiceSettings
@@ -46,14 +46,14 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = open_store(settings)
-        blobs = BlobFolder(settings.folder, store.inputs, settings.min_free_bytes)
         results = Artifacts(settings.artifacts_url)
+        blobs = open_blobs(settings, store.inputs, results)
         context = Context(
             settings=settings,
             store=store,
             blobs=blobs,
             artifacts=results,
-            inspector=Inspector(settings, store),
+            inspector=Inspector(settings, store, blobs),
             packer=Packer(settings, store, blobs, results),
             hub=Hub(store),
             metrics=Metrics(store),

@@ -15,7 +15,7 @@ from api.http.hub import Hub
 from api.http.metrics import Metrics
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder
+from service.files.blobs import Blobs
 from service.inspection.inspector import Inspector
 from service.inspection.packer import Packer
 from service.settings import ServiceSettings
@@ -44,7 +44,7 @@ class Context:
 
     settings: ServiceSettings
     store: Store
-    blobs: BlobFolder
+    blobs: Blobs
     artifacts: Artifacts
     inspector: Inspector
     packer: Packer

@@ -17,7 +17,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from service.errors import RefusedInputError, ServiceError, TooLargeError
-from service.files.blobs import BlobFolder, Receiver
+from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
@@ -115,7 +115,7 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
         yield bytes(block)
 
 
-async def receive(request: Request, blobs: BlobFolder, settings: ServiceSettings) -> Received:
+async def receive(request: Request, blobs: Blobs, settings: ServiceSettings) -> Received:
     """Read a multipart request to its end; its files are blobs when this returns.
 
     Raises:
@@ -160,7 +160,7 @@ async def _drain(blocks: AsyncIterator[bytes]) -> None:
 class _Form:
     """The parser's callbacks: which part is open, and where its bytes go."""
 
-    def __init__(self, boundary: bytes, blobs: BlobFolder, settings: ServiceSettings) -> None:
+    def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings) -> None:
         self.received = Received()
         self._blobs, self._settings = blobs, settings
         self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + 1

@@ -6,15 +6,13 @@ import asyncio
 import base64
 import contextlib
 import hashlib
-import os
 from collections.abc import Iterator
 
 from fastapi import Request
 
 from api.http.context import Context
 from api.http.multipart import BadRequestError, body_blocks
-from service.errors import NotFoundError, ServiceError, TooLargeError
-from service.files.blobs import write_all
+from service.errors import ServiceError, TooLargeError
 from service.store.tables import UploadRow
 
 #: Of digests that a part may be announced with.
@@ -55,7 +53,7 @@ def only_writer(upload_id: str) -> Iterator[None]:
 
 async def append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
     """Write the request's body behind what is there; returns when the upload expires now."""
-    writer = _Writer(context, row, wanted)
+    writer = await asyncio.to_thread(_Writer, context, row, wanted)
     try:
         async for block in body_blocks(request, context.settings):
             await asyncio.to_thread(writer.write, block)
@@ -74,21 +72,14 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
 
 
 class _Writer:
-    """The file of an unfinished upload, from the offset that the store knows on."""
+    """Checks what comes, and has it saved now and then."""
 
     def __init__(self, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> None:
         self._context, self._row, self._wanted = context, row, wanted
-        path = context.blobs.upload_path(row.id)
-        there = path.stat().st_size if path.exists() else 0
-        if there < row.offset:  # zeros would take the place of what is missing
-            raise NotFoundError(f"The bytes of upload {row.id} are gone. Begin a new one.")
-        self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
-        self._file.truncate(row.offset)  # a crash may have left more, of which nothing is known
-        self._file.seek(row.offset)
-        self._digest = hashlib.new(wanted[0]) if wanted else None
-        self._whole = context.blobs.digest_so_far(row.id, row.offset)
-        self._offset = self._saved = row.offset
         self._seconds = context.settings.upload_hours * 3600
+        self._part = context.blobs.append(row, self._seconds)
+        self._digest = hashlib.new(wanted[0]) if wanted else None
+        self._offset = self._saved = row.offset
 
     def write(self, block: bytes) -> None:
         if self._offset + len(block) > self._row.length:
@@ -96,10 +87,8 @@ class _Writer:
                 f"More bytes come than the {self._row.length:,} of Upload-Length.", limit=self._row.length
             )
         self._context.blobs.ensure_room(len(block))
-        write_all(self._file, block)
+        self._part.write(block)
         self._offset += len(block)
-        if self._whole is not None:
-            self._whole.update(block)
         if self._digest is not None:
             self._digest.update(block)
         elif self._offset - self._saved >= _SAVE_BYTES:
@@ -107,15 +96,13 @@ class _Writer:
 
     def save(self) -> float:
         """Make what has come durable, then tell the store."""
-        os.fsync(self._file.fileno())
         self._saved = self._offset
-        self._context.blobs.keep_digest(self._row.id, self._offset, self._whole)
-        return self._context.store.inputs.advance_upload(self._row.id, self._offset, self._seconds)
+        return self._part.save()
 
     def finish(self) -> float:
         """The request has ended: check it, save it, and where that was the last part make the file a blob."""
         if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
-            self._file.truncate(self._row.offset)
+            self._part.discard()
             raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
         expires = self.save()
         if self._offset == self._row.length:
@@ -123,7 +110,7 @@ class _Writer:
         return expires
 
     def close(self) -> None:
-        self._file.close()
+        self._part.close()
 
 
 def parse_checksum(header: str) -> tuple[str, bytes]:

@@ -16,6 +16,7 @@ from service.errors import (
     QueueFullError,
     RefusedInputError,
     ServiceError,
+    StoreError,
     TooLargeError,
 )
 from service.files.staging import MOST_STYLES
@@ -145,4 +146,5 @@ REFUSALS: tuple[ServiceError, ...] = (
     QueueFullError("There are 100 unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=100),
     BusyError("Too many files are being checked. Try again later.", retry_after=10),
     NoSpaceError("The service's disk is too full to take this in. Try again later."),
+    StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
 )

@@ -1,4 +1,4 @@
-"""Results: whole files under names of their own, in a local folder or an S3-compatible bucket (fsspec)."""
+"""Results: whole files under names of their own, in the store of files."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import fsspec
-from fsspec.implementations.local import LocalFileSystem
-
+from service.files.objects import ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 
@@ -32,10 +31,10 @@ class Artifacts:
     """Where results are. A name is never written twice: rows in the store point to what counts."""
 
     def __init__(self, url: str) -> None:
-        self._files, self._root = fsspec.core.url_to_fs(url)
-        self.local = isinstance(self._files, LocalFileSystem)
+        self.objects = ObjectStore(url)
+        self.local = self.objects.local
         if self.local:
-            self._files.makedirs(self._root, exist_ok=True)
+            self.objects.make_folder()
 
     def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:
         """Bring a file in; it is durable and whole when this returns, and visible once its row is in the store.
@@ -46,10 +45,11 @@ class Artifacts:
         """
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
         if not self.local:
-            size, sha256 = _digest(source)
-            self._files.put_file(str(source), f"{self._root}/{location}")
+            with _held(source) as held:
+                size, sha256 = _digest(held)
+                self.objects.put(held, location)
             return Published(name, location, size, sha256)
-        target = Path(self._root, location)
+        target = Path(self.objects.root, location)
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(target) as temporary:
             if not (final and _linked(source, temporary)):
@@ -59,34 +59,20 @@ class Artifacts:
 
     def read(self, location: str, start: int, stop: int) -> Iterator[bytes]:
         """The bytes from `start` up to `stop`, in pieces."""
-        with self._files.open(f"{self._root}/{location}", "rb") as file:
-            file.seek(start)
-            left = stop - start
-            while left > 0:
-                data = file.read(min(_CHUNK, left))
-                if not data:
-                    raise OSError(f"{location}: is shorter than its row says")
-                left -= len(data)
-                yield data
+        return self.objects.read(location, start, stop)
 
     def fetch(self, location: str, target: Path) -> None:
         """Copy a result to a local file; it appears whole or not at all."""
         with atomic_path(target) as temporary:
-            self._files.get_file(f"{self._root}/{location}", str(temporary))
+            self.objects.get(location, temporary)
 
     def remove(self, location: str) -> None:
         """Remove one file, where it is still there."""
-        try:
-            self._files.rm_file(f"{self._root}/{location}")
-        except FileNotFoundError:
-            return
+        self.objects.remove(location)
 
     def remove_job(self, job_id: str) -> None:
         """Remove all files of a job."""
-        try:
-            self._files.rm(f"{self._root}/{job_id}", recursive=True)
-        except FileNotFoundError:
-            return
+        self.objects.remove_below(job_id)
 
     def sweep(self, job_id: str, epoch: int, kept: set[str]) -> None:
         """Remove a job's files that no row refers to: those of attempts that were cut off.
@@ -95,20 +81,14 @@ class Artifacts:
             epoch: of the last lease whose files are looked at; a later one's may still be without their rows.
             kept: locations that rows refer to.
         """
-        top = f"{self._root}/{job_id}"
-        for path in self._files.find(top):
-            below = path.rsplit(f"/{job_id}/", 1)[-1]
-            location = f"{job_id}/{below}"
+        for location in self.objects.below(job_id):
+            below = location.partition("/")[2]
             if location not in kept and int(below.partition("/")[0]) <= epoch:
                 self.remove(location)
 
     def ping(self) -> None:
-        """Prove that the place can be reached; raises OSError, or what fsspec raises."""
-        # a prefix of a bucket is nothing that could be there before something is in it
-        place = self._root if self.local else self._root.partition("/")[0]
-        self._files.invalidate_cache()
-        if not self._files.exists(place):
-            raise FileNotFoundError(f"The results' place {place!r} is not there, or cannot be reached.")
+        """Prove that the place can be reached; raises OSError or StoreError."""
+        self.objects.ping()
 
 
 def media_type(name: str) -> str:
@@ -126,6 +106,23 @@ def _linked(source: Path, target: Path) -> bool:
             raise
         return False
     return True
+
+
+@contextmanager
+def _held(source: Path) -> Iterator[Path]:
+    """One more name for a file as it is now: whoever replaces it meanwhile changes nothing of what is sent."""
+    held = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
+    try:
+        os.link(source, held)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        yield source
+        return
+    try:
+        yield held
+    finally:
+        held.unlink(missing_ok=True)
 
 
 def _digest(path: Path) -> tuple[int, str]:

@@ -173,18 +173,17 @@ def _check_camera_files(names: Sequence[str]) -> None:
         )
 
 
-def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str, Path]) -> Staged:
-    """Link a job's inputs into a folder.
+def layout(inputs: Sequence[Mapping[str, Any]]) -> tuple[Staged, list[tuple[Path, str]]]:
+    """Where a job's inputs belong: the paths by role, and the path of each file with the file's SHA-256.
 
     Args:
-        folder: which exists.
         inputs: `role`, `name` (from `clean_name`) and `sha256` of each.
-        blobs: the files by digest.
     """
     scene = Path()
     styles: list[Path] = []
     cameras: list[str] = []
     photos = False
+    files = []
     for entry in inputs:
         role, name = entry["role"], entry["name"]
         if role == "scene":
@@ -198,11 +197,25 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
         else:
             path = Path("photos", name)
             photos = True
+        files.append((path, entry["sha256"]))
+    return Staged(scene, tuple(styles), _camera_path(cameras), Path("photos") if photos else None), files
+
+
+def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str, Path]) -> Staged:
+    """Link a job's inputs into a folder.
+
+    Args:
+        folder: which exists.
+        inputs: as for `layout`.
+        blobs: the files by digest.
+    """
+    staged, files = layout(inputs)
+    for path, sha256 in files:
         link = folder / path
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
-        link.symlink_to(blobs[entry["sha256"]])
-    return Staged(scene, tuple(styles), _camera_path(cameras), Path("photos") if photos else None)
+        link.symlink_to(blobs[sha256])
+    return staged
 
 
 def _camera_path(names: Sequence[str]) -> Path | None:

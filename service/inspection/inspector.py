@@ -18,10 +18,12 @@ from typing import Any, Literal
 import psutil
 
 from service.errors import BusyError, RefusedInputError
+from service.files.blobs import Blobs
 from service.files.staging import stage
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
+from service.store.tables import BlobRow
 
 #: What is wanted of the inspecting process: prove that a job's inputs can be used, or plan the job as well.
 Work = Literal["validate", "plan"]
@@ -133,9 +135,9 @@ class InspectionProcess:
 class Inspector:
     """Validates and plans whole jobs, once for the same files and parameters."""
 
-    def __init__(self, settings: ServiceSettings, store: Store) -> None:
+    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs) -> None:
         self._settings = settings
-        self._store = store
+        self._store, self._blobs = store, blobs
         self._validating, self._validating_large = InspectionProcess(), InspectionProcess()
         self._planning = InspectionProcess(_threads_of_a_job(settings))
         self._folder = settings.folder / "inspections"
@@ -165,7 +167,7 @@ class Inspector:
         self,
         work: Work,
         inputs: Sequence[Mapping[str, Any]],
-        blobs: Mapping[str, Path],
+        rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show = lambda now: None,
     ) -> dict[str, Any]:
@@ -174,7 +176,7 @@ class Inspector:
         Args:
             work: "plan" for what has been validated.
             inputs: `role`, `name`, `sha256` and `size` of each file.
-            blobs: the files by digest.
+            rows: the files by digest.
             parameters: of the job.
             show: told `step`, `total`, `fraction` and `eta_s` of a plan; its steps are views.
 
@@ -185,7 +187,7 @@ class Inspector:
         recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
         if recalled is not None:
             return recalled
-        answer = await self._ask_process(work, inputs, blobs, parameters, show)
+        answer = await self._ask_process(work, inputs, rows, parameters, show)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
         if not passing:  # another day it may be otherwise
             key = self._key(work, inputs, parameters)
@@ -196,7 +198,7 @@ class Inspector:
         self,
         work: Work,
         inputs: Sequence[Mapping[str, Any]],
-        blobs: Mapping[str, Path],
+        rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show,
     ) -> dict[str, Any]:
@@ -206,7 +208,8 @@ class Inspector:
         )
         seconds = await asyncio.to_thread(self._seconds, work, size, inputs, parameters)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
-            staged = await asyncio.to_thread(stage, Path(folder), inputs, blobs)
+            paths = await asyncio.to_thread(self._blobs.bring, rows, Path(folder))
+            staged = await asyncio.to_thread(stage, Path(folder), inputs, paths)
             request = {
                 "work": work,
                 "folder": folder,

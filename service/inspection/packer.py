@@ -16,7 +16,7 @@ from typing import Any
 
 from service.errors import NotFoundError
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder
+from service.files.blobs import Blobs
 from service.files.names import RESULT
 from service.files.staging import Staged, stage
 from service.inspection.inspector import LEFT_SECONDS, MEMORY_PER_BYTE, InspectionProcess, found_or_refused
@@ -35,7 +35,7 @@ _SECONDS_PER_BYTE = 600 / 1e9
 class Packer:
     """Makes packed results, one after the other; those who ask for the same wait for the same."""
 
-    def __init__(self, settings: ServiceSettings, store: Store, blobs: BlobFolder, artifacts: Artifacts) -> None:
+    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
         self._process = InspectionProcess()
         self._making: dict[tuple[str, str], asyncio.Task[None]] = {}
@@ -90,7 +90,7 @@ class Packer:
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
         """The job's inputs, and the result in the scene's place."""
         rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
-        staged = stage(folder, job.inputs, {sha256: self._blobs.path(row.location) for sha256, row in rows.items()})
+        staged = stage(folder, job.inputs, self._blobs.bring(rows, folder))
         self._artifacts.fetch(result.location, folder / RESULT)
         return replace(staged, scene=Path(RESULT))
 

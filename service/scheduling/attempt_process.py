@@ -17,10 +17,12 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from service.files.staging import Staged
 from service.parameters import JobParameters
+from service.scheduling.endings import OUTAGE, is_outage
+from service.scheduling.messages import Message
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
@@ -35,23 +37,6 @@ if TYPE_CHECKING:
 _NICENESS = 5
 #: Of previews, in the attempt's folder.
 _PREVIEWS = Path("out", "previews")
-
-
-class Message(TypedDict, total=False):
-    """What the process tells: `kind` and what belongs to it."""
-
-    kind: Literal["stage", "prepared", "left-out", "progress", "preview", "done", "interrupted", "failed"]
-    stage: str
-    step: int
-    total: int
-    loss: float
-    seconds: float
-    seconds_left: float | None
-    path: str
-    gpus: list[str]
-    result: dict[str, Any]
-    error: dict[str, Any]
-    permanent: bool
 
 
 @dataclass(frozen=True)
@@ -102,7 +87,10 @@ class AttemptProcess:
             result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
         except Exception as error:
             tell(failure(error))
-            traceback.print_exc()
+            if is_outage(error):
+                log(OUTAGE["message"])  # what is known of it is the operator's
+            else:
+                traceback.print_exc()
             return
         if result is None or result.stopped == "interrupted":
             tell({"kind": "interrupted"})
@@ -223,13 +211,16 @@ def summary(result: Result) -> dict[str, Any]:
 
 def failure(error: Exception) -> Message:
     """An error as it is told: whether the same would happen again decides whether the job is tried again."""
-    from sgsst_core.errors import DivergedError, InvalidInputError, OutputError, SgsstError
+    from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError
 
+    if is_outage(error):
+        detail = "".join(traceback.format_exception(error))
+        return {"kind": "failed", "error": OUTAGE, "permanent": False, "detail": detail}
     code = error.code if isinstance(error, SgsstError) else "out-of-memory" if _out_of_memory(error) else "internal"
     message = (
         str(error) if isinstance(error, SgsstError) or _out_of_memory(error) else f"{type(error).__name__}: {error}"
     )
-    permanent = isinstance(error, InvalidInputError | DivergedError) and not isinstance(error, OutputError)
+    permanent = isinstance(error, InvalidInputError | DivergedError)
     return {"kind": "failed", "error": {"code": code, "message": message}, "permanent": permanent}
 
 

@@ -20,7 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder
+from service.files.stored_blobs import open_blobs
 from service.logs import set_up
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
@@ -54,7 +54,7 @@ class Dispatcher:
     def __init__(self, settings: ServiceSettings, store: Store, machine: Machine | None = None) -> None:
         self._settings, self._store = settings, store
         self._artifacts = Artifacts(settings.artifacts_url)
-        self._blobs = BlobFolder(settings.folder, store.inputs, settings.min_free_bytes)
+        self._blobs = open_blobs(settings, store.inputs, self._artifacts)
         self._machine = machine or Machine.find(settings)
         self._room = Room(self._machine, settings.parallel_jobs)
         self._running: dict[str, RunningAttempt] = {}

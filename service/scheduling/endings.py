@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from service.scheduling.attempt_process import Message
+from service.scheduling.messages import Message
 from service.store.states import AttemptOutcome
+from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
 
 
 class Wish(StrEnum):
@@ -22,6 +24,26 @@ class Wish(StrEnum):
     ABANDON = "abandon"
 
 
+#: What a job's user is told where a machine, a network or the store of files has failed.
+OUTAGE = {
+    "code": InfrastructureError.code,
+    "message": "A machine of the service, its network or its store of files has failed. The job is tried again by itself.",
+}
+#: What the system says when the fault is a machine's: a full, broken or read-only disk, a file system that is away.
+_MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.ENOTCONN, errno.ENODEV)
+
+
+def is_outage(error: BaseException) -> bool:
+    """Whether an error is that of a machine, a network or a store: nothing is wrong with the job.
+
+    What cannot be written is, since jobs write to folders of the service; so are networks that are not installed, which
+    nothing but an operator can change.
+    """
+    if isinstance(error, OSError):
+        return error.errno in _MACHINE_ERRORS
+    return isinstance(error, InfrastructureError | OutputError | WeightsError)
+
+
 @dataclass(frozen=True)
 class Ending:
     """How an attempt has ended.
@@ -30,11 +52,13 @@ class Ending:
         outcome: for its record; SUCCEEDED, CANCELED, RELEASED or FAILED.
         error: of a failure: `code`, `message` and what else there is to know.
         permanent: another attempt would fail the same way.
+        detail: of a failure, for the operator alone.
     """
 
     outcome: AttemptOutcome
     error: dict[str, Any] | None = None
     permanent: bool = False
+    detail: str | None = None
 
 
 def attempt_ending(
@@ -58,7 +82,7 @@ def attempt_ending(
     if wish == Wish.RELEASE:
         return Ending(AttemptOutcome.RELEASED)
     if last is not None and last["kind"] == "failed":
-        return Ending(AttemptOutcome.FAILED, last["error"], last["permanent"])
+        return Ending(AttemptOutcome.FAILED, last["error"], last["permanent"], last.get("detail"))
     return Ending(AttemptOutcome.FAILED, _crash_error(exit_code, log_tail))
 
 

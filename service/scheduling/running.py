@@ -19,12 +19,13 @@ from typing import Any
 
 from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder
+from service.files.blobs import Blobs
 from service.files.names import CHECKPOINT, RESULT
 from service.files.staging import stage
 from service.parameters import JobParameters, stored_parameters
-from service.scheduling.attempt_process import Message, Task
-from service.scheduling.endings import Ending, Wish, attempt_ending
+from service.scheduling.attempt_process import Task
+from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
+from service.scheduling.messages import Message
 from service.scheduling.packing import Grant
 from service.scheduling.publishing import Publisher
 from service.settings import ServiceSettings
@@ -52,7 +53,7 @@ class RunningAttempt:
         grant: Grant,
         folder: Path,
         store: Store,
-        blobs: BlobFolder,
+        blobs: Blobs,
         artifacts: Artifacts,
         settings: ServiceSettings,
         cluster: bool,
@@ -103,8 +104,9 @@ class RunningAttempt:
             _log.warning("the lease was lost: another dispatcher has the job", extra=self._log_fields)
         except Exception as error:
             _log.exception("the attempt broke", extra=self._log_fields)
+            told = {"code": "internal", "message": f"{type(error).__name__}: {error}"}
             with contextlib.suppress(Exception):
-                self._fail({"code": "internal", "message": f"{type(error).__name__}: {error}"}, permanent=False)
+                self._fail(OUTAGE if is_outage(error) else told, permanent=False)
         finally:
             self._kill()
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -135,7 +137,7 @@ class RunningAttempt:
     def _conclude(self, ending: Ending, result: dict[str, Any]) -> None:
         """Write an attempt's end into the store."""
         if ending.outcome == AttemptOutcome.SUCCEEDED:
-            self._publisher.succeed(result)
+            self._publisher.succeed(result, lambda: self._wish == Wish.ABANDON)
             self._publisher.sweep()
         elif ending.outcome == AttemptOutcome.CANCELED:
             self._store.leases.stop(self.lease)
@@ -143,6 +145,10 @@ class RunningAttempt:
         elif ending.outcome == AttemptOutcome.RELEASED:
             self._store.leases.release(self.lease)
         else:
+            if ending.detail:
+                _log.error(
+                    "a machine, a network or the store of files has failed:\n%s", ending.detail, extra=self._log_fields
+                )
             self._fail(ending.error or {}, permanent=ending.permanent)
             return
         _log.info(ending.outcome, extra=self._log_fields)
@@ -152,9 +158,7 @@ class RunningAttempt:
         self._folder.mkdir(parents=True)
         digests = sorted({entry["sha256"] for entry in job.inputs})
         rows = self._store.inputs.blobs(digests)
-        staged = stage(
-            self._folder, job.inputs, {sha256: self._blobs.path(row.location) for sha256, row in rows.items()}
-        )
+        staged = stage(self._folder, job.inputs, self._blobs.bring(rows, self._folder))
         out = self._folder / "out"
         out.mkdir()
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)

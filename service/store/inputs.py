@@ -8,9 +8,9 @@ from typing import Any
 
 from sqlalchemy import bindparam, delete, exists, select, update
 
-from service.errors import NotFoundError
+from service.errors import ConflictError, NotFoundError
 from service.store.database import Database, idempotency_row, new_id, upsert
-from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadRow
+from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
 GRACE_SECONDS = 3600.0
@@ -146,6 +146,34 @@ class Inputs:
             row.offset, row.expires_at = offset, expires
         return expires
 
+    def add_part(self, upload_id: str, start: int, size: int, location: str, seconds: float) -> float:
+        """Record bytes of an upload that are in the store of files; returns when the upload expires now.
+
+        Raises:
+            ConflictError: the next byte is another one by now: somebody else was faster.
+        """
+        expires = self._database.clock() + seconds
+        with self._database.writing() as session:
+            row = session.get(UploadRow, upload_id, with_for_update=True)
+            if row is None:
+                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+            if row.offset != start:
+                raise ConflictError(f"Upload-Offset is {start}, but the next byte is {row.offset}.", offset=row.offset)
+            session.add(UploadPartRow(upload_id=upload_id, start=start, size=size, location=location))
+            row.offset, row.expires_at = start + size, expires
+        return expires
+
+    def parts(self, upload_id: str) -> list[UploadPartRow]:
+        """Where the bytes of an unfinished upload are, in their order."""
+        query = select(UploadPartRow).where(UploadPartRow.upload_id == upload_id).order_by(UploadPartRow.start)
+        with self._database.reading() as session:
+            return list(session.scalars(query))
+
+    def known_uploads(self, upload_ids: Sequence[str]) -> set[str]:
+        """Those of some uploads that are there, finished or not."""
+        with self._database.reading() as session:
+            return set(session.scalars(select(UploadRow.id).where(UploadRow.id.in_(upload_ids))))
+
     def finish_upload(self, upload_id: str, sha256: str, seconds: float) -> None:
         """Tie an upload to the blob that its bytes have become."""
         with self._database.writing() as session:
@@ -153,6 +181,7 @@ class Inputs:
             if row is None:
                 raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
             row.offset, row.sha256, row.expires_at = row.length, sha256, self._database.clock() + seconds
+            session.execute(delete(UploadPartRow).where(UploadPartRow.upload_id == upload_id))
             use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
             session.execute(use.on_conflict_do_nothing())
 

@@ -20,9 +20,12 @@ from service.store.database import Database, count, upsert
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, TurnRow
+from sgsst_core.errors import InfrastructureError
 
 #: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
 KEPT_PROGRESS = 200
+#: Attempts that are looked back at for how long to wait: by then the wait is as long as it gets.
+_OUTAGES = 20
 
 
 @dataclass(frozen=True)
@@ -211,6 +214,8 @@ class Leases:
     def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
         """End an attempt that failed: the job is queued again after a wait, or has failed for good (`retries`).
 
+        An error with the code of `InfrastructureError` is never for good.
+
         Args:
             lease: of the job.
             error: `code` and `message`.
@@ -274,10 +279,11 @@ class Leases:
     ) -> Verdict:
         """Close an attempt, and count it where it failed; returns what is to become of the job."""
         _close_attempt(session, job, outcome, error, now)
-        before = FailureCount(job.failures, job.failed_step)
-        verdict = self._policy.after_attempt(
-            outcome, JobStatus(job.status), before, job.saved_step, permanent=permanent
-        )
+        before, status = FailureCount(job.failures, job.failed_step), JobStatus(job.status)
+        if error is not None and error["code"] == InfrastructureError.code:
+            verdict = self._policy.after_outage(status, before, _outages(session, job))
+        else:
+            verdict = self._policy.after_attempt(outcome, status, before, job.saved_step, permanent=permanent)
         job.failures, job.failed_step = verdict.count.failures, verdict.count.failed_step
         return verdict
 
@@ -327,6 +333,17 @@ def _publish(session: Session, job: JobRow, files: Sequence[Published], now: flo
             data = {"name": file.name, "size": file.size, "sha256": file.sha256}
             add_event(session, job.id, "artifact", data, now)
     return unused
+
+
+def _outages(session: Session, job: JobRow) -> int:
+    """How many of the last attempts, one after the other, ended because of a machine, a network or the store of files."""
+    query = select(AttemptRow.error).where(AttemptRow.job_id == job.id).order_by(AttemptRow.number.desc())
+    count = 0
+    for error in session.scalars(query.limit(_OUTAGES)):
+        if not error or error["code"] != InfrastructureError.code:
+            break
+        count += 1
+    return count
 
 
 def _close_attempt(

@@ -88,7 +88,21 @@ class RetryPolicy:
         if permanent or count.failures >= self.max_attempts:
             return Verdict(Transition.FAIL, count)
         # who was lost has been waited for already, for as long as a lease
-        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(count))
+        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(count.failures))
 
-    def _wait(self, count: FailureCount) -> float:
-        return min(self.retry_seconds * 2.0 ** max(count.failures - 1, 0), MAX_RETRY_SECONDS)
+    def after_outage(self, status: JobStatus, count: FailureCount, outages: int) -> Verdict:
+        """What to do after an attempt that failed for a machine, a network or the store of files.
+
+        That is no failure of the job: it is tried again, with longer and longer waits, until it goes or is canceled.
+
+        Args:
+            status: of the job while the attempt ran.
+            count: before this attempt; it stays.
+            outages: attempts in a row that ended so, this one included.
+        """
+        if status == JobStatus.CANCELING:
+            return Verdict(Transition.STOP, count)
+        return Verdict(Transition.REQUEUE, count, self._wait(outages))
+
+    def _wait(self, times: int) -> float:
+        return min(self.retry_seconds * 2.0 ** max(times - 1, 0), MAX_RETRY_SECONDS)

@@ -133,7 +133,7 @@ class ArtifactRow(Base):
 
 
 class BlobRow(Base):
-    """The content of an input, once for all who use it; `location` is the file's name in the blob folder."""
+    """The content of an input, once for all who use it; `location` is the file's name among the blobs."""
 
     __tablename__ = "blobs"
 
@@ -166,6 +166,17 @@ class UploadRow(Base):
     sha256: Mapped[str | None] = mapped_column(String(64))
     created_at: Mapped[float] = mapped_column(Float)
     expires_at: Mapped[float] = mapped_column(Float, index=True)
+
+
+class UploadPartRow(Base):
+    """Bytes of an unfinished upload that are in the store of files as an object of their own."""
+
+    __tablename__ = "upload_parts"
+
+    upload_id: Mapped[str] = mapped_column(ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True)
+    start: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    size: Mapped[int] = mapped_column(BigInteger)
+    location: Mapped[str] = mapped_column(Text)
 
 
 class KeyRow(Base):

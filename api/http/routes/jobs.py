@@ -8,7 +8,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
@@ -33,7 +32,7 @@ from service.files.staging import check_roles, clean_name, region_styles
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
-from service.store.tables import JobRow, UploadRow
+from service.store.tables import BlobRow, JobRow, UploadRow
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 #: Bytes of a JSON body, which only names uploads.
@@ -93,9 +92,9 @@ async def create_job(
     parts = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
     wanted = await asyncio.to_thread(_find_files, context, caller, parts)
     if not wanted.checked:
-        await context.inspector.inspect("validate", wanted.inputs, wanted.paths, wanted.parameters)
+        await context.inspector.inspect("validate", wanted.inputs, wanted.rows, wanted.parameters)
     if dry_run:
-        plan = partial(context.inspector.inspect, "plan", wanted.inputs, wanted.paths, wanted.parameters)
+        plan = partial(context.inspector.inspect, "plan", wanted.inputs, wanted.rows, wanted.parameters)
         return await answer_plan(request, plan, wanted.parameters.workers)
     return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key)
 
@@ -106,12 +105,12 @@ class _JobRequest:
 
     Attributes:
         inputs: `role`, `name`, `sha256`, `size` of each file.
-        paths: the files by digest.
+        rows: the files by digest.
         checked: the same files have been inspected before, and can be used.
     """
 
     inputs: list[dict[str, Any]]
-    paths: dict[str, FilePath]
+    rows: dict[str, BlobRow]
     parameters: JobParameters
     webhook: str | None
     checked: bool
@@ -123,16 +122,17 @@ Parts = tuple[Received, JobParameters, str | None]
 def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     """Find the files of a job, and prove what can be proved without the inspecting process."""
     received, parameters, webhook = parts
-    inputs, paths = _resolve_inputs(context, caller, received)
+    inputs, rows = _resolve_inputs(context, caller, received)
     styles = region_styles(parameters.region_requests)
     check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, of_regions=styles)
     if webhook:
         check_url(webhook, context.settings)
     checked = context.inspector.recall("validate", inputs, parameters) is not None
     if not checked:
-        for entry in inputs:
-            check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
-    return _JobRequest(inputs, paths, parameters, webhook, checked)
+        with context.blobs.lent(rows) as paths:
+            for entry in inputs:
+                check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
+    return _JobRequest(inputs, rows, parameters, webhook, checked)
 
 
 def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None) -> Response:
@@ -182,8 +182,8 @@ async def _from_json(request: Request, context: Context) -> Parts:
 
 def _resolve_inputs(
     context: Context, caller: Caller, received: Received
-) -> tuple[list[dict[str, Any]], dict[str, FilePath]]:
-    """All files of a job, those that came with it and those that were uploaded before, and where they are by digest.
+) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
+    """All files of a job, those that came with it and those that were uploaded before, and their rows by digest.
     They stay for now.
     """
     inputs = list(received.files)
@@ -204,7 +204,7 @@ def _resolve_inputs(
         name = clean_name(role, uploads[upload_id].filename, number)
         # in the order in which they came: that of styles is that of their weights
         inputs.insert(place, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
-    return inputs, {sha256: context.blobs.path(row.location) for sha256, row in rows.items()}
+    return inputs, rows
 
 
 def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:

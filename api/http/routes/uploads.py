@@ -22,6 +22,7 @@ from service.errors import (
     NoSpaceError,
     NotFoundError,
     ServiceError,
+    StoreError,
     TooLargeError,
 )
 from service.files.staging import clean_name
@@ -154,7 +155,7 @@ def create_upload(
     name = clean_name("photos", _file_name(metadata), 0)[-200:]
     seconds = context.settings.upload_hours * 3600
     row = context.store.inputs.create_upload(caller.owner, length, name, metadata, seconds, idempotency_key)
-    context.blobs.upload_path(row.id).touch()
+    context.blobs.begin_upload(row.id)
     sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
 
@@ -231,6 +232,7 @@ _PATCH_BODY = {
             LockedError("Another request is writing to this upload. Ask for its offset, and go on from there."),
             ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again."),
             NoSpaceError("The service's disk is too full to take this in. Try again later."),
+            StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
         ),
     },
     operation_id="append_upload",
@@ -293,7 +295,7 @@ def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -
     """Give an upload up, or let go of a finished one; jobs that use it keep their file."""
     _find_upload(context, caller.owner, upload_id)
     context.store.inputs.delete_upload(upload_id, caller.owner)
-    context.blobs.upload_path(upload_id).unlink(missing_ok=True)
+    context.blobs.forget_upload(upload_id)
     return Response(status_code=204, headers=_HEADERS)
 
 

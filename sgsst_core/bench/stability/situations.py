@@ -179,5 +179,6 @@ def _evaluate(
         style_scale=settings.style_scale,
         scales=job.loss.weights,
     )
-    targets = loss.style_targets(job.style.to(network.dtype), (picture.shape[0], picture.shape[1]))
+    style = job.style.map(lambda own: own.to(network.dtype))
+    targets = loss.style_targets(style, (picture.shape[0], picture.shape[1]))
     return loss.evaluate(picture.to(network.dtype), targets, loss.view_target(content.to(network.dtype), coverage))

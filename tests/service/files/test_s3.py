@@ -13,6 +13,7 @@ import pytest
 
 from service.files.artifacts import Artifacts
 from tests.api.service import Service, undisturbed, wait_for
+from tests.service.files.s3 import environment_of, s3_server
 from tests.small_scenes import wall, write_files
 
 #: More than one part of a multipart upload would hold, and no round number.
@@ -21,25 +22,14 @@ SIZE = 6 * (1 << 20) + 17
 
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
-    """URL of a server that speaks S3."""
-    server_module = pytest.importorskip("moto.server", reason="moto's server is not installed: see the extra [dev]")
-    pytest.importorskip("s3fs", reason="s3fs is not installed: see the extra [s3]")
-    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
+    with s3_server() as url:
+        yield url
 
 
 @pytest.fixture(scope="module")
 def environment(endpoint: str) -> Iterator[dict[str, str]]:
-    """What tells clients of S3 where it is, and who they are; a bucket named `results` is there."""
-    values = {
-        "AWS_ENDPOINT_URL": endpoint,
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
+    """What tells clients of S3 where it is; a bucket named `results` is there."""
+    values = environment_of(endpoint)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in values.items():
             patch.setenv(name, value)
@@ -143,7 +133,8 @@ def test_a_job_whose_results_are_in_a_bucket(environment: dict[str, str], tmp_pa
         tail = client.get(f"{where}/artifacts/stylized.ply", headers={"Range": "bytes=-100"})
         assert (tail.status_code, tail.content) == (206, expected[-100:])
         assert not (service.data / "artifacts").exists()
+        assert not (service.data / "blobs").exists(), "inputs are there, too"
         assert client.delete(where).status_code == 204
         assert client.get(f"{where}/artifacts/stylized.ply").status_code == 404
-    listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/"})
+    listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/job_"})
     assert "<Key>" not in listing.text

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from service.errors import RefusedInputError
+from service.files.blobs import BlobFolder
 from service.inspection.inspector import Inspector
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
@@ -22,17 +23,20 @@ from tests.small_scenes import wall, write_files
 def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
     """What validation finds, with these limits of the settings."""
     settings = ServiceSettings(data=folder / "data", **limits)
-    blobs = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
+    digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
     inputs = [
-        {"role": role, "name": path.name, "sha256": blobs[role], "size": path.stat().st_size}
+        {"role": role, "name": path.name, "sha256": digests[role], "size": path.stat().st_size}
         for role, path in files.items()
     ]
 
     async def ask() -> dict[str, Any]:
-        inspector = Inspector(settings, store)
+        blobs = BlobFolder(settings.folder, store.inputs, 0)
+        for role, path in files.items():
+            blobs.keep(path, digests[role], path.stat().st_size, leave=True)
+        inspector = Inspector(settings, store, blobs)
         try:
-            paths = {blobs[role]: path for role, path in files.items()}
-            return await inspector.inspect("validate", inputs, paths, JobParameters(backbone="auto"))
+            rows = store.inputs.blobs(sorted(digests.values()))
+            return await inspector.inspect("validate", inputs, rows, JobParameters(backbone="auto"))
         finally:
             await inspector.close()
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 from typing import Any
 
 import pytest
 
-from service.scheduling.attempt_process import Message
-from service.scheduling.endings import Ending, Wish, attempt_ending
+from service.errors import NoSpaceError, StoreError
+from service.scheduling.attempt_process import failure
+from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
+from service.scheduling.messages import Message
 from service.store.states import AttemptOutcome
+from sgsst_core.errors import ImageError, InfrastructureError, OutputError, RanksFailedError, WeightsError
 
 DONE: Message = {"kind": "done", "result": {"steps": 3}}
 INTERRUPTED: Message = {"kind": "interrupted"}
@@ -64,3 +68,27 @@ def test_a_process_without_a_last_word_has_crashed(last: Message | None, code: i
     assert (error["code"], error["log"]) == ("crashed", "the log")
     assert told in error["message"]
     assert "log" not in (ending(None, last, code, None).error or {})
+
+
+@pytest.mark.parametrize(
+    ("error", "outage"),
+    [
+        (StoreError("The store of files does not answer."), True),
+        (NoSpaceError("The disk is full."), True),
+        (OutputError("out/stylized.ply: cannot be written: No space left on device."), True),
+        (WeightsError("no VGG weights in /root/.cache/sgsst"), True),
+        (InfrastructureError("The folder is not on this machine."), True),
+        (OSError(errno.ENOSPC, "No space left on device"), True),
+        (OSError(errno.EINVAL, "Invalid argument"), False),
+        (ImageError("style.png: is not an image"), False),
+        (RanksFailedError("3 attempts in a row came no further than step 0."), False),
+    ],
+)
+def test_a_machines_failure_is_not_told_as_the_users(error: Exception, outage: bool) -> None:
+    assert is_outage(error) == outage
+    told = failure(error)
+    assert (told["error"] == OUTAGE) == outage
+    assert (str(error) in told.get("detail", "")) == outage, "for the operator"
+    found = ending(None, told)
+    assert (found.outcome, found.detail) == (AttemptOutcome.FAILED, told.get("detail"))
+    assert not (outage and found.permanent)

@@ -84,3 +84,15 @@ def test_every_verdict_is_a_way_that_there_is(status: JobStatus, outcome: Attemp
         count = FailureCount(failures, None)
         verdict = POLICY.after_attempt(outcome, status, count, None, permanent=permanent)
         assert status in TRANSITIONS[verdict.transition]
+
+
+def test_an_outage_is_waited_out_and_counts_as_no_failure() -> None:
+    count = FailureCount(2, 10)
+    waits = []
+    for outages in range(1, 12):
+        verdict = POLICY.after_outage(JobStatus.RUNNING, count, outages)
+        assert (verdict.transition, verdict.count) == (Transition.REQUEUE, count)
+        waits.append(verdict.wait)
+    assert waits[:3] == [POLICY.retry_seconds * factor for factor in (1, 2, 4)]
+    assert waits[-1] == MAX_RETRY_SECONDS
+    assert POLICY.after_outage(JobStatus.CANCELING, count, 1).transition == Transition.STOP

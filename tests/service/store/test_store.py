@@ -287,6 +287,25 @@ def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> No
     assert store.jobs.get(job_id, "local").status == "failed"
 
 
+def test_an_outage_is_waited_out_however_long_it_takes(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    outage, error = {"code": "infrastructure", "message": "x"}, {"code": "x", "message": "x"}
+    assert store.leases.fail(lease(store), error, permanent=False)
+    clock.now += RETRY + 0.1
+    for outages in range(2 * ATTEMPTS):
+        assert store.leases.fail(lease(store), outage, permanent=False)
+        wait = RETRY * 2**outages
+        clock.now += wait - 0.1
+        assert store.leases.take("one") is None, "the wait doubles with each"
+        clock.now += 0.2
+    assert store.leases.fail(lease(store), error, permanent=False), "outages do not count"
+    clock.now += 2 * RETRY + 0.1
+    assert store.leases.fail(lease(store), outage, permanent=False)
+    clock.now += RETRY + 0.1
+    assert not store.leases.fail(lease(store), error, permanent=False)
+    assert store.jobs.get(job_id, "local").status == "failed"
+
+
 def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False) -> bool:
     """An attempt that saves a step and fails; whether the job is tried again."""
     clock.now += 1000

@@ -1,0 +1,192 @@
+"""The store of files behind an fsspec URL: a local folder, an S3-compatible bucket, or what else fsspec knows.
+
+Only whole objects: a name is written once, by one writer. What goes wrong with a remote store that is away, slow or
+broken is raised as `StoreError`; a local folder's errors are the system's own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+from service.errors import StoreError
+
+#: Of S3: seconds to connect and for an answer, and tries. What answers 503 (SlowDown) is asked again after waits that
+#: double, by the client itself; together a store that is away is given up after half a minute.
+_CONNECT_SECONDS, _ANSWER_SECONDS = 3.0, 30.0
+_CLIENT_TRIES, _TRIES = 4, 2
+#: What S3 takes as a part of an object but for the last one, and how many of them.
+MIN_PART_BYTES, _MAX_PARTS = 5 << 20, 10_000
+_CHUNK = 1 << 20
+
+
+class TruncatedError(OSError):
+    """An object has fewer bytes than it should."""
+
+
+class ObjectStore:
+    """Objects below a URL, by names relative to it."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self._files, self.root = fsspec.core.url_to_fs(url, **_options(url))
+        self.local = isinstance(self._files, LocalFileSystem)
+        self._s3 = "s3" in self._protocols()
+        if self._s3:
+            self._files.retries = _TRIES
+
+    def _protocols(self) -> tuple[str, ...]:
+        found = self._files.protocol
+        return (found,) if isinstance(found, str) else tuple(found)
+
+    def put(self, source: Path, name: str) -> None:
+        """Bring a file in that nobody writes to; it is there as a whole or not at all."""
+        with self._told(name):
+            self._files.put_file(str(source), self._path(name))
+
+    def get(self, name: str, target: Path) -> None:
+        """Copy an object to a local file.
+
+        Raises:
+            FileNotFoundError: there is none of that name.
+        """
+        with self._told(name):
+            self._files.get_file(self._path(name), str(target))
+
+    def read(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+        """The bytes from `start` up to `stop`, in pieces.
+
+        Raises:
+            FileNotFoundError: there is none of that name.
+            TruncatedError: it has fewer.
+        """
+        with self._told(name), self._files.open(self._path(name), "rb") as file:
+            file.seek(start)
+            left = stop - start
+            while left > 0:
+                data = file.read(min(_CHUNK, left))
+                if not data:
+                    raise TruncatedError(f"{name}: is shorter than its row says")
+                left -= len(data)
+                yield data
+
+    def exists(self, name: str) -> bool:
+        """Whether there is an object of that name, now."""
+        with self._told(name):
+            self._files.invalidate_cache()
+            return bool(self._files.isfile(self._path(name)))
+
+    def remove(self, name: str) -> None:
+        """Remove an object, where it is still there."""
+        with self._told(name), contextlib.suppress(FileNotFoundError):
+            self._files.rm_file(self._path(name))
+
+    def remove_below(self, folder: str) -> None:
+        """Remove all objects whose names begin with a folder's."""
+        with self._told(folder), contextlib.suppress(FileNotFoundError):
+            self._files.invalidate_cache()
+            self._files.rm(self._path(folder), recursive=True)
+
+    def below(self, folder: str) -> dict[str, float]:
+        """Names of all objects below a folder, and when each was last changed: seconds since 1970, 0 if unknown."""
+        with self._told(folder):
+            self._files.invalidate_cache()
+            found = self._files.find(self._path(folder), detail=True)
+            return {path[len(self.root) + 1 :]: _changed(entry) for path, entry in found.items()}
+
+    def can_join(self, sizes: list[int]) -> bool:
+        """Whether objects of these sizes, one behind the other, can become one without being sent again."""
+        whole = all(size >= MIN_PART_BYTES for size in sizes[:-1])
+        return self._s3 and 0 < len(sizes) <= _MAX_PARTS and whole
+
+    def join(self, parts: list[str], name: str) -> None:
+        """Make objects one, in the store itself (S3's multipart upload by copies); see `can_join`."""
+        with self._told(name):
+            where = dict(zip(("Bucket", "Key"), self._path(name).split("/", 1), strict=True))
+            begun = self._files.call_s3("create_multipart_upload", **where)
+            where["UploadId"] = begun["UploadId"]
+            try:
+                done = []
+                for number, part in enumerate(parts, 1):
+                    source = dict(zip(("Bucket", "Key"), self._path(part).split("/", 1), strict=True))
+                    copied = self._files.call_s3("upload_part_copy", **where, PartNumber=number, CopySource=source)
+                    done.append({"PartNumber": number, "ETag": copied["CopyPartResult"]["ETag"]})
+                self._files.call_s3("complete_multipart_upload", **where, MultipartUpload={"Parts": done})
+            except BaseException:
+                with contextlib.suppress(Exception):
+                    self._files.call_s3("abort_multipart_upload", **where)
+                raise
+            self._files.invalidate_cache()
+
+    def abort_old_parts(self, seconds: float) -> int:
+        """Give up objects that were begun in parts so long ago, and never finished; returns how many."""
+        if not self._s3:
+            return 0
+        bucket, _, prefix = self.root.partition("/")
+        with self._told(prefix):
+            found = self._files.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix)
+            before = time.time() - seconds
+            old = [entry for entry in found.get("Uploads", ()) if entry["Initiated"].timestamp() < before]
+            for entry in old:
+                self._files.call_s3(
+                    "abort_multipart_upload", Bucket=bucket, Key=entry["Key"], UploadId=entry["UploadId"]
+                )
+            return len(old)
+
+    def ping(self) -> None:
+        """Prove that the place can be reached; raises OSError or StoreError."""
+        # a prefix of a bucket is nothing that could be there before something is in it
+        place = self.root if self.local else self.root.partition("/")[0]
+        with self._told(place):
+            self._files.invalidate_cache()
+            if not self._files.exists(place):
+                raise FileNotFoundError(f"The results' place {place!r} is not there, or cannot be reached.")
+
+    def make_folder(self) -> None:
+        """Create the place itself."""
+        self._files.makedirs(self.root, exist_ok=True)
+
+    def _path(self, name: str) -> str:
+        return f"{self.root}/{name}"
+
+    @contextlib.contextmanager
+    def _told(self, name: str) -> Iterator[None]:
+        """Turn what goes wrong with a remote store, in whatever library, into `StoreError`."""
+        try:
+            yield
+        except (FileNotFoundError, TruncatedError, StoreError):
+            raise
+        except Exception as error:
+            if self.local:
+                raise
+            raise StoreError("The service's store of files does not answer. Try again later.", retry_after=10) from (
+                _cause(name, error)
+            )
+
+
+def _cause(name: str, error: Exception) -> Exception:
+    """An error with the name that it is about, for the operator's log."""
+    error.add_note(f"store of files: {name}")
+    return error
+
+
+def _options(url: str) -> dict[str, Any]:
+    """For fsspec, by the URL's protocol."""
+    if not url.startswith(("s3://", "s3a://")):
+        return {}
+    retries = {"mode": "standard", "total_max_attempts": _CLIENT_TRIES}
+    config = {"connect_timeout": _CONNECT_SECONDS, "read_timeout": _ANSWER_SECONDS, "retries": retries}
+    return {"config_kwargs": config, "skip_instance_cache": True}
+
+
+def _changed(entry: dict[str, Any]) -> float:
+    """When an object was last changed, by what its file system says of it."""
+    found = entry.get("LastModified") or entry.get("mtime") or entry.get("created")
+    return found.timestamp() if isinstance(found, datetime) else float(found or 0.0)

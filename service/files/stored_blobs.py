@@ -1,0 +1,205 @@
+"""Inputs in the store of files, which all hosts share, and the cache through which this host reads them."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+from service.errors import ConflictError, NotFoundError
+from service.files.artifacts import Artifacts
+from service.files.blobs import BlobFolder, Blobs, PartWriter, write_all
+from service.files.cache import FileCache, file_digest
+from service.files.objects import ObjectStore
+from service.settings import ServiceSettings
+from service.store.inputs import Inputs
+from service.store.tables import BlobRow, UploadRow
+
+#: Folders of the store; all others are those of jobs.
+BLOBS, UPLOADS = "blobs", "uploads"
+#: Objects that no row refers to are removed at this age: a younger one's row may still be on its way.
+_ORPHAN_SECONDS = 6 * 3600.0
+#: The store is looked through for these so often.
+_LOOK_SECONDS = 3600.0
+
+
+def open_blobs(settings: ServiceSettings, inputs: Inputs, artifacts: Artifacts) -> Blobs:
+    """The inputs: in the data folder where the store of files is a local folder, else in the store."""
+    if artifacts.local:
+        return BlobFolder(settings.folder, inputs, settings.min_free_bytes)
+    return StoredBlobs(settings, inputs, artifacts.objects)
+
+
+def open_cache(settings: ServiceSettings) -> FileCache:
+    """This host's cache of files that are in the store."""
+    return FileCache(settings.folder / "cache", settings.file_cache_bytes)
+
+
+class StoredBlobs(Blobs):
+    """Inputs as objects of the store."""
+
+    def __init__(self, settings: ServiceSettings, inputs: Inputs, objects: ObjectStore) -> None:
+        super().__init__(settings.folder, inputs, settings.min_free_bytes)
+        self._objects, self._cache = objects, open_cache(settings)
+        self._before = settings.folder / "blobs"  # of a service whose files were in a local folder
+        self._looked_at = float("-inf")
+
+    def keep(self, path: Path, sha256: str, size: int) -> None:
+        """Put a received file into the store, unless its content is there, and into the cache."""
+        self._put(path, sha256, size, [])
+        self._cache.adopt(path, sha256)
+
+    def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
+        """Links to this host's copies, in `folder`; what is not in the cache is fetched."""
+        place = folder / ".inputs"
+        place.mkdir()
+        found = {}
+        for sha256, row in rows.items():
+            found[sha256] = place / sha256
+            self._cache.link(sha256, row.size, found[sha256], partial(self._objects.get, f"{BLOBS}/{row.location}"))
+        return found
+
+    def _put(self, path: Path, sha256: str, size: int, parts: list[str]) -> None:
+        """Make a file a blob of the store.
+
+        Args:
+            path: the file.
+            parts: objects that are it, one behind the other; empty to send it.
+        """
+        try:
+            self._inputs.hold([sha256])
+            return
+        except NotFoundError:
+            location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+        if parts:
+            self._objects.join(parts, f"{BLOBS}/{location}")
+        else:
+            self._objects.put(path, f"{BLOBS}/{location}")
+        if self._inputs.add_blob(sha256, location, size) != location:
+            self._objects.remove(f"{BLOBS}/{location}")
+
+    # --- uploads ---------------------------------------------------------------------------------------------------
+
+    def begin_upload(self, upload_id: str) -> None:
+        """There is nothing to prepare."""
+
+    def append(self, upload: UploadRow, seconds: float) -> PartWriter:
+        """Write objects of the store, one at each `save`: any API process can go on behind them."""
+        return _ObjectWriter(self.incoming, self._objects, self._inputs, upload, seconds)
+
+    def finish_upload(self, upload: UploadRow, seconds: float) -> str:
+        """Join its parts in the store; they are fetched once, for their digest and for the cache."""
+        whole = self.incoming / f"{secrets.token_hex(12)}.part"
+        try:
+            parts = self._inputs.parts(upload.id)
+            try:
+                self._gather([part.location for part in parts], whole, upload)
+            except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
+                known = self._inputs.upload(upload.id, upload.owner).sha256
+                if known is None:
+                    raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
+                return known
+            sha256 = file_digest(whole)
+            joined = [part.location for part in parts] if self._objects.can_join([part.size for part in parts]) else []
+            self._put(whole, sha256, upload.length, joined)
+            self._inputs.finish_upload(upload.id, sha256, seconds)
+            self._cache.adopt(whole, sha256)
+        finally:
+            whole.unlink(missing_ok=True)
+        self.forget_upload(upload.id)
+        return sha256
+
+    def _gather(self, locations: list[str], whole: Path, upload: UploadRow) -> None:
+        """Fetch the parts of an upload, one behind the other."""
+        self.ensure_room(upload.length)
+        piece = whole.with_suffix(".piece")
+        try:
+            with whole.open("wb", buffering=0) as file:
+                for location in locations:
+                    self._objects.get(location, piece)
+                    with piece.open("rb") as part:
+                        while data := part.read(1 << 20):
+                            write_all(file, data)
+        finally:
+            piece.unlink(missing_ok=True)
+        if whole.stat().st_size != upload.length:
+            raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.")
+
+    def forget_upload(self, upload_id: str) -> None:
+        """Remove its objects."""
+        self._objects.remove_below(f"{UPLOADS}/{upload_id}")
+
+    # --- housekeeping ----------------------------------------------------------------------------------------------
+
+    def _collect_blobs(self) -> int:
+        removed = 0
+        for location in self._inputs.collect():
+            self._objects.remove(f"{BLOBS}/{location}")
+            removed += 1
+        self._cache.evict()
+        if time.monotonic() - self._looked_at > _LOOK_SECONDS:
+            self._looked_at = time.monotonic()
+            self._take_over()
+            removed += self._collect_orphans() + self._objects.abort_old_parts(_ORPHAN_SECONDS)
+        return removed
+
+    def _collect_orphans(self) -> int:
+        """Remove objects that a process which died had put, without their rows."""
+        before = time.time() - _ORPHAN_SECONDS
+        old = [name for name, changed in self._objects.below(BLOBS).items() if changed < before]
+        known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
+        orphans = [name for name in old if name not in known]
+        parts = [name for name, changed in self._objects.below(UPLOADS).items() if changed < before]
+        uploads = self._inputs.known_uploads(sorted({name.split("/")[1] for name in parts}))
+        orphans += [name for name in parts if name.split("/")[1] not in uploads]
+        for name in orphans:
+            self._objects.remove(name)
+        return len(orphans)
+
+    def _take_over(self) -> None:
+        """Bring what is left of a time when the store was a local folder into the store."""
+        known = self._inputs.locations() if self._before.is_dir() else set()
+        for path in self._before.glob("*/*"):
+            location = f"{path.parent.name}/{path.name}"
+            if location in known:
+                self._objects.put(path, f"{BLOBS}/{location}")
+            path.unlink()
+
+
+class _ObjectWriter:
+    """Bytes of an upload on their way into the store: a file of this host until they are saved."""
+
+    def __init__(self, folder: Path, objects: ObjectStore, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
+        self._objects, self._inputs, self._upload, self._seconds = objects, inputs, upload, seconds
+        self._path = folder / f"{secrets.token_hex(12)}.part"
+        self._file = self._path.open("wb", buffering=0)
+        self._start, self._size = upload.offset, 0
+
+    def write(self, data: bytes) -> None:
+        write_all(self._file, data)
+        self._size += len(data)
+
+    def save(self) -> float:
+        if not self._size:
+            return self._upload.expires_at
+        location = f"{UPLOADS}/{self._upload.id}/{self._start:016d}-{secrets.token_hex(6)}"
+        self._objects.put(self._path, location)
+        try:
+            expires = self._inputs.add_part(self._upload.id, self._start, self._size, location, self._seconds)
+        except (ConflictError, NotFoundError):
+            self._objects.remove(location)
+            raise
+        self._start += self._size
+        self.discard()
+        return expires
+
+    def discard(self) -> None:
+        self._file.seek(0)
+        self._file.truncate()
+        self._size = 0
+
+    def close(self) -> None:
+        self._file.close()
+        self._path.unlink(missing_ok=True)

@@ -1,0 +1,23 @@
+"""What the process of an attempt tells its dispatcher, as lines of JSON."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypedDict
+
+
+class Message(TypedDict, total=False):
+    """What the process tells: `kind` and what belongs to it."""
+
+    kind: Literal["stage", "prepared", "left-out", "progress", "preview", "done", "interrupted", "failed"]
+    stage: str
+    step: int
+    total: int
+    loss: float
+    seconds: float
+    seconds_left: float | None
+    path: str
+    gpus: list[str]
+    result: dict[str, Any]
+    error: dict[str, Any]
+    permanent: bool
+    detail: str

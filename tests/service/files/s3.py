@@ -1,0 +1,144 @@
+"""A server that speaks S3 (moto's), and one in front of it that answers wrongly when it is told to."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Literal
+
+import httpx
+import pytest
+
+#: "slow-down": 503, as S3 says that there are too many requests; "reset": the connection is broken off before the
+#: answer; "cut-off": in the middle of it; "silence": there is no answer at all.
+Fault = Literal["slow-down", "reset", "cut-off", "silence"]
+
+_SLOW_DOWN = (
+    b"<?xml version='1.0'?><Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"
+)
+
+
+@contextmanager
+def s3_server() -> Iterator[str]:
+    """URL of a server with no buckets."""
+    server_module = pytest.importorskip("moto.server", reason="moto's server is not installed: see the extra [dev]")
+    pytest.importorskip("s3fs", reason="s3fs is not installed: see the extra [s3]")
+    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+def environment_of(endpoint: str) -> dict[str, str]:
+    """What tells clients of S3 where it is, and who they are."""
+    return {
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+
+
+class FaultyS3:
+    """Hands requests on to a server, but for those that it is told to answer wrongly.
+
+    Attributes:
+        url: of this.
+        asked: method and path of every request.
+    """
+
+    def __init__(self, behind: str) -> None:
+        self.asked: list[tuple[str, str]] = []
+        self._faults: list[tuple[Fault, Callable[[str, str], bool]]] = []
+        self._lock = threading.Lock()
+        faulty = self
+        client = httpx.Client(base_url=behind, timeout=60)
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def _answer(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                faulty._answer(self, client, body)
+
+            do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = _answer  # noqa: N815 (http.server's names)
+
+            def log_message(self, *arguments: Any) -> None:
+                return
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def fail(self, fault: Fault, times: int, which: Callable[[str, str], bool] = lambda method, path: True) -> None:
+        """Answer so many of the next requests that are meant (by method and path) with a fault."""
+        with self._lock:
+            self._faults = [(fault, which)] * times
+
+    def heal(self) -> None:
+        """No more faults."""
+        with self._lock:
+            self._faults = []
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _fault(self, method: str, path: str) -> Fault | None:
+        with self._lock:
+            self.asked.append((method, path))
+            if self._faults and self._faults[0][1](method, path):
+                return self._faults.pop(0)[0]
+        return None
+
+    def _answer(self, handler: BaseHTTPRequestHandler, client: httpx.Client, body: bytes) -> None:
+        fault = self._fault(handler.command, handler.path)
+        if fault == "slow-down":
+            self._send(handler, 503, {"Content-Type": "application/xml"}, _SLOW_DOWN)
+        elif fault == "reset":
+            self._reset(handler)
+        elif fault == "silence":
+            threading.Event().wait(20)
+            handler.close_connection = True
+        else:
+            kept = {name: value for name, value in handler.headers.items() if name.lower() != "connection"}
+            request = client.build_request(handler.command, handler.path, headers=kept, content=body)
+            answer = client.send(request)
+            self._send(handler, answer.status_code, dict(answer.headers), answer.content, cut=fault == "cut-off")
+
+    def _send(
+        self,
+        handler: BaseHTTPRequestHandler,
+        status: int,
+        headers: dict[str, str],
+        body: bytes,
+        *,
+        cut: bool = False,
+    ) -> None:
+        handler.send_response_only(status)
+        dropped = {"content-length", "connection", "transfer-encoding", "content-encoding"}
+        for name, value in headers.items():
+            if name.lower() not in dropped:
+                handler.send_header(name, value)
+        head = handler.command == "HEAD"
+        length = next((value for name, value in headers.items() if name.lower() == "content-length"), "0")
+        handler.send_header("Content-Length", length if head else str(len(body)))
+        handler.end_headers()
+        if head:
+            return
+        handler.wfile.write(body[: len(body) // 2] if cut else body)
+        if cut:
+            self._reset(handler)
+
+    @staticmethod
+    def _reset(handler: BaseHTTPRequestHandler) -> None:
+        handler.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        handler.connection.close()
+        handler.close_connection = True

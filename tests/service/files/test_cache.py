@@ -1,0 +1,169 @@
+"""A host's cache of the store's files: fetched once, verified, bounded, shared by processes."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import multiprocessing
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from service.errors import NoSpaceError, StoreError
+from service.files.cache import FileCache
+
+
+def content(number: int, size: int = 1000) -> tuple[bytes, str]:
+    data = bytes([number]) * size
+    return data, hashlib.sha256(data).hexdigest()
+
+
+class Source:
+    """Something to fetch from, which counts."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.fetched = data, 0
+
+    def __call__(self, target: Path) -> None:
+        self.fetched += 1
+        target.write_bytes(self.data)
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in (folder / "cache" / "files").glob("*/*")}
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> FileCache:
+    return FileCache(tmp_path / "cache", 2500)
+
+
+def test_a_file_is_fetched_once(cache: FileCache, tmp_path: Path) -> None:
+    data, sha256 = content(1)
+    source = Source(data)
+    for name in ("a", "b"):
+        cache.link(sha256, len(data), tmp_path / name, source)
+        assert (tmp_path / name).read_bytes() == data
+        assert not os.access(tmp_path / name, os.W_OK) or os.geteuid() == 0
+    assert source.fetched == 1
+    assert (tmp_path / "a").stat().st_mtime == int(sha256[:8], 16), "its time tells of its content alone"
+
+
+def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(cache: FileCache, tmp_path: Path) -> None:
+    found = [content(number) for number in range(5)]
+    for number in (0, 1):
+        cache.link(found[number][1], 1000, tmp_path / str(number), Source(found[number][0]))
+    (tmp_path / "0").unlink()
+    (tmp_path / "1").unlink()
+    again = Source(found[0][0])
+    cache.link(found[0][1], 1000, tmp_path / "0", again)  # used again, and let go of: now the other one is older
+    (tmp_path / "0").unlink()
+    assert again.fetched == 0
+    cache.link(found[2][1], 1000, tmp_path / "2", Source(found[2][0]))
+    assert files(tmp_path) == {found[0][1], found[2][1]}
+    cache.link(found[3][1], 1000, tmp_path / "3", Source(found[3][0]))
+    cache.link(found[4][1], 1000, tmp_path / "4", Source(found[4][0]))
+    assert files(tmp_path) == {found[number][1] for number in (2, 3, 4)}, "all of them are in use"
+    (tmp_path / "2").unlink()
+    cache.evict()
+    assert files(tmp_path) == {found[3][1], found[4][1]}
+
+
+def test_what_is_damaged_on_the_way_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:
+    data, sha256 = content(1)
+    source = Source(b"damaged")
+
+    def fetch(target: Path) -> None:
+        source(target)
+        source.data = data
+
+    cache.link(sha256, 1000, tmp_path / "a", fetch)
+    assert ((tmp_path / "a").read_bytes(), source.fetched) == (data, 2)
+
+
+def test_what_is_damaged_in_the_store_is_nobodys_file(cache: FileCache, tmp_path: Path) -> None:
+    _, sha256 = content(1)
+    with pytest.raises(StoreError, match="damaged in the store"):
+        cache.link(sha256, 1000, tmp_path / "a", Source(b"another"))
+    assert not (tmp_path / "a").exists()
+    assert files(tmp_path) == set()
+    assert list((tmp_path / "cache" / "half").iterdir()) == []
+
+
+def test_what_the_store_has_lost_is_its_error(cache: FileCache, tmp_path: Path) -> None:
+    def fetch(target: Path) -> None:
+        raise FileNotFoundError(target)
+
+    with pytest.raises(StoreError, match="has lost"):
+        cache.link(content(1)[1], 1000, tmp_path / "a", fetch)
+
+
+@pytest.mark.parametrize("helps", [True, False])
+def test_a_full_disk_is_freed_of_what_nobody_uses(cache: FileCache, tmp_path: Path, helps: bool) -> None:
+    old, old_sha256 = content(1)
+    cache.link(old_sha256, 1000, tmp_path / "old", Source(old))
+    (tmp_path / "old").unlink()
+    data, sha256 = content(2)
+
+    def fetch(target: Path) -> None:
+        target.write_bytes(b"half")
+        if files(tmp_path) or not helps:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        target.write_bytes(data)
+
+    if helps:
+        cache.link(sha256, 1000, tmp_path / "new", fetch)
+        assert (tmp_path / "new").read_bytes() == data
+    else:
+        with pytest.raises(NoSpaceError, match="full"):
+            cache.link(sha256, 1000, tmp_path / "new", fetch)
+        assert list((tmp_path / "cache" / "half").iterdir()) == []
+    assert old_sha256 not in files(tmp_path)
+
+
+def test_a_file_that_is_handed_over_is_not_copied(cache: FileCache, tmp_path: Path) -> None:
+    data, sha256 = content(1)
+    for name in ("first", "second"):
+        (tmp_path / name).write_bytes(data)
+        inode = (tmp_path / name).stat().st_ino
+        cache.adopt(tmp_path / name, sha256)
+        assert not (tmp_path / name).exists()
+        if name == "first":
+            first = inode
+    source = Source(data)
+    cache.link(sha256, 1000, tmp_path / "a", source)
+    assert ((tmp_path / "a").stat().st_ino, source.fetched) == (first, 0)
+
+
+def _use(folder: str, number: int) -> None:
+    """Link, read and let go of five files, again and again, in a cache that holds two."""
+    cache = FileCache(Path(folder) / "cache", 2500)
+    for turn in range(40):
+        data, sha256 = content((number + turn) % 5)
+        target = Path(folder) / f"{number}-{turn}"
+
+        def fetch(half: Path, data: bytes = data) -> None:
+            with half.open("wb") as file:
+                file.write(data[:500])
+                file.flush()
+                time.sleep(0.001)
+                file.write(data[500:])
+
+        cache.link(sha256, 1000, target, fetch)
+        assert target.read_bytes() == data
+        target.unlink()
+
+
+def test_processes_share_it(cache: FileCache, tmp_path: Path) -> None:
+    spawned = multiprocessing.get_context("spawn")
+    processes = [spawned.Process(target=_use, args=(str(tmp_path), number)) for number in range(3)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0, 0, 0]
+    cache.evict()
+    assert len(files(tmp_path)) <= 2
+    assert list((tmp_path / "cache" / "half").iterdir()) == []

@@ -1,0 +1,226 @@
+"""Inputs in an S3-compatible store, by several processes' eyes, while the store has its faults."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.errors import ConflictError, NotFoundError, StoreError
+from service.files import stored_blobs
+from service.files.artifacts import Artifacts
+from service.files.blobs import BlobFolder, Receiver
+from service.files.stored_blobs import StoredBlobs
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.tables import UploadRow
+from tests.service.files.s3 import Fault, FaultyS3, environment_of, s3_server
+
+MB = 1 << 20
+HOUR = 3600.0
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    with s3_server() as url:
+        yield url
+
+
+@dataclass
+class Fleet:
+    """Hosts that share a database and a store of files, which has its faults."""
+
+    folder: Path
+    store: Store
+    url: str
+    s3: FaultyS3
+
+    def host(self, name: str) -> StoredBlobs:
+        settings = ServiceSettings(data=self.folder / name, min_free_bytes=0, artifacts=self.url)
+        return StoredBlobs(settings, self.store.inputs, Artifacts(self.url).objects)
+
+    def names(self) -> list[str]:
+        """All objects of the store."""
+        return sorted(Artifacts(self.url).objects.below(""))
+
+    def take(self, host: StoredBlobs, data: bytes) -> str:
+        """Receive a file."""
+        receiver = Receiver(host.incoming / os.urandom(4).hex(), len(data), lambda size: None)
+        receiver.write(data)
+        sha256 = receiver.close()
+        host.keep(receiver.path, sha256, len(data))
+        return sha256
+
+    def read(self, host: StoredBlobs, sha256: str) -> bytes:
+        with host.lent(self.store.inputs.blobs([sha256])) as paths:
+            return paths[sha256].read_bytes()
+
+    def upload(self, length: int) -> UploadRow:
+        return self.store.inputs.create_upload("me", length, "scene.ply", "", HOUR)
+
+    def again(self, upload: UploadRow) -> UploadRow:
+        """Its row as it is now."""
+        return self.store.inputs.upload(upload.id, "me")
+
+    def append(self, host: StoredBlobs, upload: UploadRow, *blocks: bytes) -> None:
+        writer = host.append(self.again(upload), HOUR)
+        for block in blocks:
+            writer.write(block)
+        writer.save()
+        writer.close()
+
+
+@pytest.fixture
+def fleet(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+    s3 = FaultyS3(server)
+    for name, value in environment_of(s3.url).items():
+        monkeypatch.setenv(name, value)
+    url = f"s3://inputs/{os.urandom(4).hex()}"
+    assert httpx.put(f"{server}/inputs").status_code == 200
+    store = open_store(ServiceSettings(data=tmp_path / "database"))
+    yield Fleet(tmp_path, store, url, s3)
+    s3.heal()
+    store.close()
+    s3.close()
+
+
+def test_what_one_host_takes_in_another_one_reads(fleet: Fleet) -> None:
+    one, two = fleet.host("one"), fleet.host("two")
+    data = os.urandom(3 * MB + 1)
+    sha256 = fleet.take(one, data)
+    assert list(one.incoming.iterdir()) == []
+    assert fleet.take(two, data) == sha256
+    assert len(fleet.names()) == 1, "the same content is there once"
+    third = fleet.host("three")
+    asked = len(fleet.s3.asked)
+    assert fleet.read(one, sha256) == fleet.read(two, sha256) == data
+    assert len(fleet.s3.asked) == asked, "who has taken it in does not fetch it"
+    assert fleet.read(third, sha256) == data
+    asked = len(fleet.s3.asked)
+    assert fleet.read(third, sha256) == data
+    assert len(fleet.s3.asked) == asked
+
+
+def test_what_nobody_needs_leaves_the_store(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    host = fleet.host("one")
+    sha256 = fleet.take(host, b"wanted by nobody")
+    Artifacts(fleet.url).objects.put(_file(fleet.folder, b"x"), "blobs/aa/orphan")
+    Artifacts(fleet.url).objects.put(_file(fleet.folder, b"x"), "uploads/upl_1/orphan")
+    host.collect()
+    assert len(fleet.names()) == 3, "the rows may still be on their way"
+    monkeypatch.setattr(stored_blobs, "_ORPHAN_SECONDS", -HOUR)
+    fleet.store.inputs._database.clock = lambda: 10**11
+    fleet.host("two").collect()
+    assert fleet.names() == []
+    with pytest.raises(NotFoundError):
+        fleet.store.inputs.hold([sha256])
+
+
+def _file(folder: Path, data: bytes) -> Path:
+    path = folder / os.urandom(4).hex()
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize(("first", "joined"), [(6 * MB, True), (1 * MB, False)])
+def test_an_upload_goes_on_at_another_host(fleet: Fleet, first: int, joined: bool) -> None:
+    data = os.urandom(8 * MB)
+    upload = fleet.upload(len(data))
+    fleet.append(fleet.host("one"), upload, data[:1000], data[1000:first])
+    two = fleet.host("two")
+    fleet.append(two, upload, data[first:])
+    assert fleet.again(upload).offset == len(data)
+    assert len(fleet.names()) == 2
+    before = len(fleet.s3.asked)
+    sha256 = two.finish_upload(fleet.again(upload), HOUR)
+    assert sha256 == hashlib.sha256(data).hexdigest()
+    assert [name.split("/")[0] for name in fleet.names()] == ["blobs"]
+    assert fleet.read(fleet.host("three"), sha256) == data
+    copied = [path for method, path in fleet.s3.asked[before:] if method == "PUT" and "partNumber=" in path]
+    assert (len(copied) >= 2) == joined
+    assert two.finish_upload(fleet.again(upload), HOUR) == sha256, "another request has finished it already"
+
+
+def test_of_two_who_send_the_same_bytes_one_is_told_so(fleet: Fleet) -> None:
+    upload = fleet.upload(30)
+    slow, fast = fleet.host("one").append(upload, HOUR), fleet.host("two").append(upload, HOUR)
+    slow.write(b"slow" * 5)
+    fast.write(b"fast" * 4)
+    fast.save()
+    with pytest.raises(ConflictError, match="the next byte is 16"):
+        slow.save()
+    slow.close()
+    fast.write(b"fast" * 3)
+    fast.discard()
+    fast.write(b"and the end.")
+    with pytest.raises(NotFoundError, match="gone"):
+        fleet.host("three").finish_upload(fleet.again(upload), HOUR)  # it is not whole yet
+    fast.write(b"!!")
+    fast.save()
+    fast.close()
+    sha256 = fleet.host("three").finish_upload(fleet.again(upload), HOUR)
+    assert fleet.read(fleet.host("one"), sha256) == b"fast" * 4 + b"and the end.!!"
+    assert len(fleet.names()) == 1
+
+
+def test_a_half_upload_is_collected(fleet: Fleet) -> None:
+    upload = fleet.upload(100)
+    fleet.append(fleet.host("one"), upload, bytes(60))
+    assert len(fleet.names()) == 1
+    now = fleet.store.inputs._database.clock()
+    fleet.store.inputs._database.clock = lambda: now + 2 * HOUR
+    fleet.host("two").collect()
+    assert fleet.names() == []
+    assert fleet.store.inputs.parts(upload.id) == []
+
+
+def test_what_a_local_folder_held_moves_into_the_store(fleet: Fleet) -> None:
+    folder = BlobFolder(fleet.folder / "one", fleet.store.inputs, 0)
+    data = b"taken in before"
+    sha256 = hashlib.sha256(data).hexdigest()
+    folder.keep(_file(fleet.folder, data), sha256, len(data))
+    fleet.host("one").collect()
+    assert fleet.read(fleet.host("two"), sha256) == data
+    assert not [path for path in (fleet.folder / "one" / "blobs").rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("fault", ["slow-down", "reset", "cut-off"])
+def test_a_store_that_fails_for_a_moment_costs_a_moment(fleet: Fleet, fault: Fault) -> None:
+    data = os.urandom(100_000)
+    if fault != "cut-off":
+        fleet.s3.fail(fault, 2, lambda method, path: method == "PUT")
+    sha256 = fleet.take(fleet.host("one"), data)
+    fleet.s3.fail(fault, 1, lambda method, path: method == "GET" and "list-type" not in path)
+    assert fleet.read(fleet.host("two"), sha256) == data
+
+
+def test_a_store_that_stays_away_is_not_the_users_fault(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = b"the scene"
+    sha256 = fleet.take(fleet.host("one"), data)
+    fleet.s3.fail("reset", 10**6)
+    two = fleet.host("two")
+    with pytest.raises(StoreError, match="does not answer") as raised:
+        fleet.read(two, sha256)
+    assert raised.value.__cause__ is not None
+    upload = fleet.upload(9)
+    with pytest.raises(StoreError):
+        fleet.append(two, upload, data)
+    fleet.s3.heal()
+    assert fleet.again(upload).offset == 0
+    fleet.append(two, upload, data)
+    assert two.finish_upload(fleet.again(upload), HOUR) == sha256
+    assert fleet.read(two, sha256) == data
+
+
+def test_a_store_that_is_silent_is_asked_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = b"the scene"
+    sha256 = fleet.take(fleet.host("one"), data)
+    monkeypatch.setattr("service.files.objects._ANSWER_SECONDS", 1.0)
+    two = fleet.host("two")
+    fleet.s3.fail("silence", 1, lambda method, path: "blobs" in path)
+    assert fleet.read(two, sha256) == data
