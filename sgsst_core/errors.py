@@ -96,3 +96,9 @@ class InfrastructureError(SgsstError):
     """A machine, a network or a store of files has failed: nothing is wrong with what the user handed in."""
 
     code = "infrastructure"
+
+
+class ClusterAwayError(RanksFailedError, InfrastructureError):
+    """There is no cluster to run workers on, or it has no free place for a single one."""
+
+    code = "workers-failed"

@@ -15,7 +15,7 @@ import threading
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,8 @@ from service.files.staging import Staged
 from service.parameters import JobParameters
 from service.scheduling.endings import OUTAGE, is_outage
 from service.scheduling.messages import Message
+from service.scheduling.workplace import StoreWorkplace
+from service.store.leases import Published
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
@@ -48,8 +50,9 @@ class Task:
         parameters: of the job.
         workers: ranks to run it on at most; 1 for this process alone.
         cluster: run even one rank on the Ray cluster.
-        resume: go on from the checkpoint in `out`, where it can be used.
+        resume: go on from the checkpoint in `out`, or in the workplace, where it can be used.
         checkpoint_seconds, preview_seconds: see the settings.
+        workplace: of ranks on machines that share no folder with this one; None where they do.
     """
 
     staged: Staged
@@ -59,17 +62,22 @@ class Task:
     resume: bool
     checkpoint_seconds: float
     preview_seconds: float
+    workplace: StoreWorkplace | None = None
 
     def save(self, folder: Path) -> None:
         """Write it for `load`."""
         values = {**vars(self), "staged": self.staged.as_json(), "parameters": self.parameters.model_dump(mode="json")}
+        values["workplace"] = self.workplace and self.workplace.as_json()
         (folder / "task.json").write_text(json.dumps(values))
 
     @staticmethod
     def load(folder: Path) -> Task:
         """Read what `save` wrote."""
         values = json.loads((folder / "task.json").read_text())
-        return Task(Staged.of_json(values.pop("staged")), JobParameters(**values.pop("parameters")), **values)
+        staged = Staged.of_json(values.pop("staged"))
+        if values["workplace"] is not None:
+            values["workplace"] = StoreWorkplace.from_json(values["workplace"])
+        return Task(staged, JobParameters(**values.pop("parameters")), **values)
 
 
 class AttemptProcess:
@@ -125,15 +133,9 @@ class AttemptProcess:
         )
 
     def _run_on_ranks(self) -> Result | None:
-        from dataclasses import replace
-
         from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
         from worker.ranks.listener import Listener
-        from worker.request import Outputs
 
-        request = self._request()
-        # a checkpoint that is not there is no error here, as it would be for a user who asks for it
-        request = replace(request, resume=request.resume and Outputs.of(request.out).checkpoints.exist)
         listener = Listener(
             planning=tell_planning,
             prepared=tell_prepared,
@@ -143,13 +145,16 @@ class AttemptProcess:
             stop=self._stopping.is_set,
             preview=tell_preview,
             left_out=tell_left_out,
+            stored=tell_stored,
         )
         options = WorkerOptions(
             checkpoint_seconds=self._task.checkpoint_seconds,
             preview_folder=_PREVIEWS,
             preview_seconds=self._task.preview_seconds,
+            resume_required=False,
+            workplace=self._task.workplace,
         )
-        return stylize_on_ranks(request, self._task.workers, listener, options=options).result
+        return stylize_on_ranks(self._request(), self._task.workers, listener, options=options).result
 
 
 def tell_planning(now: PlanningProgress) -> None:
@@ -190,6 +195,11 @@ def tell_progress(now: Progress) -> None:
 def tell_left_out(gpus: Sequence[str]) -> None:
     """GPUs that the plan does without."""
     tell({"kind": "left-out", "gpus": list(gpus)})
+
+
+def tell_stored(file: Published) -> None:
+    """A file that a rank has put into the store of files."""
+    tell({"kind": "stored", "file": asdict(file)})
 
 
 def tell_preview(path: Path) -> None:

@@ -27,6 +27,7 @@ from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
 from service.scheduling.publishing import sweep
 from service.scheduling.running import RunningAttempt
+from service.scheduling.strays import remove_strays
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -36,10 +37,13 @@ from service.store.tables import JobRow
 
 #: Seconds between two looks for what has expired or was left behind.
 _HOUSEKEEPING_SECONDS = 60.0
-#: Jobs that are swept at a time: leases are not renewed meanwhile.
+#: And for what nothing refers to.
+_STRAYS_SECONDS = 3600.0
+#: Jobs that are swept at a time.
 _SWEEPS = 20
-#: Of a lease's time that passes before it is renewed.
-_RENEW_SHARE = 1 / 3
+#: Of a lease's time that passes before it is renewed, and before jobs are ended whose lease could not be: others may
+#: have them when it has run out, and the clocks of machines differ.
+_RENEW_SHARE, _ABANDON_SHARE = 1 / 3, 3 / 4
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +65,8 @@ class Dispatcher:
         self._stop = threading.Event()
         self.name = own_name()
         self._work = settings.folder / "work" / self.name
-        self._renewed_at = self._housekeeping_at = self._announced_at = float("-inf")
+        self._renewed_at = self._announced_at = self._strays_at = float("-inf")
+        self._ended = threading.Event()
         self._deliverer = Deliverer(settings, store)
 
     def stop(self) -> None:
@@ -73,6 +78,8 @@ class Dispatcher:
         self._take_over_from_the_dead()
         self._work.mkdir(parents=True, exist_ok=True)
         self._deliverer.start()
+        for work in (self._keep_house_now_and_then, self._abandon_late):
+            threading.Thread(target=work, name=work.__name__, daemon=True).start()
         what = "GPUs" if self._machine.gpus else "places"
         _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
         while not self._stop.is_set():
@@ -80,7 +87,6 @@ class Dispatcher:
                 self._work_once()
             except (SQLAlchemyError, OSError):  # the database is away or locked; leases run out if it stays so
                 _log.exception("the store cannot be reached")
-                self._abandon_expired()
                 self._stop.wait(2.0)
             self._stop.wait(self._settings.poll_seconds)
         self._shut_down()
@@ -106,9 +112,6 @@ class Dispatcher:
         self._announce_alive()
         while not self._stop.is_set() and (found := self.next_job(self._grants())) is not None:
             self._start_attempt(*found)
-        if time.monotonic() - self._housekeeping_at > _HOUSEKEEPING_SECONDS:
-            self._housekeeping_at = time.monotonic()
-            self._keep_house()
 
     # --- room ------------------------------------------------------------------------------------------------------
 
@@ -152,13 +155,14 @@ class Dispatcher:
 
     def _renew_leases(self) -> None:
         """Hold the leases of all running attempts, and see which of their jobs are to be canceled or are lost."""
+        now = time.monotonic()  # a lease counts from before the request for it
         if not self._running:
-            self._renewed_at = time.monotonic()
+            self._renewed_at = now
             return
         leases = [attempt.lease for attempt in self._running.values()]
-        if time.monotonic() - self._renewed_at >= _RENEW_SHARE * self._settings.lease_seconds:
+        if now - self._renewed_at >= _RENEW_SHARE * self._settings.lease_seconds:
             found = self._store.leases.renew(leases)
-            self._renewed_at = time.monotonic()
+            self._renewed_at = now
         else:
             found = self._store.leases.statuses(leases)
         for job_id, status in found.items():
@@ -168,11 +172,17 @@ class Dispatcher:
             elif status == JobStatus.CANCELING:
                 attempt.cancel()
 
-    def _abandon_expired(self) -> None:
-        """Without a store for as long as a lease: others may have the jobs by now."""
-        if time.monotonic() - self._renewed_at > self._settings.lease_seconds:
-            for attempt in self._running.values():
-                attempt.abandon()
+    def _abandon_late(self) -> None:
+        """End jobs whose leases could not be renewed, before these run out: in a thread of its own, since the one that
+        renews them may wait for a database that does not answer.
+        """
+        limit = _ABANDON_SHARE * self._settings.lease_seconds
+        while not self._ended.wait(_RENEW_SHARE * (self._settings.lease_seconds - limit)):
+            late = time.monotonic() - self._renewed_at
+            if late > limit:
+                for attempt in [each for each in self._running.copy().values() if not each.abandoned]:
+                    _log.error("%s is abandoned: no lease could be renewed for %.0f s", attempt.lease.job_id, late)
+                    attempt.abandon()
 
     def _shut_down(self) -> None:
         _log.info("shutting down: %d running jobs save their state", len(self._running))
@@ -184,10 +194,17 @@ class Dispatcher:
             with contextlib.suppress(SQLAlchemyError, LeaseLostError):
                 self._renew_leases()
             time.sleep(0.2)
+        self._ended.set()
         self._deliverer.stop()
         shutil.rmtree(self._work, ignore_errors=True)
 
     # --- housekeeping ----------------------------------------------------------------------------------------------
+
+    def _keep_house_now_and_then(self) -> None:
+        """In a thread of its own: leases are renewed meanwhile, however slow the store of files is."""
+        while not self._ended.is_set():
+            self._keep_house()
+            self._ended.wait(_HOUSEKEEPING_SECONDS)
 
     def _keep_house(self) -> None:
         try:
@@ -196,6 +213,9 @@ class Dispatcher:
             for job_id, epoch in self._store.retention.unswept(_SWEEPS):
                 sweep(self._store, self._artifacts, job_id, epoch)
             self._blobs.collect()
+            if time.monotonic() - self._strays_at > _STRAYS_SECONDS:
+                self._strays_at = time.monotonic()
+                remove_strays(self._store, self._artifacts)
         except Exception:  # stores of files raise what they like; running jobs are not to suffer
             _log.exception("not everything that is no longer needed could be removed; this is tried again")
 

@@ -27,7 +27,7 @@ class Wish(StrEnum):
 #: What a job's user is told where a machine, a network or the store of files has failed.
 OUTAGE = {
     "code": InfrastructureError.code,
-    "message": "A machine of the service, its network or its store of files has failed. The job is tried again by itself.",
+    "message": "A machine of the service, its network or its store of files has failed. The job is tried again.",
 }
 #: What the system says when the fault is a machine's: a full, broken or read-only disk, a file system that is away.
 _MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.ENOTCONN, errno.ENODEV)

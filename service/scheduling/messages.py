@@ -8,7 +8,7 @@ from typing import Any, Literal, TypedDict
 class Message(TypedDict, total=False):
     """What the process tells: `kind` and what belongs to it."""
 
-    kind: Literal["stage", "prepared", "left-out", "progress", "preview", "done", "interrupted", "failed"]
+    kind: Literal["stage", "prepared", "left-out", "stored", "progress", "preview", "done", "interrupted", "failed"]
     stage: str
     step: int
     total: int
@@ -17,6 +17,7 @@ class Message(TypedDict, total=False):
     seconds_left: float | None
     path: str
     gpus: list[str]
+    file: dict[str, Any]
     result: dict[str, Any]
     error: dict[str, Any]
     permanent: bool

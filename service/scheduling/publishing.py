@@ -1,4 +1,4 @@
-"""What attempts have made becomes visible: while they run, and the results at their end. Only the dispatcher does it."""
+"""What attempts have made becomes visible: while they run, and the results at their end. By the dispatcher alone."""
 
 from __future__ import annotations
 

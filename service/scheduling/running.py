@@ -21,17 +21,21 @@ from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.names import CHECKPOINT, RESULT
-from service.files.staging import stage
+from service.files.staging import Staged, layout, stage
+from service.files.stored_blobs import BLOBS
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.attempt_process import Task
 from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
 from service.scheduling.messages import Message
 from service.scheduling.packing import Grant
 from service.scheduling.publishing import Publisher
+from service.scheduling.stored_weights import store_weights
+from service.scheduling.workplace import StoredFile, StoreWorkplace
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.leases import Lease
+from service.store.leases import Lease, Published
 from service.store.states import AttemptOutcome
+from service.store.tables import ArtifactRow, BlobRow
 from sgsst_core.errors import SettingsError
 
 #: Progress is written this often at most: more would be writes that nobody sees.
@@ -79,6 +83,11 @@ class RunningAttempt:
         """Whether there is still something to do."""
         return self._thread.is_alive()
 
+    @property
+    def abandoned(self) -> bool:
+        """Whether it has ended, or was told to at once."""
+        return self._wish == Wish.ABANDON or not self.alive
+
     def start(self) -> None:
         """Begin."""
         self._thread.start()
@@ -92,8 +101,9 @@ class RunningAttempt:
         self._wish = self._wish or Wish.RELEASE
 
     def abandon(self) -> None:
-        """Another dispatcher has the job: end everything, and write nothing more."""
+        """Another dispatcher has the job, or may have it soon: end everything at once, and write nothing more."""
         self._wish = Wish.ABANDON
+        self._kill()  # the attempt's own thread may wait for a database that does not answer
 
     # --- in its thread ---------------------------------------------------------------------------------------------
 
@@ -155,20 +165,35 @@ class RunningAttempt:
 
     def _stage(self, parameters: JobParameters) -> None:
         job = self.lease.job
-        self._folder.mkdir(parents=True)
-        digests = sorted({entry["sha256"] for entry in job.inputs})
-        rows = self._store.inputs.blobs(digests)
-        staged = stage(self._folder, job.inputs, self._blobs.bring(rows, self._folder))
-        out = self._folder / "out"
-        out.mkdir()
+        (self._folder / "out").mkdir(parents=True)
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
-        if checkpoint is not None:
-            self._artifacts.fetch(checkpoint.location, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
+        workplace = self._workplace(checkpoint) if self._cluster and not self._artifacts.local else None
+        staged = layout(job.inputs)[0] if workplace else self._stage_here(checkpoint)
         if self.grant.memory is not None:
             parameters = parameters.model_copy(update={"memory_limit": self.grant.memory})
         seconds = self._settings.checkpoint_seconds, self._settings.preview_seconds
-        ranks = self.grant.ranks
-        Task(staged, parameters, ranks, self._cluster, checkpoint is not None, *seconds).save(self._folder)
+        ranks, resume = self.grant.ranks, checkpoint is not None
+        Task(staged, parameters, ranks, self._cluster, resume, *seconds, workplace).save(self._folder)
+
+    def _stage_here(self, checkpoint: ArtifactRow | None) -> Staged:
+        """Lay the job's files out in the attempt's folder."""
+        if checkpoint is not None:
+            target = self._folder / "out" / f"{Path(RESULT).stem}.checkpoint.safetensors"
+            self._artifacts.fetch(checkpoint.location, target)
+        return stage(self._folder, self.lease.job.inputs, self._blobs.bring(self._input_rows(), self._folder))
+
+    def _input_rows(self) -> dict[str, BlobRow]:
+        return self._store.inputs.blobs(sorted({entry["sha256"] for entry in self.lease.job.inputs}))
+
+    def _workplace(self, checkpoint: ArtifactRow | None) -> StoreWorkplace:
+        """What ranks on other machines need to lay the job's files out there."""
+        job = self.lease.job
+        files = [StoredFile(f"{BLOBS}/{row.location}", row.sha256, row.size) for row in self._input_rows().values()]
+        saved = StoredFile(checkpoint.location, checkpoint.sha256, checkpoint.size) if checkpoint is not None else None
+        weights = store_weights(self._artifacts.objects)
+        return StoreWorkplace(
+            self._artifacts.objects.url, job.id, self.lease.epoch, tuple(job.inputs), tuple(files), saved, weights
+        )
 
     def _launch(self) -> None:
         # a process without GPUs of its own must not see any
@@ -224,6 +249,8 @@ class RunningAttempt:
         """Act on what the process tells, but for its last word."""
         if message["kind"] == "left-out":
             self._give_back(message["gpus"])
+        if message["kind"] == "stored":
+            self._publisher.publish([Published(**message["file"])])
         if message["kind"] == "prepared":
             self._store.leases.begin(self.lease)
         if message["kind"] in ("stage", "prepared", "progress"):

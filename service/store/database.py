@@ -26,6 +26,14 @@ SCHEMA = "0004"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Seconds that a writer waits for another one's transaction. All are short.
 _BUSY_SECONDS = 30
+#: Of PostgreSQL's connections: a server that is cut off is noticed within some seconds, and not when TCP gives up.
+_LOST_AFTER = {
+    "connect_timeout": 5,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 10_000,
+}
 #: An Idempotency-Key is idempotency_row for so long.
 IDEMPOTENCY_SECONDS = 86_400.0
 #: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
@@ -51,6 +59,9 @@ class Database:
         }
         if self.sqlite:
             options["connect_args"] = {"timeout": _BUSY_SECONDS, "check_same_thread": False}
+        elif self.url.get_backend_name() == "postgresql":
+            options["connect_args"] = _LOST_AFTER
+            options["pool_timeout"] = _BUSY_SECONDS
         self.engine = create_engine(self.url, **options)
         if self.sqlite:
             event.listen(self.engine, "connect", _set_pragmas)

@@ -336,7 +336,7 @@ def _publish(session: Session, job: JobRow, files: Sequence[Published], now: flo
 
 
 def _outages(session: Session, job: JobRow) -> int:
-    """How many of the last attempts, one after the other, ended because of a machine, a network or the store of files."""
+    """How many of the last attempts in a row ended because of a machine, a network or the store of files."""
     query = select(AttemptRow.error).where(AttemptRow.job_id == job.id).order_by(AttemptRow.number.desc())
     count = 0
     for error in session.scalars(query.limit(_OUTAGES)):

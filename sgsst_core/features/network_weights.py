@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.features import network_sources as sources
 from sgsst_core.features.network_sources import Progress
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.cache_folder import cache_folder as cache_folder
 
 #: What `sgsst weights fetch` must be given to install each set of weights.
 _FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
@@ -71,17 +71,6 @@ class WeightsEntry:
     path: Path | None
     source: str
     size: int
-
-
-def cache_folder() -> Path:
-    """Where weights are kept: $SGSST_CACHE, or `sgsst` in the platform's cache folder."""
-    if chosen := os.environ.get("SGSST_CACHE"):
-        return Path(chosen).expanduser()
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "sgsst"
-    if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
-        return Path(local) / "sgsst" / "cache"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sgsst"
 
 
 def load_network_weights(name: str = "auto", folder: Path | None = None) -> BackboneWeights:

@@ -27,6 +27,7 @@ from worker.ranks.starting import start_ranks
 if TYPE_CHECKING:
     from worker.execute import Result
     from worker.request import Resume, StylizeRequest
+    from worker.workplace import Workplace
 
 #: Seconds that a stopping job has to finish its step and to save it.
 STOP_SECONDS = 10.0
@@ -44,6 +45,8 @@ class WorkerOptions:
         preview_folder: of pictures of the running job, as rank 0's machine sees it; None for none.
         preview_seconds: between two pictures, at least.
         actor: what runs a rank.
+        resume_required: whether a checkpoint that a request asks for, and that cannot be used, is an error.
+        workplace: of ranks on machines that share no folder; None for this process's working folder.
     """
 
     rank_timeout: float = RunOptions().rank_timeout
@@ -51,6 +54,8 @@ class WorkerOptions:
     preview_folder: Path | None = None
     preview_seconds: float = 20.0
     actor: type[RankProcess] = RankProcess
+    resume_required: bool = True
+    workplace: Workplace | None = None
 
 
 @dataclass
@@ -196,7 +201,7 @@ class _Attempts:
             raise AttemptFailedError(Failure("loss", f"Ray failed: {first_line(error)}", error)) from error
         finally:
             self._lost_at = time.monotonic()
-            end_ranks(self._group, self._cluster)
+            end_ranks(self._group, self._cluster, self._options.workplace)
 
     def _watch(self) -> Result | None:
         first = self._group.handles[0]
@@ -236,6 +241,7 @@ class _Attempts:
             workers={"asked": self._asked, "attempts": [asdict(attempt) for attempt in self._lost]},
             seconds_lost=time.monotonic() - self._relay.safe_at,
             seconds_since_loss=time.monotonic() - self._lost_at,
+            workplace=self._workplace(),
         )
 
     def _resume(self) -> Resume:
@@ -243,8 +249,13 @@ class _Attempts:
         from worker.request import Resume
 
         if not self._lost:
-            return Resume(self._request.resume)
+            return Resume(self._request.resume, self._options.resume_required)
         return Resume(True, required=False, run=None if self._request.resume else self._run_id)
+
+    def _workplace(self) -> Workplace | None:
+        """Of the next ranks: they go on from what those before have stored."""
+        workplace = self._options.workplace
+        return workplace and workplace.after(self._relay.stored)
 
     def _leave_out(self, rank: RankHandle) -> None:
         """End a rank that the plan does without, and let go of its GPU.

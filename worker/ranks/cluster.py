@@ -19,7 +19,7 @@ from types import TracebackType
 
 import psutil
 
-from sgsst_core.errors import RanksFailedError
+from sgsst_core.errors import ClusterAwayError, RanksFailedError
 from worker.ranks import sweeper
 from worker.ranks.failure_policy import first_line
 
@@ -69,7 +69,7 @@ class Cluster:
         """Start or join it.
 
         Raises:
-            RanksFailedError: it cannot be reached.
+            RanksFailedError: it cannot be started, or reached (ClusterAwayError).
         """
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError("Ray must be started on the main thread: it ends with the thread that started it")
@@ -90,7 +90,7 @@ class Cluster:
         try:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray has many for this, some of them plain ones
-            raise RanksFailedError(
+            raise ClusterAwayError(
                 f"The Ray cluster at {self.address} cannot be joined: {first_line(error)}. Check RAY_ADDRESS, or "
                 "leave it out for workers on this machine."
             ) from error

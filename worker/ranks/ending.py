@@ -9,18 +9,21 @@ from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster
 from worker.ranks.rank import RankPlace
 from worker.ranks.rank_group import RankGroup, RankHandle
+from worker.workplace import Workplace
 
 #: Seconds for processes on other machines to end.
 _REMOTE_SECONDS = 5.0
 
 
-def end_ranks(group: RankGroup, cluster: Cluster) -> None:
-    """End every rank of an attempt, and give its place back."""
+def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = None) -> None:
+    """End every rank of an attempt, and give its place back; what they leave in a workplace is removed."""
     kill([rank.place.process for rank in group.handles if rank.place and rank.place.process.home == home()])
     if cluster.alive():
         # What cannot be reached any more cannot be ended either, and its own node's daemon does it.
         with contextlib.suppress(Exception):
-            _end_remote(group)
+            _end_remote(group, workplace)
+    if workplace is not None:
+        workplace.tidy()
     group.reservation = None
 
 
@@ -33,7 +36,7 @@ def end_rank(rank: RankHandle) -> None:
     kill([rank.place.process])
 
 
-def _end_remote(group: RankGroup) -> None:
+def _end_remote(group: RankGroup, workplace: Workplace | None) -> None:
     import ray
 
     for rank in group.handles:
@@ -41,7 +44,7 @@ def _end_remote(group: RankGroup) -> None:
     if group.reservation is not None:
         group.reservation.release()
     places = [rank.place for rank in group.handles if rank.place and rank.place.process.home != home()]
-    pending = [_kill_on(place).remote([place.process]) for place in places]
+    pending = [_kill_on(place).remote([place.process], workplace) for place in places]
     if pending:
         ray.wait(pending, num_returns=len(pending), timeout=_REMOTE_SECONDS)
 
@@ -51,8 +54,10 @@ def _kill_on(place: RankPlace) -> Any:
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    def end(processes: list[ProcessId]) -> None:
+    def end(processes: list[ProcessId], workplace: Workplace | None) -> None:
         kill(processes)
+        if workplace is not None:
+            workplace.tidy()
 
     strategy = NodeAffinitySchedulingStrategy(place.node, soft=False)
     return ray.remote(end).options(num_cpus=0, max_retries=0, scheduling_strategy=strategy)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from worker.ranks.rank import RankStatus
 
@@ -28,6 +28,7 @@ class Listener:
         stop: asked a few times a second; True ends the job as "interrupted".
         preview: path of each picture of the running job.
         left_out: GPUs of this machine that the job has let go of, because the plan does without them.
+        stored: what a workplace told of each file that it has stored, in their order.
         planning: how far the survey of the views has come, a few times a second; again where an attempt that was lost
             had not saved its plan.
     """
@@ -39,6 +40,7 @@ class Listener:
     stop: Callable[[], bool] = lambda: False
     preview: Callable[[Path], None] = lambda path: None
     left_out: Callable[[Sequence[str]], None] = lambda gpus: None
+    stored: Callable[[Any], None] = lambda file: None
     planning: Callable[[PlanningProgress], None] = lambda progress: None
 
 
@@ -55,6 +57,7 @@ class Relay:
         saved: step of the last checkpoint; None where there is none.
         first_step: at which the present attempt began; None until it was prepared.
         last_step: that the present attempt has made, or went on from.
+        stored: what was told of all files that were stored, by any attempt.
         safe_at: when nothing was last lost: the beginning, then each checkpoint; monotonic seconds.
     """
 
@@ -66,7 +69,8 @@ class Relay:
         self.safe_at = time.monotonic()
         self._prepared = False
         self._planned = -1  # views that were last told of
-        self._warned = self._previewed = 0
+        self._warned = self._previewed = self._told_stored = 0
+        self.stored: list[Any] = []
 
     @property
     def farthest(self) -> tuple[int, int | None]:
@@ -76,7 +80,7 @@ class Relay:
     def begin_attempt(self) -> None:
         """Another set of ranks starts to tell."""
         self.first_step, self.last_step = None, self.saved or 0
-        self._warned = self._previewed = 0
+        self._warned = self._previewed = self._told_stored = 0
         self._planned = -1
 
     def pass_on(self, status: RankStatus) -> None:
@@ -87,6 +91,10 @@ class Relay:
         for path in status.previews[self._previewed :]:
             self._listener.preview(path)
         self._previewed = len(status.previews)
+        for file in status.stored[self._told_stored :]:
+            self.stored.append(file)
+            self._listener.stored(file)
+        self._told_stored = len(status.stored)
         self._pass_on_planning(status)
         self._pass_on_prepared(status)
         self._pass_on_progress(status)

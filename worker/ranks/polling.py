@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from sgsst_core.errors import InfrastructureError
 from worker.ranks.cluster import Cluster
 from worker.ranks.failure_policy import Failure, failure_of, first_line
 from worker.ranks.rank_group import AttemptFailedError, RankGroup, RankHandle
@@ -98,8 +99,8 @@ def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
             continue
         assert outcome.error is not None
         failure = failure_of(outcome.error, group.name_of(rank))
-        if failure.kind == "loss":
-            outcome.error.add_note(outcome.trace)
+        if failure.kind == "loss" or isinstance(outcome.error, InfrastructureError):
+            outcome.error.add_note(f"{group.name_of(rank)}:\n{outcome.trace}")
         raise AttemptFailedError(failure)
 
 

@@ -17,6 +17,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from sgsst_core.errors import InfrastructureError
 from worker.processes import ProcessId, die_with_parent, interface_towards
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from worker.description import Prepared
     from worker.execute import Result
     from worker.request import Resume, StylizeRequest
+    from worker.workplace import OpenWorkplace, Workplace
 
 #: Seconds by which an exchange waits longer than the driver: so the driver, which knows which rank gives no answer, is
 #: the first to notice.
@@ -61,7 +63,8 @@ class RankTask:
         address: "host:port" at which rank 0 listens.
         threads: for computing.
         timeout: seconds after which a rank that gives no answer counts as lost.
-        folder: from which relative paths are meant.
+        folder: from which relative paths are meant, on every machine; without a workplace.
+        workplace: where the files are on machines that share no folder; None where they do.
         resume: whether to go on from a checkpoint.
         run_id: identifies the run of the program.
         checkpoint_seconds: between checkpoints.
@@ -85,6 +88,7 @@ class RankTask:
     workers: dict[str, Any]
     seconds_lost: float
     seconds_since_loss: float
+    workplace: Workplace | None = None
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,10 @@ class RankStatus:
         planning: how far the survey of the views has come; None where there was none.
         prepared: once the inputs have been read; rank 0 alone.
         progress: of the last step; rank 0 alone.
-        saved: step of the last checkpoint that this rank has written.
+        saved: step of the last checkpoint that this rank has written, or stored where others find it.
         warnings: all so far.
         previews: paths of all pictures so far.
+        stored: what a workplace told of all files that it has stored so far.
         outcome: once it has ended.
     """
 
@@ -126,6 +131,7 @@ class RankStatus:
     saved: int | None = None
     warnings: tuple[str, ...] = ()
     previews: tuple[Path, ...] = ()
+    stored: tuple[Any, ...] = ()
     outcome: Outcome | None = None
 
 
@@ -170,13 +176,28 @@ class RankProcess:
             self._status = replace(self._status, **changes)
 
     def _run(self, task: RankTask) -> None:
+        place: OpenWorkplace | None = None
         try:
             _set_environment(task)
-            self._work(task)
+            if task.workplace is None:
+                _enter_folder(task)
+            else:
+                place = task.workplace.open(task.rank, self._add_stored)
+                os.chdir(place.folder)
+            self._work(task, place)
         except BaseException as error:
-            self._update(outcome=_failure(error))
+            if self._status.outcome is None:  # who is done may leave the others as it likes
+                self._update(outcome=_failure(error))
+        finally:
+            if place is not None:
+                self._leave(place)
 
-    def _work(self, task: RankTask) -> None:
+    @staticmethod
+    def _leave(place: OpenWorkplace) -> None:
+        os.chdir("/")
+        place.close()
+
+    def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         import torch
 
         from sgsst_core.parallel.collectives import RankLeftOut
@@ -188,7 +209,11 @@ class RankProcess:
         with process_group(task.rank, task.size, task.address, device=device, timeout=timeout) as collectives:
             # The outcome is told inside the block: leaving the group may have to wait for ranks that are lost.
             try:
-                self._update(outcome=Outcome("done", self._job(task, collectives)))
+                result = self._job(task, collectives)
+                if place is not None:
+                    place.finish(done=result.stopped != "interrupted")
+                    self._leave(place)
+                self._update(outcome=Outcome("done", result))
             except RankLeftOut:
                 self._update(outcome=Outcome("left-out"))
             except BaseException as error:
@@ -228,13 +253,18 @@ class RankProcess:
             preview=Previews(task.preview_folder, task.preview_seconds, self._add_preview, self._add_warning)
             if task.preview_folder
             else None,
-            saved=lambda step: self._update(saved=step),
+            saved=lambda step: self._update(saved=step) if task.workplace is None else None,
             checkpoint_seconds=task.checkpoint_seconds,
             run_id=task.run_id,
         )
 
     def _add_preview(self, path: Path) -> None:
         self._update(previews=(*self._status.previews, path))
+
+    def _add_stored(self, file: Any, step: int | None) -> None:
+        with self._lock:
+            saved = self._status.saved if step is None else step
+            self._status = replace(self._status, stored=(*self._status.stored, file), saved=saved)
 
     def _add_warning(self, line: str) -> None:
         self._update(warnings=(*self._status.warnings, line))
@@ -251,8 +281,29 @@ def _set_environment(task: RankTask) -> None:
     if interface:
         for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
             os.environ.setdefault(name, interface)
+
+
+def _enter_folder(task: RankTask) -> None:
+    """Make the folder from which relative paths are meant the working folder.
+
+    Raises:
+        InfrastructureError: it is not on this machine, and the job has relative paths.
+    """
     if task.folder.is_dir():
         os.chdir(task.folder)
+    elif not all(path.is_absolute() for path in _paths(task.request)):
+        raise InfrastructureError(
+            f"The folder {task.folder} is not on {socket.gethostname()}. Machines that take part in a job need it "
+            "under this name, or a service whose files are in an object store."
+        )
+
+
+def _paths(request: StylizeRequest) -> list[Path]:
+    """All paths of a job that are given."""
+    styles = [*request.styles, *(style for region in request.regions for style in region.styles)]
+    masks = [region.selection.path for region in request.regions if region.selection]
+    found = [request.source.scene, request.source.cameras, *(style.path for style in styles), *masks]
+    return [path for path in [*found, request.images, request.out] if path is not None]
 
 
 def set_thread_variables(threads: int) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from sgsst_core.errors import ClusterAwayError
 from worker.ranks.failure_policy import Failure
 from worker.ranks.placement import NoRoomError, reserve
 from worker.ranks.rank import RankPlace, RankProcess, RankTask
@@ -35,7 +36,7 @@ def start_ranks(group: RankGroup, workers: int, actor: type[RankProcess], make_t
     try:
         group.reservation = reserve(workers)
     except NoRoomError as error:
-        raise AttemptFailedError(Failure("loss", str(error))) from error
+        raise AttemptFailedError(Failure("loss", str(error), ClusterAwayError(f"{error}."))) from error
     kind = ray.remote(actor)
     group.handles = [RankHandle(kind.options(**options).remote()) for options in group.reservation.actor_options()]
     places = _from_all(group, "place")

@@ -5,7 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -111,12 +114,32 @@ def test_a_bucket_that_is_not_there_is_not_ready(artifacts: Artifacts) -> None:
         Artifacts("s3://nowhere/x").ping()
 
 
-def test_a_job_whose_results_are_in_a_bucket(environment: dict[str, str], tmp_path: Path, tiny_installed: Path) -> None:
+@contextmanager
+def dispatcher(data: Path, environment: dict[str, str]) -> Iterator[None]:
+    """A dispatcher with a data folder of its own."""
+    command = [sys.executable, "-m", "service.scheduling.dispatcher"]
+    with data.with_suffix(".log").open("ab") as log:
+        process = subprocess.Popen(command, env={**environment, "SGSST_DATA": str(data)}, stdout=log, stderr=log)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(120)
+
+
+def test_api_and_dispatcher_share_a_bucket_and_no_folder(
+    environment: dict[str, str], tmp_path: Path, tiny_installed: Path
+) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
     files = {"scene": ply, "cameras": cameras, "style": style}
     parameters = {"preset": "standard", "steps_sos": 4, "backbone": "vgg16", "early_stop": False, "seed": 1}
     expected = undisturbed(files, parameters, tmp_path).read_bytes()
-    with Service(tmp_path / "data", SGSST_ARTIFACTS="s3://results/service") as service, service.client() as client:
+    shared = {"SGSST_ARTIFACTS": "s3://results/service", "SGSST_DATABASE": f"sqlite:///{tmp_path / 'shared.db'}"}
+    with (
+        Service(tmp_path / "api", alone=True, **shared) as service,
+        dispatcher(tmp_path / "dispatcher", service.environment),
+        service.client() as client,
+    ):
         body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
         answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
         assert answer.status_code == 202, answer.text
@@ -132,8 +155,10 @@ def test_a_job_whose_results_are_in_a_bucket(environment: dict[str, str], tmp_pa
         assert result.content == expected
         tail = client.get(f"{where}/artifacts/stylized.ply", headers={"Range": "bytes=-100"})
         assert (tail.status_code, tail.content) == (206, expected[-100:])
-        assert not (service.data / "artifacts").exists()
-        assert not (service.data / "blobs").exists(), "inputs are there, too"
+        for folder in (service.data, tmp_path / "dispatcher"):
+            assert not (folder / "artifacts").exists()
+            assert not (folder / "blobs").exists(), "inputs are in the bucket, too"
+            assert len(list((folder / "cache" / "files").glob("*/*"))) == 3
         assert client.delete(where).status_code == 204
         assert client.get(f"{where}/artifacts/stylized.ply").status_code == 404
     listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/job_"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -112,6 +113,53 @@ def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store
             lambda: [row.name for row in store.operations.dispatchers()] == [dispatcher.name],
             "the dead to be forgotten",
         )
+
+
+def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The database does not answer: the thread that renews leases waits for it, and others will take the job over."""
+    settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, lease_seconds=4)
+    store = open_store(settings)
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    released = threading.Event()
+    abandoned = threading.Event()
+
+    def renew(leases: list[Lease]) -> dict[str, None]:
+        released.wait(60)
+        return {}
+
+    class Attempt:
+        """An attempt that runs for ever."""
+
+        def __init__(self, lease: Lease, grant: Grant, *others: object) -> None:
+            self.lease, self.grant = lease, grant
+
+        alive = True
+
+        @property
+        def abandoned(self) -> bool:
+            return abandoned.is_set()
+
+        def start(self) -> None:
+            self.started = time.monotonic()
+
+        def abandon(self) -> None:
+            abandoned.set()
+
+        def release(self) -> None:
+            self.alive = False
+
+    monkeypatch.setattr("service.scheduling.dispatcher.RunningAttempt", Attempt)
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    with at_work(settings, store):
+        monkeypatch.setattr(store.leases, "renew", renew)
+        job, _ = store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+        wait_for(lambda: store.jobs.get(job.id, None).status == "starting", "the job to be taken")
+        assert abandoned.wait(60)
+        expires = store.jobs.get(job.id, None).lease_expires_at
+        assert expires is not None
+        assert store.database.clock() < expires, "nobody else can have the job yet"
+        released.set()
+    store.close()
 
 
 def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:

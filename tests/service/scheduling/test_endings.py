@@ -13,7 +13,14 @@ from service.scheduling.attempt_process import failure
 from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
 from service.scheduling.messages import Message
 from service.store.states import AttemptOutcome
-from sgsst_core.errors import ImageError, InfrastructureError, OutputError, RanksFailedError, WeightsError
+from sgsst_core.errors import (
+    ClusterAwayError,
+    ImageError,
+    InfrastructureError,
+    OutputError,
+    RanksFailedError,
+    WeightsError,
+)
 
 DONE: Message = {"kind": "done", "result": {"steps": 3}}
 INTERRUPTED: Message = {"kind": "interrupted"}
@@ -81,6 +88,7 @@ def test_a_process_without_a_last_word_has_crashed(last: Message | None, code: i
         (OSError(errno.ENOSPC, "No space left on device"), True),
         (OSError(errno.EINVAL, "Invalid argument"), False),
         (ImageError("style.png: is not an image"), False),
+        (ClusterAwayError("The Ray cluster at head:6379 cannot be joined."), True),
         (RanksFailedError("3 attempts in a row came no further than step 0."), False),
     ],
 )

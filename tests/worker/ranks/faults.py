@@ -21,6 +21,7 @@ from tests.small_scenes import wall, write_files
 from worker.ranks.rank import RankProcess, RankTask
 from worker.request import SceneRequest, StylizeRequest
 from worker.styles import StyleFile
+from worker.workplace import OpenWorkplace
 
 Place = Literal[
     "render",
@@ -88,12 +89,12 @@ class Fault:
 class FaultyRank(RankProcess):
     """A rank to which the fault that lies beside its output happens."""
 
-    def _work(self, task: RankTask) -> None:
+    def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         if _file(task.request).exists():
             fault = Fault(**json.loads(_file(task.request).read_text()))
             if fault.rank == task.rank:
                 fault.arm(task.request)
-        super()._work(task)
+        super()._work(task, place)
 
 
 def fired(request: StylizeRequest) -> float | None:

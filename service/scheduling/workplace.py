@@ -1,0 +1,264 @@
+"""A job's files on a machine that shares nothing with the dispatcher's but the store of files (`worker.workplace`).
+
+Settings are those of the machine itself: the Ray node's environment says where its folder is (`SGSST_DATA`; a temporary
+one by default), how large its cache may be, and how the store knows it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import secrets
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from service.errors import StoreError
+from service.files.artifacts import Artifacts
+from service.files.names import CHECKPOINT, RESULT
+from service.files.objects import ObjectStore
+from service.files.staging import stage
+from service.files.stored_blobs import open_cache
+from service.scheduling.outbox import Outbox
+from service.scheduling.publishing import put_patiently
+from service.settings import ServiceSettings
+from service.store.leases import Published
+from sgsst_core.errors import InfrastructureError
+from worker.workplace import Stored
+
+#: Seconds between two looks for what a job has made.
+_LOOK_SECONDS = 0.5
+#: What the store did not take is put again after so long.
+_AGAIN_SECONDS = 5.0
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file of the store.
+
+    Attributes:
+        name: of the object.
+        sha256, size: of its content.
+    """
+
+    name: str
+    sha256: str
+    size: int
+
+
+@dataclass(frozen=True)
+class StoreWorkplace:
+    """What a rank needs to know of its job's files.
+
+    Attributes:
+        url: of the store.
+        job_id, epoch: under which the job's files are stored.
+        inputs: `role`, `name` and `sha256` of each, for `stage`.
+        files: the inputs by digest.
+        checkpoint: to go on from; None for none.
+        weights: of feature networks, by the names of their files; empty for those that the machine has itself.
+    """
+
+    url: str
+    job_id: str
+    epoch: int
+    inputs: tuple[dict[str, Any], ...]
+    files: tuple[StoredFile, ...]
+    checkpoint: StoredFile | None
+    weights: dict[str, StoredFile]
+
+    def as_json(self) -> dict[str, Any]:
+        """For `from_json`."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> StoreWorkplace:
+        """What `as_json` gave."""
+        checkpoint = values["checkpoint"]
+        return StoreWorkplace(
+            values["url"],
+            values["job_id"],
+            values["epoch"],
+            tuple(values["inputs"]),
+            tuple(StoredFile(**file) for file in values["files"]),
+            StoredFile(**checkpoint) if checkpoint else None,
+            {name: StoredFile(**file) for name, file in values["weights"].items()},
+        )
+
+    def open(self, rank: int, stored: Stored) -> RankFolder:
+        """Fetch what is not in this machine's cache, and link the rest: once for all ranks of a machine.
+
+        Raises:
+            InfrastructureError: the store is away or has lost a file, or the disk is full.
+        """
+        try:
+            return RankFolder(self, rank, stored)
+        except OSError as error:
+            raise InfrastructureError(f"The job's files cannot be laid out here: {error}.") from error
+
+    def after(self, stored: Sequence[Published]) -> StoreWorkplace:
+        """With the last checkpoint of these files."""
+        found = [file for file in stored if file.name == CHECKPOINT]
+        if not found:
+            return self
+        return replace(self, checkpoint=StoredFile(found[-1].location, found[-1].sha256, found[-1].size))
+
+    def tidy(self) -> None:
+        """Remove the folders of ranks of this machine that are no more."""
+        _remove_left(_ranks_folder(node_settings()))
+
+
+class RankFolder:
+    """A rank's folder: it is locked as long as the rank lives, so that others can tell what was left behind."""
+
+    def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
+        settings = node_settings()
+        above = _ranks_folder(settings)
+        above.mkdir(parents=True, exist_ok=True)
+        _remove_left(above)
+        self._above = above / f"{workplace.job_id}-{workplace.epoch}-{rank}-{secrets.token_hex(4)}"
+        with _locked(above / "all"):  # or it would be taken for one that was left
+            self._above.mkdir()
+            self._lock = (self._above / "lock").open("w")
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self.folder = self._above / "job"
+        self._shipper: _Shipper | None = None
+        try:
+            self._lay_out(workplace, settings, rank)
+        except BaseException:
+            self.close()
+            raise
+        if rank == 0:
+            outbox = Outbox(workplace.job_id, workplace.epoch, self.folder / "out", Artifacts(workplace.url))
+            self._shipper = _Shipper(outbox, stored)
+
+    def _lay_out(self, workplace: StoreWorkplace, settings: ServiceSettings, rank: int) -> None:
+        cache, objects = open_cache(settings), ObjectStore(workplace.url)
+        kept, weights, out = self._above / "files", self._above / "weights", self.folder / "out"
+        for path in (kept, weights, out):
+            path.mkdir(parents=True)
+
+        def link(file: StoredFile, target: Path) -> Path:
+            cache.link(file.sha256, file.size, target, partial(objects.get, file.name))
+            return target
+
+        blobs = {file.sha256: link(file, kept / file.sha256) for file in workplace.files}
+        stage(self.folder, workplace.inputs, blobs)
+        for name, file in workplace.weights.items():
+            link(file, weights / name)
+        if workplace.weights:
+            os.environ["SGSST_CACHE"] = str(weights)
+        if workplace.checkpoint is not None and rank == 0:
+            _fetch_checkpoint(objects, workplace.checkpoint, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
+
+    def finish(self, *, done: bool) -> None:
+        """Store what is left: a checkpoint, or the results.
+
+        Raises:
+            StoreError: the store was away for too long.
+        """
+        if self._shipper is not None:
+            self._shipper.finish(done=done)
+
+    def close(self) -> None:
+        """Remove the folder."""
+        if self._shipper is not None:
+            self._shipper.stop()
+        shutil.rmtree(self._above, ignore_errors=True)
+        self._lock.close()
+
+
+class _Shipper:
+    """Stores what a job makes while it makes it, in a thread of its own: steps do not wait for the store."""
+
+    def __init__(self, outbox: Outbox, stored: Stored) -> None:
+        self._outbox, self._stored = outbox, stored
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="shipper", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(_LOOK_SECONDS):
+            try:
+                refused = self._ship()
+            except Exception:  # whatever it is, the job goes on
+                _log.exception("what the job has made could not be stored")
+                refused = None
+            if refused is not None:
+                _log.warning("what the job has made could not be stored: %s", refused.__cause__ or refused)
+                self._stop.wait(_AGAIN_SECONDS)
+
+    def _ship(self) -> StoreError | None:
+        put, refused = self._outbox.put(self._outbox.unfinished())
+        self._tell(put)
+        return refused
+
+    def _tell(self, files: Sequence[Published]) -> None:
+        for file in files:
+            self._stored(file, file.step)
+
+    def finish(self, *, done: bool) -> None:
+        self.stop()
+        if done:
+            self._tell(put_patiently(self._outbox, lambda: False))
+        refused = self._ship()
+        if refused is not None and not done:
+            time.sleep(_AGAIN_SECONDS)
+            refused = self._ship()
+            if refused is not None:
+                raise refused
+
+    def stop(self) -> None:
+        self._stop.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+
+def node_settings() -> ServiceSettings:
+    """Settings of this machine, whose folder is a temporary one unless its environment names another."""
+    if os.environ.get("SGSST_DATA"):
+        return ServiceSettings()
+    return ServiceSettings(data=Path(tempfile.gettempdir()) / f"sgsst-{os.getuid()}")
+
+
+def _ranks_folder(settings: ServiceSettings) -> Path:
+    return settings.folder / "ranks"
+
+
+def _remove_left(above: Path) -> None:
+    """Remove folders whose locks nobody holds."""
+    if not above.is_dir():
+        return
+    with _locked(above / "all"):
+        for path in above.iterdir():
+            if not path.is_dir():
+                continue
+            with contextlib.suppress(OSError), (path / "lock").open("a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(path, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Any:
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _fetch_checkpoint(objects: ObjectStore, checkpoint: StoredFile, target: Path) -> None:
+    """Bring a checkpoint; one that has been replaced meanwhile is no longer there, and the job begins anew."""
+    try:
+        objects.get(checkpoint.name, target)
+    except FileNotFoundError:
+        target.unlink(missing_ok=True)
+        _log.warning("the checkpoint %s is gone: the job begins anew", checkpoint.name)

@@ -1,0 +1,52 @@
+"""Files of jobs that nothing refers to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from service.files.artifacts import Artifacts
+from service.scheduling import strays
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.leases import Lease, Published
+
+SHA = "a" * 64
+
+
+def lease(store: Store) -> Lease:
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+    found = store.leases.take("one")
+    assert found is not None
+    return found
+
+
+def test_what_comes_too_late_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = ServiceSettings(data=tmp_path / "data")
+    store, artifacts = open_store(settings), Artifacts(settings.artifacts_url)
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    source = tmp_path / "file"
+    source.write_bytes(b"x")
+
+    def put(job_id: str, epoch: int) -> Published:
+        return artifacts.put(job_id, epoch, "plan.json", source)
+
+    done, running = lease(store), lease(store)
+    kept = put(done.job_id, 1)
+    store.leases.succeed(done, [kept], {})
+    late, unknown = put(done.job_id, 1), put("job_0123456789", 1)
+    store.leases.release(running)
+    again = store.leases.take("two")
+    assert again is not None
+    assert again.epoch == 2
+    before, own = put(running.job_id, 1), put(running.job_id, 2)
+    everything = {file.location for file in (kept, late, unknown, before, own)}
+    assert set(artifacts.objects.below("")) == everything
+    assert strays.remove_strays(store, artifacts) == 0, "rows may still be on their way"
+    monkeypatch.setattr(strays, "_STRAY_SECONDS", -60.0)
+    assert strays.remove_strays(store, artifacts) == 3
+    assert set(artifacts.objects.below("")) == {kept.location, own.location}
+    store.close()

@@ -1,0 +1,207 @@
+"""A rank's folder on a machine that shares nothing with others but the store of files."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import pickle
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from service.errors import StoreError
+from service.files.artifacts import Artifacts
+from service.files.cache import file_digest
+from service.files.names import CHECKPOINT
+from service.scheduling import publishing, workplace
+from service.scheduling.stored_weights import store_weights
+from service.scheduling.workplace import StoredFile, StoreWorkplace
+from service.store.leases import Published
+from sgsst_core.errors import InfrastructureError
+from sgsst_core.features.network_weights import load_network_weights
+from tests.api.service import wait_for
+from tests.service.files.s3 import FaultyS3, environment_of, s3_server
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    with s3_server() as url:
+        assert httpx.put(f"{url}/files").status_code == 200
+        yield url
+
+
+@pytest.fixture
+def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyS3]:
+    faulty = FaultyS3(server)
+    for name, value in environment_of(faulty.url).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
+    monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
+    monkeypatch.setattr(workplace, "_LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(workplace, "_AGAIN_SECONDS", 0.1)
+    monkeypatch.setattr(publishing, "_AGAIN_SECONDS", 0.1)
+    yield faulty
+    faulty.heal()
+    faulty.close()
+
+
+@dataclass
+class Heard:
+    """What was told of stored files."""
+
+    files: list[Published] = field(default_factory=list)
+    steps: list[int | None] = field(default_factory=list)
+
+    def __call__(self, file: Any, step: int | None) -> None:
+        self.files.append(file)
+        self.steps.append(step)
+
+    def names(self) -> set[str]:
+        return {file.name for file in self.files}
+
+
+def put(url: str, name: str, data: bytes, folder: Path) -> StoredFile:
+    path = folder / os.urandom(4).hex()
+    path.write_bytes(data)
+    Artifacts(url).objects.put(path, name)
+    return StoredFile(name, file_digest(path), len(data))
+
+
+@pytest.fixture
+def job(s3: FaultyS3, tmp_path: Path) -> StoreWorkplace:
+    url = f"s3://files/{os.urandom(4).hex()}"
+    contents = {"scene": b"scene", "style": b"style", "cameras": b"{}"}
+    files = {role: put(url, f"blobs/{role}", data, tmp_path) for role, data in contents.items()}
+    names = {"scene": "my.ply", "style": "style.png", "cameras": "cameras.json"}
+    inputs = tuple({"role": role, "name": names[role], "sha256": file.sha256} for role, file in files.items())
+    return StoreWorkplace(url, "job_1", 3, inputs, tuple(files.values()), None, {})
+
+
+def checkpoint(folder: Path, step: int) -> None:
+    path = folder / "out" / "stylized.checkpoint.safetensors"
+    save_file({"x": np.zeros(3)}, path.with_suffix(".new"), {"step": str(step)})
+    path.with_suffix(".new").replace(path)
+
+
+def test_a_job_is_laid_out_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: StoreWorkplace, tmp_path: Path) -> None:
+    job = pickle.loads(pickle.dumps(StoreWorkplace.from_json(json.loads(json.dumps(job.as_json())))))
+    before = len(s3.asked)
+    ranks = [job.open(number, Heard()) for number in (1, 2)]
+    fetched = [path for method, path in s3.asked[before:] if method == "GET"]
+    assert sorted(path.rpartition("/")[2] for path in fetched) == ["cameras", "scene", "style"]
+    for rank in ranks:
+        assert (rank.folder / "scene" / "my.ply").read_bytes() == b"scene"
+        assert (rank.folder / "cameras" / "cameras.json").read_bytes() == b"{}"
+        rank.close()
+        rank.close()
+    assert not [path for path in (tmp_path / "node" / "ranks").iterdir() if path.is_dir()]
+
+
+def test_what_the_first_rank_makes_is_stored_while_it_makes_it(job: StoreWorkplace) -> None:
+    heard = Heard()
+    rank = job.open(0, heard)
+    out = rank.folder / "out"
+    (out / "stylized.plan.json").write_text("{}")
+    checkpoint(rank.folder, 10)
+    wait_for(lambda: heard.names() == {"plan.json", CHECKPOINT}, "the files to be stored")
+    checkpoint(rank.folder, 25)
+    wait_for(lambda: heard.steps[-1] == 25, "the checkpoint to be stored")
+    assert all(file.location.startswith("job_1/3/") for file in heard.files), "under the attempt's epoch"
+    (out / "stylized.ply").write_bytes(b"ply")
+    (out / "stylized.report.json").write_text("{}")
+    rank.finish(done=True)
+    assert heard.names() == {"plan.json", CHECKPOINT, "stylized.ply", "report.json"}
+    result = next(file for file in heard.files if file.name == "stylized.ply")
+    assert b"".join(Artifacts(job.url).read(result.location, 0, result.size)) == b"ply"
+    rank.close()
+    assert not rank.folder.exists()
+    following = job.after(heard.files)
+    assert following.checkpoint is not None
+    again = following.open(0, Heard())
+    assert (again.folder / "out" / "stylized.checkpoint.safetensors").stat().st_size == following.checkpoint.size
+    again.close()
+    assert job.after([]) == job
+
+
+def test_a_store_that_is_away_for_a_while_loses_nothing(s3: FaultyS3, job: StoreWorkplace) -> None:
+    heard = Heard()
+    rank = job.open(0, heard)
+    s3.fail("reset", 10**6)
+    checkpoint(rank.folder, 10)
+    (rank.folder / "out" / "stylized.ply").write_bytes(b"ply")
+    time.sleep(0.3)
+    assert heard.files == []
+    healing = threading.Timer(1.0, s3.heal)
+    healing.start()
+    rank.finish(done=True)
+    healing.join()
+    assert heard.names() == {CHECKPOINT, "stylized.ply"}
+    rank.close()
+
+
+def test_what_a_machine_lacks_is_the_machines_fault(
+    s3: FaultyS3, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = replace(job, files=(*job.files[:2], StoredFile("blobs/none", "e" * 64, 3)))
+    with pytest.raises(StoreError, match="has lost"):
+        gone.open(1, Heard())
+    s3.fail("reset", 10**6)
+    with pytest.raises(StoreError, match="does not answer") as raised:
+        job.open(1, Heard())
+    assert pickle.loads(pickle.dumps(raised.value)).code == "store-unavailable", "it travels from rank to dispatcher"
+    s3.heal()
+    (tmp_path / "full").write_bytes(b"a file where the folder should be")
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path / "full" / "data"))
+    with pytest.raises(InfrastructureError, match="cannot be laid out"):
+        job.open(1, Heard())
+
+
+def test_weights_come_by_digest(
+    job: StoreWorkplace, tiny_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SGSST_CACHE", str(tiny_cache))
+    expected = load_network_weights("vgg16").sha256
+    weights = store_weights(Artifacts(job.url).objects)
+    assert "vgg16.safetensors" in weights
+    assert store_weights(Artifacts(job.url).objects) == weights
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "nothing is installed here"))
+    rank = replace(job, weights=weights).open(1, Heard())
+    assert os.environ["SGSST_CACHE"] != str(tiny_cache)
+    assert load_network_weights("auto").sha256 == expected
+    rank.close()
+
+
+def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
+    rank = job.open(0, Heard())
+    ready.set()
+    time.sleep(600)
+    rank.close()
+
+
+def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Path) -> None:
+    spawned = multiprocessing.get_context("spawn")
+    ready = spawned.Event()
+    process = spawned.Process(target=_open_and_wait, args=(job, ready))
+    process.start()
+    assert ready.wait(120)
+    own = job.open(1, Heard())
+
+    def folders() -> int:
+        return sum(path.is_dir() for path in (tmp_path / "node" / "ranks").iterdir())
+
+    assert folders() == 2, "who lives is left alone"
+    process.kill()
+    process.join()
+    job.tidy()
+    assert folders() == 1
+    assert (own.folder / "scene" / "my.ply").exists()
+    own.close()
