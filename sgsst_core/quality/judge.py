@@ -28,6 +28,7 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.stylizing.regions import JobStyles
 
 #: Longer side in pixels at which views are judged: figures of one scene at several resolutions can be compared, and a
 #: view of many megapixels costs no more than one of one.
@@ -68,7 +69,8 @@ class Judge:
 
     Args:
         lpips: with AlexNet.
-        style: a picture [H, W, 3] in 0..1, or several with their weights: the mixture's Gram matrices and palette.
+        style: a picture [H, W, 3] in 0..1, or several with their weights: the mixture's Gram matrices and palette. Of
+            regions, `style` and `palette` are means of each region's by their shares of a view; kept ones have none.
         scene: unstylized.
         rasterizer: of the scene.
         cameras: of the views; larger ones than `JUDGED_SIDE` are judged at that size. Those that see next to nothing
@@ -82,7 +84,7 @@ class Judge:
     def __init__(
         self,
         lpips: Lpips,
-        style: Tensor | StyleMixture,
+        style: Tensor | StyleMixture | JobStyles,
         scene: Scene,
         rasterizer: Rasterizer,
         cameras: Sequence[Camera],
@@ -90,23 +92,16 @@ class Judge:
     ) -> None:
         self.scene = scene
         self._lpips, self._rasterizer = lpips, rasterizer
-        self._style = StyleMixture.of(style).map(lambda picture: picture.to(lpips.device, torch.float32))
+        styles = style if isinstance(style, JobStyles) else JobStyles(StyleMixture.of(style))
+        self._judges = [_StyleJudge(lpips, each) for each in styles.each or (styles.own,)]
+        self._maps = styles.maps(rasterizer)
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
         self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
-        self._palette = mixed_moments(
-            [
-                _moments(picture.reshape(-1, 3), picture.new_ones(picture[..., 0].numel()))
-                for picture in self._style.pictures
-            ],
-            self._style.weights,
-        )
-        self._targets: dict[tuple[int, int], list[Tensor]] = {}
         small = [resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras]
         self.cameras = [
             camera
             for camera in small
-            if min(camera.width, camera.height) >= lpips.minimum_side
-            and float(rasterizer.coverage(camera).mean()) >= _LEAST_COVERAGE
+            if min(camera.width, camera.height) >= lpips.minimum_side and self._covered(camera) >= _LEAST_COVERAGE
         ]
 
     @torch.no_grad()
@@ -137,6 +132,7 @@ class Judge:
         image, coverage = self._render(sh_dc, camera)
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
+        parts = self._parts(camera, weights)
         found = []
         for behind in _BEHIND:
             picture, original = (self._on(values, coverage, camera, behind) for values in (image, before))
@@ -144,13 +140,19 @@ class Judge:
             distance = self._lpips.between(own, theirs, (camera.height, camera.width)).map
             found.append(
                 (
-                    self._style_distance(own, weights),
-                    frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette),
+                    sum(share * judge.distance(own, part) for judge, part, share in parts),
+                    sum(share * judge.palette(picture, part) for judge, part, share in parts),
                     _weighted_mean(distance, weights),
                     fmean(_turned(x, y, weights) for x, y in zip(own, theirs, strict=True)),
                 )
             )
         return found
+
+    def _covered(self, camera: Camera) -> float:
+        """Share of a view that is judged."""
+        if self._maps is not None:
+            return float(self._maps.render(camera).sum(dim=2).mean())
+        return float(self._rasterizer.coverage(camera).mean())
 
     def _render(self, sh_dc: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         """Image [H, W, 3] over the rasterizer's background, and coverage [H, W]."""
@@ -163,25 +165,50 @@ class Judge:
         """The picture with another colour behind the Gaussians."""
         return shown(image + (1 - coverage)[..., None] * (behind - self._background), camera, self._lpips.device)
 
-    def _style_distance(self, features: list[Tensor], coverage: Tensor) -> float:
-        targets = self._style_grams((int(coverage.shape[0]), int(coverage.shape[1])))
+    def _parts(self, camera: Camera, coverage: Tensor) -> list[tuple[_StyleJudge, Tensor, float]]:
+        """Each style with its position weights [h, w] and its share of a view: a region's own, or what is covered."""
+        if self._maps is None:
+            return [(self._judges[0], coverage, 1.0)]
+        weights = [share.to(coverage) for share in self._maps.render(camera).unbind(2)]
+        sums = [float(share.sum(dtype=torch.float64)) for share in weights]
+        parts = zip(self._judges, weights, sums, strict=True)
+        return [(judge, share, own / sum(sums)) for judge, share, own in parts if own > 0]
+
+
+class _StyleJudge:
+    """Judges pictures by one style."""
+
+    def __init__(self, lpips: Lpips, style: StyleMixture) -> None:
+        self._lpips = lpips
+        self._style = style.map(lambda picture: picture.to(lpips.device, torch.float32))
+        moments = [_moments(each.reshape(-1, 3), each.new_ones(each[..., 0].numel())) for each in self._style.pictures]
+        self._palette = mixed_moments(moments, style.weights)
+        self._targets: dict[tuple[int, int], list[Tensor]] = {}
+
+    def palette(self, picture: Tensor, weights: Tensor) -> float:
+        """Frechet distance of the colours of a picture [H, W, 3] with position weights [H, W]."""
+        return frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette)
+
+    def distance(self, features: list[Tensor], weights: Tensor) -> float:
+        """Relative distance of Gram matrices of a picture's features [h, w, c] by layer, position weights [H, W]."""
+        targets = self._grams((int(weights.shape[0]), int(weights.shape[1])))
         distances = []
         for values, target in zip(features, targets, strict=True):
-            gram = _gram(values, _pooled(coverage, values))
+            gram = _gram(values, _pooled(weights, values))
             distances.append(float((gram - target).norm() / target.norm().clamp_min(torch.finfo(target.dtype).tiny)))
         return fmean(distances)
 
-    def _style_grams(self, view: tuple[int, int]) -> list[Tensor]:
+    def _grams(self, view: tuple[int, int]) -> list[Tensor]:
         """The style's Gram matrices at the size that it has in the loss of such a view; at least AlexNet's least."""
         if view not in self._targets:
-            every = [self._grams(picture, view) for picture in self._style.pictures]
+            every = [self._grams_of(picture, view) for picture in self._style.pictures]
             self._targets[view] = [
                 reduce(operator.add, [weight * gram for gram, weight in zip(grams, self._style.weights, strict=True)])
                 for grams in zip(*every, strict=True)
             ]
         return self._targets[view]
 
-    def _grams(self, picture: Tensor, view: tuple[int, int]) -> list[Tensor]:
+    def _grams_of(self, picture: Tensor, view: tuple[int, int]) -> list[Tensor]:
         """Of one picture of the style."""
         height, width = style_size((picture.shape[0], picture.shape[1]), view)
         enlarged = max(1.0, self._lpips.minimum_side / min(height, width))

@@ -128,7 +128,7 @@ class Measurements:
             return
         views = [held_out.cameras[index] for index in held_out.views]
         background = stylizer.settings.background
-        judge = Judge(held_out.lpips, stylizer.style, held_out.scene, held_out.rasterizer, views, background)
+        judge = Judge(held_out.lpips, stylizer.styles, held_out.scene, held_out.rasterizer, views, background)
         colours = {"before": stylizer.scene.sh_dc, "after": stylizer.stylized()}
         found = {name: judge.judge(sh_dc) for name, sh_dc in colours.items()}
         stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in found.items() if one} or None

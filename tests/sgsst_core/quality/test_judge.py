@@ -12,6 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import resize_area
 from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgement, frechet_distance, saturated
 from sgsst_core.quality.lpips import Lpips
@@ -21,6 +23,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colours
 from sgsst_core.scene.stored_harmonics import held
+from sgsst_core.stylizing.regions import JobStyles
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -145,3 +148,45 @@ def test_frechet_distance_of_known_distributions() -> None:
 def test_colours_that_no_screen_shows_are_saturated() -> None:
     colours = torch.tensor([[-0.01, 0.5, 0.5], [0.5, 0.5, 0.5], [0.2, 1.3, 0.4], [0.9, 0.1, 0.5]])
     assert saturated((colours - 0.5) / SH_C0) == 0.5
+
+
+def regions_of(scene: Scene, left: Tensor, right: Tensor, *, keep: bool = False) -> JobStyles:
+    every = (Region("rest", keep=keep), Region("right"))
+    labels = (scene.means[:, 0] > 0).to(torch.uint8)
+    regions = Regions(every, labels).resolved(torch.ones(len(scene)).double())
+    each = (right,) if keep else (left, right)
+    return JobStyles(StyleMixture.of(left), regions, tuple(map(StyleMixture.of, each)))
+
+
+def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
+    scene, views = wall(), cameras(2)
+    dark, bright = torch.full((64, 64, 3), 0.1), torch.full((64, 64, 3), 0.9)
+    right = (scene.means[:, 0] > 0)[:, None]
+    colours = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
+    found = [
+        judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colours)
+        for styles in (regions_of(scene, dark, bright), regions_of(scene, bright, dark))
+    ]
+    assert found[0].palette < 60  # colours run into each other at the border
+    assert found[1].palette > 150
+    assert found[0].content == found[1].content
+
+
+def test_what_is_kept_has_no_style_to_be_judged_by(alex: Lpips) -> None:
+    scene, views = wall(), cameras(2)
+    bright = torch.full((64, 64, 3), 0.9)
+    right = (scene.means[:, 0] > 0)[:, None]
+    colours = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
+    styles = regions_of(scene, bright, bright, keep=True)
+    assert judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colours).palette < 60
+    assert judged(judge_of(alex, scene, views, bright), colours).palette > 80
+
+
+def test_equal_pictures_are_judged_as_one(alex: Lpips) -> None:
+    scene, views = wall(), cameras(2)
+    mixture = StyleMixture.weighted([style(), style()], [1, 3])
+    one, two = (
+        judged(Judge(alex, each, scene, CpuRasterizer(scene), views), scene.sh_dc) for each in (style(), mixture)
+    )
+    assert two.style == pytest.approx(one.style, rel=1e-6)
+    assert two.palette == pytest.approx(one.palette, rel=1e-6)
