@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -102,7 +103,7 @@ def _black_views(scale: str) -> Situation:
     return replace(job, weights=weights, cameras=views()[:1])
 
 
-def _tiny_views(width: int, height: int, **settings: object) -> Situation:
+def _tiny_views(width: int, height: int, **settings: Any) -> Situation:
     return replace(_job(**settings), cameras=views(width, height), falls=False)
 
 
