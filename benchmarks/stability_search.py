@@ -44,8 +44,8 @@ def main() -> None:
         return
     ended, found = search(arguments.seconds, arguments.first)
     print(f"{sum(ended.values())} jobs: " + ", ".join(f"{count} {how}" for how, count in ended.most_common()))
-    write_result("stability_search", {"seconds": arguments.seconds, "first": arguments.first, "ended": dict(ended),
-                                      "found": found})  # fmt: skip
+    figures = {"seconds": arguments.seconds, "first": arguments.first, "ended": dict(ended), "found": found}
+    write_result("stability_search", figures)
 
 
 def search(seconds: float, first: int = 0) -> tuple[Counter[str], dict[int, str]]:

@@ -1,0 +1,40 @@
+"""The random search draws the same jobs everywhere, and tells of those that break a bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from benchmarks.stability_search import drawn, outcome, search
+from sgsst_core.bench.stability import situations
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_a_number_is_always_the_same_job() -> None:
+    first, second = drawn(7), drawn(7)
+    assert first.settings == second.settings
+    assert torch.equal(first.style, second.style)
+    assert torch.equal(first.scene.sh_dc, second.scene.sh_dc)
+    assert drawn(8).settings != first.settings
+
+
+def test_a_search_says_how_jobs_ended() -> None:
+    ended, found = search(0.0, 3)
+    assert sum(ended.values()) == 1
+    assert not found
+
+
+def test_what_breaks_a_bound_or_ends_in_any_other_way_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    job = situations.Situation(situations.crowd(20), torch.rand(30, 26, 3), {"steps_coarse": 0, "steps_sos": 1})
+    assert outcome(job) == ("within its bounds", None)
+    with monkeypatch.context() as patch:
+        patch.setattr(situations, "TWIN_BOUND", 0.0)
+        how, problem = outcome(job)
+        assert how == "broken"
+        assert "bound 0" in str(problem)
+    how, problem = outcome(replace(job, style=torch.zeros(4, 4, 5)))
+    assert how == "broken"
+    assert "Error" in str(problem)
