@@ -70,7 +70,9 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     source, settings, images = request.source, request.settings, request.images
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_image(request.style))
-    scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
+    scene_file, reader = read_shared_scene(
+        source.scene, collectives, drop_invalid=source.drop_invalid, growth=settings.refine
+    )
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)
     together(collectives, lambda: check_style_size(style, cameras, settings.style_scale))

@@ -24,6 +24,7 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.settings import Settings
+from sgsst_core.stylizing.refining import refine, refined
 from worker.inputs import check_something_seen, read_scene_and_cameras
 from worker.request import SceneRequest, check_choice, check_folder
 
@@ -60,12 +61,20 @@ def make_plan(
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
     weights = load_network_weights(backbone)
-    load_image(style)  # a style that cannot be used is told before the work, too
+    image = load_image(style)  # one that cannot be used is told before the work, too
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
         write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
+    refinement = refine(file.scene, cameras, image, settings, weights=weights)
     plan, _ = planner.make_plan(
-        file.scene, cameras, settings, weights=weights, measured=True, show=show_planning, orbit=orbit
+        refined(file.scene, refinement),
+        cameras,
+        settings,
+        weights=weights,
+        measured=True,
+        show=show_planning,
+        orbit=orbit,
+        refinement=refinement,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))

@@ -39,6 +39,8 @@ from sgsst_core.quality.packed import measure_packed
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.style_picture import check_style_size
 from worker.inputs import check_something_in_view, read_cameras_of
 from worker.processes import die_with_parent
@@ -83,10 +85,11 @@ def _read_inputs(
         header = read_scene_header(staged.scene)
         if header.ply is not None:
             element_offsets(staged.scene, header.ply)
-        declared = header.count
+        declared = int(header.count * settings.refine)
         if declared > limits["gaussians"]:
             raise RefusedError(
-                "too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be."
+                "too-many-gaussians",
+                f"The scene has {declared:,} Gaussians{_once(settings)}; {limits['gaussians']:,} may be.",
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
@@ -118,12 +121,28 @@ def _read_inputs(
     return found, file.scene, cameras, orbit
 
 
+def _once(settings: Settings) -> str:
+    """Beside a number of Gaussians that counts those of a refined scene."""
+    return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
+
+
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
     found, scene, cameras, orbit = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
-    made, _ = make_plan(scene, cameras, request.settings, weights=weights, measured=True, show=show, orbit=orbit)
+    settings = request.settings
+    refinement = refine(scene, cameras, load_image(staged.style), settings, weights=weights)
+    made, _ = make_plan(
+        refined(scene, refinement),
+        cameras,
+        settings,
+        weights=weights,
+        measured=True,
+        show=show,
+        orbit=orbit,
+        refinement=refinement,
+    )
     seconds = memory = on_device = None
     if made.prediction:
         memory, on_device = made.prediction.peak_bytes, made.prediction.device_bytes

@@ -15,9 +15,11 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Workshop, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
+from sgsst_core.planning.refine import refine_decision
 from sgsst_core.planning.survey import Survey, survey
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import Settings
 from sgsst_core.timing import Timer
 
@@ -35,10 +37,12 @@ def make_plan(
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
     orbit: Orbit | None = None,
+    refinement: Refinement | None = None,
 ) -> tuple[Plan, Workshop]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
     Args:
+        scene: as it was refined, where it was.
         cameras: larger ones are brought down to `settings.max_resolution`.
         weights: of the feature network; None loads VGG19, or VGG16 where only that is installed.
         rasterizer: "cpu", "cuda" or "reference", to compute blend weights anew; None chooses.
@@ -47,6 +51,7 @@ def make_plan(
         show: told how far the survey has come.
         timer: counts the seconds of `survey`, and of all else as `planning`.
         orbit: that the cameras are of, for the plan to tell of it; None for those of files.
+        refinement: what made the scene, likewise; None where it is as it was read.
 
     Returns:
         The plan, and what was built to make it, for a `Stylizer` to go on with.
@@ -71,4 +76,7 @@ def make_plan(
         plan = collectives.broadcast(lambda: decide(measure(workshop, looked, link), settings, measured=measured))
         if orbit is not None:
             plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, looked), *plan.decisions))
+        if refinement is not None:
+            decisions = (refine_decision(refinement, settings), *plan.decisions)
+            plan = replace(plan, refinement=refinement, decisions=decisions)
     return plan, workshop

@@ -127,6 +127,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
             "gaussians": len(stylizer.scene),
             "sh_degree": stylizer.scene.sh_degree,
             "dropped": sources.dropped,
+            "refined": _refined_json(stylizer.plan),
         },
         "style": {"path": str(sources.style), "width": style.shape[1], "height": style.shape[0]},
         "cameras": _cameras_json(stylizer, sources),
@@ -134,6 +135,22 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
             "used": stylizer.views.weighted,
             "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
         },
+    }
+
+
+def _refined_json(plan: Plan) -> dict[str, Any] | None:
+    """What was cut into smaller Gaussians, and what that did to the unstylized picture; None where nobody wanted it."""
+    made = plan.refinement
+    if made is None:
+        return None
+    return {
+        "gaussians_before": len(made.pieces),
+        "gaussians": made.gaussians,
+        "split": made.split,
+        "taken_back": made.taken_back,
+        "size": made.size,
+        "psnr": made.psnr,
+        "lowest_psnr": made.lowest_psnr,
     }
 
 

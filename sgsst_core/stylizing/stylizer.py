@@ -42,6 +42,7 @@ from sgsst_core.stylizing.evaluation import (
     mean_loss,
 )
 from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
+from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.style_picture import prepared_style
@@ -58,7 +59,7 @@ class Stylizer:
 
     Args:
         plan: of this scene, these cameras and settings: from `make_plan`, or of an earlier run of the same job.
-        scene: what to stylize.
+        scene: what to stylize; as it was refined, where the plan says so.
         cameras: the views; larger ones are brought down to `settings.max_resolution`.
         style: [H, W, 3] in 0..1.
         settings: see `Settings`.
@@ -148,10 +149,21 @@ class Stylizer:
         rasterizer: str | None = None,
         collectives: Collectives = ALONE,
     ) -> Self:
-        """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised."""
+        """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised.
+
+        Where the settings refine the scene, the stylizer's is the refined one.
+        """
         weights = weights or load_network_weights("auto")
+        made = refine(scene, cameras, style, settings, weights=weights, rasterizer=rasterizer, collectives=collectives)
+        scene = refined(scene, made)
         plan, workshop = make_plan(
-            scene, cameras, settings, weights=weights, rasterizer=rasterizer, collectives=collectives
+            scene,
+            cameras,
+            settings,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
+            refinement=made,
         )
         return cls(
             plan,
