@@ -27,7 +27,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
-from worker.inputs import Inputs, read_inputs
+from worker.inputs import Inputs, read_inputs, together
 from worker.request import Outputs, Resume, StylizeRequest, check_request
 
 Warn = Callable[[str], None]
@@ -83,9 +83,11 @@ def prepare(
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
-    with timer("refining"):
-        refinement = resumed.plan.refinement if resumed else _refine(inputs, settings, collectives)
-        scene_file = inputs.scene_file.refined(refinement)
+    refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
+    if settings.refine > 1:
+        with timer("refining"):
+            refinement = refinement if resumed else _refine(inputs, settings, collectives)
+            scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     plan, workshop, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
     if plan is not None and resumed is not None:
         planned_ranks = resumed.ranks
