@@ -175,6 +175,13 @@ class Settings(BaseModel):
         description="Weight of each scale in the loss, from full size on, each scale half as large as the one before; "
         "those that are not named, or have 0, are not computed.",
     )
+    refine: Annotated[float, Option(unit="factor", metavar="N")] = Field(
+        1.0,
+        ge=1,
+        le=16,
+        description="Cut Gaussians that are large in the views into smaller ones, which carry finer strokes: at most N "
+        "times as many in all. 1 cuts none.",
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."

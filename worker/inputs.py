@@ -78,7 +78,9 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     source, settings, images = request.source, request.settings, request.images
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_styles(request.styles))
-    scene_file, reader = read_shared_scene(source.scene, collectives, drop_invalid=source.drop_invalid)
+    scene_file, reader = read_shared_scene(
+        source.scene, collectives, drop_invalid=source.drop_invalid, growth=settings.refine
+    )
     together(collectives, lambda: check_fading(scene_file.path, scene_file.header, settings.sh_fade))
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)

@@ -21,11 +21,13 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import common_device, rasterizer_problem
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.report.document import Sources
+from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
+from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
-from worker.inputs import read_inputs
+from worker.inputs import Inputs, read_inputs, together
 from worker.request import Outputs, Resume, StylizeRequest, check_request
 
 Warn = Callable[[str], None]
@@ -81,12 +83,18 @@ def prepare(
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
+    refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
+    if settings.refine > 1:
+        with timer("refining"):
+            refinement = refinement if resumed else _refine(inputs, settings, collectives)
+            scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
+    regions = inputs.regions and inputs.regions.refined(refinement)
     plan, workshop, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
     if plan is not None and resumed is not None:
         planned_ranks = resumed.ranks
     else:
         plan, workshop = make_plan(
-            inputs.scene_file.scene,
+            scene_file.scene,
             inputs.cameras,
             settings,
             weights=inputs.weights,
@@ -97,12 +105,13 @@ def prepare(
             timer=timer,
             orbit=inputs.orbit,
             style=inputs.style,
-            regions=inputs.regions,
+            regions=regions,
+            refinement=refinement,
         )
     with timer("preparing"):
         stylizer = Stylizer(
             plan,
-            inputs.scene_file.scene,
+            scene_file.scene,
             inputs.cameras,
             inputs.style,
             settings,
@@ -110,14 +119,27 @@ def prepare(
             photos=inputs.load_photo,
             collectives=collectives,
             workshop=workshop,
-            regions=inputs.regions,
+            regions=regions,
         )
     stylizer.seconds_by_part.update(timer.seconds)
-    source, scene_file, images = request.source, inputs.scene_file, request.images
+    source, images = request.source, request.images
     styles = tuple(file.path for file in request.styles)
     sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, inputs.weights)
     workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
     return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
+
+
+def _refine(inputs: Inputs, settings: Settings, collectives: Collectives) -> Refinement | None:
+    """How the scene is refined; None where nobody wants it."""
+    return refine(
+        inputs.scene_file.scene,
+        inputs.cameras,
+        inputs.style,
+        settings,
+        weights=inputs.weights,
+        collectives=collectives,
+        regions=inputs.regions,
+    )
 
 
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:

@@ -24,6 +24,7 @@ from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.stylizing.refining import refine, refined
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_cameras
 from worker.request import SceneRequest, StylizeRequest, check_choice, check_folder
 
@@ -60,8 +61,9 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
         write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
+    refinement = refine(file.scene, cameras, style, settings, weights=weights, regions=regions)
     plan, _ = planner.make_plan(
-        file.scene,
+        refined(file.scene, refinement),
         cameras,
         settings,
         weights=weights,
@@ -69,7 +71,8 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
         show=show_planning,
         orbit=orbit,
         style=style,
-        regions=regions,
+        regions=regions and regions.refined(refinement),
+        refinement=refinement,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))

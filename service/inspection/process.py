@@ -44,6 +44,8 @@ from sgsst_core.quality.packed import measure_packed
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.style_picture import check_style_size
 from worker.inputs import check_something_in_view, load_styles, read_cameras_of, read_regions
 from worker.processes import die_with_parent
@@ -97,10 +99,11 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         header = read_scene_header(staged.scene)
         if header.ply is not None:
             element_offsets(staged.scene, header.ply)
-        declared = header.count
+        declared = int(header.count * settings.refine)
         if declared > limits["gaussians"]:
             raise RefusedError(
-                "too-many-gaussians", f"The scene has {declared:,} Gaussians; {limits['gaussians']:,} may be."
+                "too-many-gaussians",
+                f"The scene has {declared:,} Gaussians{_once(settings)}; {limits['gaussians']:,} may be.",
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
         check_fading(file.path, file.header, settings.sh_fade)
@@ -138,21 +141,29 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     return found, _Read(file.scene, cameras, orbit, style, regions)
 
 
+def _once(settings: Settings) -> str:
+    """Beside a number of Gaussians that counts those of a refined scene."""
+    return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
+
+
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
     found, read = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
+    settings, regions = request.settings, read.regions
+    refinement = refine(read.scene, read.cameras, read.style, settings, weights=weights, regions=regions)
     made, _ = make_plan(
-        read.scene,
+        refined(read.scene, refinement),
         read.cameras,
-        request.settings,
+        settings,
         weights=weights,
         measured=True,
         show=show,
         orbit=read.orbit,
         style=read.style,
-        regions=read.regions,
+        regions=regions and regions.refined(refinement),
+        refinement=refinement,
     )
     seconds = memory = on_device = None
     if made.prediction:

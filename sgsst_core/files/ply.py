@@ -34,6 +34,7 @@ from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, Scene
 from sgsst_core.files.splat import read_splat
 from sgsst_core.files.spz import read_spz, write_spz
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import Refinement, piece_counts, split
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
 #: Rows handled at a time: 64k rows of 62 floats are 16 MB, so that memory stays small and the columns of a block are
@@ -52,6 +53,8 @@ _BASE = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "sh_dc": _DC,
 }
+#: What differs between the parts of a Gaussian that was cut.
+_SHAPE = (*_BASE["means"], "opacity", *_BASE["scales"])
 #: As messages name them; f_rest_* follow.
 _ORDER = (*itertools.chain(*_BASE.values()), "opacity")
 _REST_DEGREES = {3 * number: degree for degree, number in COEFFICIENTS.items()}
@@ -68,6 +71,7 @@ class SceneFile:
         kept: [rows] bool, which rows of the file the scene holds; None where it holds all.
         stamp: size in bytes and time of last change (ns) of the file when it was read.
         form: of the file.
+        copies: [N] int64, into how many Gaussians of the scene each of its file was cut; None where none was.
     """
 
     path: Path
@@ -76,6 +80,26 @@ class SceneFile:
     kept: NDArray[np.bool_] | None
     stamp: tuple[int, int]
     form: Form = "ply"
+    copies: NDArray[np.int64] | None = None
+
+    def refined(self, refinement: Refinement | None) -> SceneFile:
+        """The same with the scene as it was refined; itself where it was not.
+
+        Raises:
+            SceneError: the file cannot hold places and sizes of smaller Gaussians.
+        """
+        if refinement is None or not refinement.split:
+            return self
+        if self.header is not None and self.form == "ply":
+            kinds = {prop.name: prop.kind for prop in self.header.vertex.properties}
+            whole = [name for name in _SHAPE if kinds[name][0] != "f"]
+            if whole:
+                raise SceneError(
+                    f"{self.path}: {', '.join(whole)} are stored as integers; smaller Gaussians need float or double. "
+                    "Convert the scene first, or leave --refine out."
+                )
+        scene, copies = split(self.scene, refinement.pieces), piece_counts(refinement.pieces)
+        return replace(self, scene=scene, copies=copies.numpy())
 
     @property
     def dropped(self) -> int:
@@ -171,7 +195,8 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: f
     they fade. A scene of a packed file becomes a PLY as `write_scene` writes it.
 
     Where a value is still what the file holds (in float32), its bytes stay too. Rows that were dropped at reading
-    are absent, which also changes the count in the header. The file appears whole or not at all.
+    are absent, and a row stands once for each part of a Gaussian that was cut, with place, size and opacity of its own;
+    both change the count in the header. The file appears whole or not at all.
 
     Args:
         source: what `read_scene` gave.
@@ -193,13 +218,13 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: f
         return
     check_fading(source.path, source.header, sh_fade)
     fading = Fading.of(source.header, sh_fade)
-    colours = sh_dc.detach().to("cpu", torch.float32).contiguous().numpy()
+    columns = _new_columns(source, sh_dc.detach().to("cpu", torch.float32))
     with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
         output.write(_header_for(source, source.header))
         if source.header.text:
-            _write_text(source, source.header, colours, fading, file, output)
+            _write_text(source, source.header, columns, fading, file, output)
         else:
-            _write_binary(source, source.header, colours, fading, file, output)
+            _write_binary(source, source.header, columns, fading, file, output)
 
 
 def write_scene(path: Path, scene: Scene) -> None:
@@ -453,31 +478,49 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
-    """The source's header, with the number of rows left where some were dropped."""
+    """The source's header, with the number of rows written where some were dropped or cut."""
     raw = header.raw
-    if source.kept is None:
+    if source.kept is None and source.copies is None:
         return raw
     start, stop = header.vertex.count_span
     return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
 
 
-def _blocks(
-    source: SceneFile, rows: int, colours: NDArray[Any]
-) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[Any]]]:
-    """For each block of the file's so many rows: their number, which of them are kept, and the colours of those."""
-    position = 0
+#: By name of the property, a value for each Gaussian of the scene.
+_NewColumns = dict[str, NDArray[np.float32]]
+
+
+def _new_columns(source: SceneFile, colours: Tensor) -> _NewColumns:
+    """What may differ from the file: colours [N, 3], and of a scene that was refined, shapes."""
+    columns = dict(zip(_DC, colours.numpy().T, strict=True))
+    if source.copies is not None:
+        columns["opacity"] = source.scene.opacities.numpy()
+        for names, values in ((_BASE["means"], source.scene.means), (_BASE["scales"], source.scene.scales)):
+            columns |= dict(zip(names, values.numpy().T, strict=True))
+    return columns
+
+
+def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
+    """For each block of the file's so many rows: their number, how often each is written, which Gaussians these are."""
+    position = gaussian = 0
     for start in range(0, rows, BLOCK_ROWS):
         count = min(BLOCK_ROWS, rows - start)
-        kept = np.ones(count, np.bool_) if source.kept is None else source.kept[start : start + count]
-        following = position + int(kept.sum())
-        yield count, kept, colours[position:following]
-        position = following
+        times = np.ones(count, np.int64)
+        if source.kept is not None:
+            times[:] = source.kept[start : start + count]
+        if source.copies is not None:
+            own = times.nonzero()[0]
+            times[own] = source.copies[position : position + len(own)]
+            position += len(own)
+        following = gaussian + int(times.sum())
+        yield count, times, slice(gaussian, following)
+        gaussian = following
 
 
 def _write_binary(
     source: SceneFile,
     header: PlyHeader,
-    colours: NDArray[Any],
+    columns: _NewColumns,
     fading: Fading | None,
     file: io.BufferedReader,
     output: BinaryIO,
@@ -487,14 +530,15 @@ def _write_binary(
     file.seek(len(header.raw))
     _copy(file, output, before)
     buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
-    for count, kept, new in _blocks(source, header.vertex.count, colours):
+    for count, times, gaussians in _blocks(source, header.vertex.count):
         part = memoryview(buffer)[: count * dtype.itemsize]
         if file.readinto(part) != len(part):
             raise changed(source.path)
         rows = np.frombuffer(part, dtype)
-        if len(new) < count:
-            rows = rows[kept]
-        for name, column in zip(_DC, new.T, strict=True):
+        if not (times == 1).all():
+            rows = np.repeat(rows, times)
+        for name, values in columns.items():
+            column = values[gaussians]
             different = rows[name].astype(np.float32) != column
             rows[name][different] = column[different]
         if fading is not None:
@@ -518,7 +562,7 @@ def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
 def _write_text(
     source: SceneFile,
     header: PlyHeader,
-    colours: NDArray[Any],
+    columns: _NewColumns,
     fading: Fading | None,
     file: BinaryIO,
     output: BinaryIO,
@@ -526,30 +570,28 @@ def _write_text(
     vertex = header.vertex
     before = header.elements[: header.elements.index(vertex)]
     order = [prop.name for prop in vertex.properties]
-    names = (*_DC, *(fading.names if fading else ()))
+    names = (*columns, *(fading.names if fading else ()))
     slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
     file.seek(len(header.raw))
     # latin-1 gives every byte back as it came, newline="" every line end
     lines = io.TextIOWrapper(file, "latin-1", newline="")
     for _ in range(sum(element.count for element in before)):
         output.write(lines.readline().encode("latin-1"))
-    for count, kept, new in _blocks(source, vertex.count, colours):
-        values = iter(new)
-        for index in range(count):
+    for _, times, gaussians in _blocks(source, vertex.count):
+        values = iter(np.stack([column[gaussians] for column in columns.values()], axis=1))
+        for copies in times:
             line = lines.readline()
-            if kept[index]:
-                output.write(_recoloured(line, slots, next(values), fading).encode("latin-1"))
+            for _ in range(copies):
+                output.write(_changed_line(line, slots, next(values), fading).encode("latin-1"))
     for line in lines:
         output.write(line.encode("latin-1"))
 
 
-def _recoloured(line: str, slots: list[tuple[int, str]], values: NDArray[Any], fading: Fading | None) -> str:
-    """A row of text with its three colour tokens replaced where their value changes, and others that fade; all spacing
-    stays.
+def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any], fading: Fading | None) -> str:
+    """A row of text with some of its tokens replaced where their value changes, others that fade; all spacing stays.
 
     Args:
-        slots: place and kind of the tokens: those of the colours first.
-        values: [3], of the colours.
+        slots: place and kind of the tokens: those that have a value first.
     """
     tokens = list(re.finditer(r"\S+", line))
     if fading is not None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.scene.split import Refinement, parents_of
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,12 @@ class Regions:
     def members(self, place: int) -> Tensor:
         """[N] bool, Gaussians of the region at a place."""
         return self.labels == place
+
+    def refined(self, refinement: Refinement | None) -> Regions:
+        """Of the scene as it was refined: the parts of a Gaussian are in its region."""
+        if refinement is None:
+            return self
+        return replace(self, labels=self.labels[parents_of(refinement.pieces)])
 
     def resolved(self, weights: Tensor) -> Regions:
         """With the Gaussians of regions that no view sees added to the rest, but for those that are kept.

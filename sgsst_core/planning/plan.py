@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
+from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import KeptWeights, PlannedSurround, Precision
 
 Device = Literal["cpu", "cuda"]
@@ -98,6 +99,7 @@ class Plan:
         measuring: what is measured between steps, at most: place in `measuring.LEVELS`.
         loss_views: on how many views the loss is taken before and after.
         ranks: how many take part.
+        refinement: of the scene that was read, into that of which the plan tells; None where it is the same.
         decisions: for people.
         prediction: for comparison with what happens.
     """
@@ -123,6 +125,7 @@ class Plan:
     measuring: int = 0
     loss_views: int = 4
     ranks: int = 1
+    refinement: Refinement | None = None
     decisions: tuple[Decision, ...] = ()
     prediction: Prediction | None = None
 

@@ -19,9 +19,11 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe, Workshop, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
+from sgsst_core.planning.refine import refine_decision
 from sgsst_core.planning.survey import Survey, survey
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import Settings
 from sgsst_core.timing import Timer
 
@@ -41,10 +43,12 @@ def make_plan(
     orbit: Orbit | None = None,
     style: StyleMixture | None = None,
     regions: Regions | None = None,
+    refinement: Refinement | None = None,
 ) -> tuple[Plan, Workshop]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
     Args:
+        scene: as it was refined, where it was.
         cameras: larger ones are brought down to `settings.max_resolution`.
         weights: of the feature network; None loads VGG19, or VGG16 where only that is installed.
         rasterizer: "cpu", "cuda" or "reference", to compute blend weights anew; None chooses.
@@ -55,6 +59,7 @@ def make_plan(
         orbit: that the cameras are of, for the plan to tell of it; None for those of files.
         style: for the plan to tell of its pictures; None for one picture.
         regions: of the scene; None where it has none.
+        refinement: what made the scene, None where it is as it was read.
 
     Returns:
         The plan, and what was built to make it, for a `Stylizer` to go on with.
@@ -88,6 +93,9 @@ def make_plan(
             plan = replace(plan, decisions=(*of_regions(regions, resolved, plan, fitted), *plan.decisions))
         if orbit is not None:
             plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, looked), *plan.decisions))
+        if refinement is not None:
+            decisions = (refine_decision(refinement, settings), *plan.decisions)
+            plan = replace(plan, refinement=refinement, decisions=decisions)
     return plan, workshop
 
 

@@ -129,6 +129,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
             "gaussians": len(stylizer.scene),
             "sh_degree": stylizer.sh_degree,
             "dropped": sources.dropped,
+            "refined": _refined_json(stylizer.plan),
         },
         "style": {name: styles[0][name] for name in ("path", "width", "height")},
         "styles": styles,
@@ -171,6 +172,22 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
         }
         for place, region in enumerate(regions.every)
     ]
+
+
+def _refined_json(plan: Plan) -> dict[str, Any] | None:
+    """What was cut into smaller Gaussians, and what that did to the unstylized picture; None where nobody wanted it."""
+    made = plan.refinement
+    if made is None:
+        return None
+    return {
+        "gaussians_before": len(made.pieces),
+        "gaussians": made.gaussians,
+        "split": made.split,
+        "taken_back": made.taken_back,
+        "size": made.size,
+        "psnr": made.psnr,
+        "lowest_psnr": made.lowest_psnr,
+    }
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:

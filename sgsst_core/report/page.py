@@ -53,6 +53,7 @@ _PARTS = {
     "checkpoint": "checkpoints",
     "measuring": "measuring, beside the steps",
     "reading": "reading, before the steps",
+    "refining": "cutting large Gaussians, before the steps",
     "survey": "survey of the views, before the steps",
     "planning": "planning, before the steps",
     "preparing": "preparing the job, before the steps",

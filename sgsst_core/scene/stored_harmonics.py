@@ -113,7 +113,7 @@ class StoredHarmonics:
 
     Args:
         layout: where they are.
-        chosen: [N] int32, ascending: the rows that are the scene's Gaussians; None for all.
+        chosen: [N] int32, ascending: the rows that are the scene's Gaussians, some perhaps of several; None for all.
         coefficients: K, the first ones of the file's; None for all.
         file: the file, if it is open already.
         factor: by which they are multiplied when they are read; rounded to float32.
@@ -149,10 +149,10 @@ class StoredHarmonics:
         return self.shape[0]
 
     def __getitem__(self, rows: Tensor) -> StoredHarmonics | Tensor:
-        """Those of some Gaussians ([N] bool, or indices); only ascending ones can stay in the file."""
+        """Those of some Gaussians ([N] bool, or indices; some several times); only ascending ones stay in the file."""
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
-        if len(rows) > 1 and not bool((rows[1:] > rows[:-1]).all()):
+        if len(rows) > 1 and not bool((rows[1:] >= rows[:-1]).all()):
             ascending, places = rows.unique(return_inverse=True)
             return self._of(ascending).tensor()[places]
         return self._of(rows)

@@ -78,7 +78,7 @@ def find_subject(scene: Scene) -> Subject:
     weights = weights / weights.sum()
     kept = _without_strays(points, weights)
     longest = quantile(ordered[:, 2][kept], weights[kept], _LARGEST)
-    turned = _rotations(scene.quats[rows][kept].double()) * lengths[kept].clamp_max(longest)[:, None]
+    turned = rotations(scene.quats[rows][kept].double()) * lengths[kept].clamp_max(longest)[:, None]
     reach = (2 * (opacities[kept] / _VISIBLE).clamp_min(1).log()).sqrt()
     hull = _hull(points[kept], turned, reach)
     left_out = float(weights[~kept].sum())
@@ -104,7 +104,7 @@ def spread_directions(count: int) -> Tensor:
     return torch.stack([across * angle.cos(), across * angle.sin(), height], dim=1)
 
 
-def _rotations(quats: Tensor) -> Tensor:
+def rotations(quats: Tensor) -> Tensor:
     """[P, 3, 3] of quaternions [P, 4], wxyz; of zeros, the identity."""
     nothing = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     given = torch.where((quats != 0).any(1, keepdim=True), quats, nothing)

@@ -30,6 +30,7 @@ from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import Refinement
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.evaluation import Evaluation
@@ -296,8 +297,14 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not take twice
     }
     nothing = torch.empty(0)  # `asdict` would copy them
+    refinement = plan.refinement
+    if refinement is not None:
+        tensors["plan.pieces"] = refinement.pieces
+        plan = replace(plan, refinement=replace(refinement, pieces=nothing))
     survey = replace(plan.survey, total_blend_weights=nothing)
     values = asdict(replace(plan, survey=survey, optimised=nothing, seen=nothing))
+    if refinement is not None:
+        del values["refinement"]["pieces"]
     del values["optimised"], values["seen"], values["survey"]["total_blend_weights"]
     return tensors, values
 
@@ -332,6 +339,7 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
     covered = tuple(values.pop("covered"))
     expected = values.pop("prediction")
+    refined = values.pop("refinement", None)
     return Plan(
         survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **looked),
         optimised=tensors["plan.optimised"],
@@ -339,6 +347,7 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
         covered=covered,
         decisions=decisions,
         prediction=Prediction(**expected) if expected else None,
+        refinement=Refinement(pieces=tensors["plan.pieces"], **refined) if refined else None,
         **values,
     )
 

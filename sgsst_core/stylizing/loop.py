@@ -224,7 +224,8 @@ def stylize(
     """Stylize a scene from beginning to end; the arguments are those of `Stylizer.planned`.
 
     Returns:
-        The new sh_dc [N, 3], float32 on the CPU. Everything else of the scene stays as it is.
+        The new sh_dc [N, 3], float32 on the CPU. Everything else of the scene stays as it is. (Of a refined scene
+        they are of its Gaussians: `Stylizer.planned` has it.)
     """
     stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, photos=photos)
     run(stylizer, callbacks)

@@ -11,7 +11,7 @@ from sgsst_core.loss.terms import LossTerms
 
 #: Parts of a job's time before its first step, as `seconds_by_part` names them: inputs, the look at every view, what
 #: else the plan is made from, and what is built for the steps.
-BEFORE_STEPS = ("reading", "survey", "planning", "preparing")
+BEFORE_STEPS = ("reading", "refining", "survey", "planning", "preparing")
 
 
 @dataclass(frozen=True)

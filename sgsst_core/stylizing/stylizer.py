@@ -45,6 +45,7 @@ from sgsst_core.stylizing.evaluation import (
     mean_loss,
 )
 from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
+from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.regions import JobStyles, neighbours_change_by_region
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
@@ -60,7 +61,7 @@ class Stylizer:
 
     Args:
         plan: of this scene, these cameras and settings: from `make_plan`, or of an earlier run of the same job.
-        scene: what to stylize.
+        scene: what to stylize; as it was refined, where the plan says so.
         cameras: the views; larger ones are brought down to `settings.max_resolution`.
         style: a picture [H, W, 3] in 0..1, or several with their weights.
         settings: see `Settings`.
@@ -161,8 +162,23 @@ class Stylizer:
         collectives: Collectives = ALONE,
         regions: Regions | None = None,
     ) -> Self:
-        """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised."""
+        """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised.
+
+        Where the settings refine the scene, the stylizer's is the refined one.
+        """
         weights = weights or load_network_weights("auto")
+        mixture = StyleMixture.of(style)
+        made = refine(
+            scene,
+            cameras,
+            mixture,
+            settings,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
+            regions=regions,
+        )
+        scene, regions = refined(scene, made), regions and regions.refined(made)
         plan, workshop = make_plan(
             scene,
             cameras,
@@ -170,8 +186,9 @@ class Stylizer:
             weights=weights,
             rasterizer=rasterizer,
             collectives=collectives,
-            style=StyleMixture.of(style),
+            style=mixture,
             regions=regions,
+            refinement=made,
         )
         return cls(
             plan,

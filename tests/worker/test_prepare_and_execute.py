@@ -9,11 +9,13 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import CheckpointError
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files.scene_headers import PackedForm
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
 from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
+from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
@@ -97,6 +99,38 @@ def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: Stylize
     assert second.resumed is not None
     assert second.stylizer.plan.survey is second.resumed.plan.survey
     assert go_on(second).stopped == "finished"
+
+
+@pytest.mark.parametrize("form", ["ply", "spz", "compressed.ply"])
+def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_path: Path, form: PackedForm) -> None:
+    jobs = []
+    for name in ("whole", "resumed"):
+        request = small_request(tmp_path / name, 6, refine=3.0)
+        scene = large_wall()
+        write_scene(request.source.scene, scene)
+        if form != "ply":
+            source = request.source.scene.with_name(f"scene.{form}")
+            write_packed(source, scene, form)
+            out = request.out.with_name(f"s.{form}")
+            request = replace(request, source=request.source.model_copy(update={"scene": source}), out=out)
+        jobs.append(request)
+    whole, resumed = jobs
+    go_on(prepare(whole))
+    assert go_on(prepare(resumed), steps=3).stopped == "interrupted"
+    second = prepare(resumed, resume=Resume(True))
+    assert second.resumed is not None
+    assert second.resumed.state.step == 3
+    assert go_on(second).stopped == "finished"
+    written = resumed.out.with_name("s.ply")
+    assert written.read_bytes() == whole.out.with_name("s.ply").read_bytes()
+    report = json.loads(resumed.out.with_name("s.report.json").read_text())
+    refined = report["scene"]["refined"]
+    assert refined["gaussians_before"] == len(scene)
+    assert refined["gaussians"] == report["scene"]["gaussians"] == len(read_scene(written).scene) > len(scene)
+    assert refined["lowest_psnr"] >= 40
+    if form != "ply":
+        assert len(read_scene(resumed.out).scene) == refined["gaussians"]
+    assert "cutting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
 
 
 def test_planning_is_shown(request_: StylizeRequest) -> None:

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneTooLargeError, SgsstError
-from sgsst_core.files.ply import SceneFile, read_scene, stays_in_file
+from sgsst_core.files.ply import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.files.scene_headers import read_scene_header
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMISER_BYTES
@@ -52,8 +52,14 @@ class _Shared:
     harmonics: bytes | None  # those that stay in the file, pickled: ranks of other machines must not look for it
 
 
-def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: bool = False) -> tuple[SceneFile, bool]:
+def read_shared_scene(
+    path: Path, collectives: Collectives, *, drop_invalid: bool = False, growth: float = 1.0
+) -> tuple[SceneFile, bool]:
     """Read a scene once on each machine. Every rank calls this.
+
+    Args:
+        growth: by which the number of its Gaussians may yet grow: room is wanted for all, and no more of their
+            spherical harmonics than of others' are held.
 
     Returns:
         The scene, and whether this rank has read it itself: on every machine one does.
@@ -65,13 +71,13 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
     homes = collectives.all_gather(home())
     reader = homes.index(home())
     sharing = homes.count(home())
-    _check_room(path, collectives, sharing)
+    _check_room(path, collectives, sharing, growth)
     own: SceneFile | None = None
     error: SgsstError | None = None
     shared: _Shared | None = None
     if collectives.rank == reader:
         try:
-            own = read_scene(path, drop_invalid=drop_invalid)
+            own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth))
             if sharing > 1:
                 own, shared = _share(own)
         except SgsstError as raised:
@@ -87,12 +93,17 @@ def read_shared_scene(path: Path, collectives: Collectives, *, drop_invalid: boo
             try:
                 own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
             except OSError:  # systems that hide even a user's own processes
-                own = read_scene(path, drop_invalid=drop_invalid)
+                own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth))
         collectives.all_gather(None)  # the reader may close its memory file when everybody has opened it
     finally:
         if shared is not None:
             os.close(shared.descriptor)
     return own, collectives.rank == reader
+
+
+def _held_bytes(growth: float) -> int | None:
+    """Spherical harmonics that are held of a scene that may grow; None for as many as of others."""
+    return None if growth == 1 else int(HELD_BYTES / growth)
 
 
 def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
@@ -134,15 +145,16 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
     return replace(shared.file, scene=Scene(**tensors), kept=kept)
 
 
-def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
+def _check_room(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:
     """Compare what the scene needs, by its header, with what each rank's machine and GPU have.
 
     Args:
         sharing: ranks on this machine.
+        growth: see `read_shared_scene`.
     """
     problem: SgsstError | None = None
     try:
-        problem = _lack(collectives.rank, sharing, *_size_by_header(path))
+        problem = _lack(collectives.rank, sharing, *(int(size * growth) for size in _size_by_header(path, growth)))
     except SgsstError as error:
         problem = error
     for found in collectives.all_gather(problem):
@@ -150,7 +162,7 @@ def _check_room(path: Path, collectives: Collectives, sharing: int) -> None:
             raise found
 
 
-def _size_by_header(path: Path) -> tuple[int, int, int]:
+def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
     """Gaussians that a file declares, and their bytes in memory and on a GPU; zeros for what `read_scene` will refuse.
 
     Memory does not hold what stays in the file.
@@ -165,7 +177,7 @@ def _size_by_header(path: Path) -> tuple[int, int, int]:
     # A header may declare anything: no more than what the file can hold is believed.
     count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))
     rest = sum(prop.name.startswith("f_rest_") for prop in header.vertex.properties)
-    held = 0 if stays_in_file(header) else rest
+    held = 0 if stays_in_file(header, _held_bytes(growth)) else rest
     return count, count * 4 * (14 + held), count * 4 * (14 + rest)
 
 

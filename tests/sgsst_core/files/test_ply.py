@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import tracemalloc
@@ -20,6 +21,7 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_scene, write_stylized
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.stored_harmonics import held
 
 CODES = {"char": "b", "uchar": "B", "int16": "h", "ushort": "H", "int": "i", "uint32": "I", "float": "f", "double": "d"}
@@ -208,6 +210,54 @@ def test_only_the_bytes_of_the_colours_change(
     else:
         assert written == file.to_bytes() + behind
     assert torch.equal(read_scene(tmp_path / "out.ply").scene.sh_dc, colours)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("dropped", [False, True])
+def test_a_cut_gaussian_has_a_row_for_each_part_with_all_that_its_row_held(
+    tmp_path: Path, form: str, dropped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ply, "BLOCK_ROWS", 2)
+    file = simple(5, degree=1, form=form)
+    properties, rows = file.elements[0][1], file.elements[0][2]
+    properties.insert(3, ("uchar", "label"))
+    properties[properties.index(("float", "y"))] = ("double", "y")
+    for i, row in enumerate(rows):
+        row |= {"label": 40 + i, "y": row["y"] + 1e-12, "scale_0": -1.0 - i, "scale_1": -2.0, "scale_2": -3.0}
+    if dropped:
+        rows[1]["opacity"] = math.nan
+    behind = b"" if form == "ascii" else b"behind"
+    source = read_scene(save(tmp_path, file.to_bytes() + behind), drop_invalid=dropped)
+    pieces = torch.ones(len(source.scene), 3, dtype=torch.uint8)
+    pieces[-1], pieces[0, 1] = torch.tensor([3, 4, 1]), 5
+    made = Refinement(pieces, 2, int(piece_counts(pieces).sum()))
+    refined = source.refined(made)
+    assert source.refined(None) is source
+    assert refined.dropped == int(dropped)
+    colours = torch.rand(len(refined.scene), 3)
+    write_stylized(refined, tmp_path / "out.ply", colours)
+    written = (tmp_path / "out.ply").read_bytes()
+    assert written.endswith(behind)
+    found = read_scene(tmp_path / "out.ply").scene
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
+        assert torch.equal(getattr(found, name), getattr(refined.scene, name)), name
+    assert torch.equal(found.sh_dc, colours)
+    kept = [row for i, row in enumerate(rows) if not (dropped and i == 1)]
+    parents = [kept[parent] for parent in parents_of(pieces).tolist()]
+    for row, parent in zip(second_reader(written)[1]["vertex"], parents, strict=True):
+        assert row["label"] == parent["label"]
+        if parent not in (kept[0], kept[-1]):
+            assert row["y"] == parent["y"], "what is not cut keeps its double precision"
+
+
+def test_shapes_that_are_stored_as_integers_cannot_be_cut(tmp_path: Path) -> None:
+    file = simple(2, scale_1=-3)
+    properties = file.elements[0][1]
+    properties[properties.index(("float", "scale_1"))] = ("char", "scale_1")
+    source = read_scene(save(tmp_path, file))
+    pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
+    with pytest.raises(SceneError, match="scale_1 are stored as integers"):
+        source.refined(Refinement(pieces, 1, 4))
 
 
 def test_unchanged_colours_give_the_same_bytes(tmp_path: Path) -> None:

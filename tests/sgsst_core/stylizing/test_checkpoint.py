@@ -16,6 +16,7 @@ from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.terms import TERMS, LossTerms
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
+from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import (
     Checkpoint,
@@ -85,7 +86,7 @@ def assert_same(expected: object, found: object) -> None:
         if isinstance(one, torch.Tensor):
             assert one.dtype == other.dtype, name
             assert torch.equal(one, other), name
-        elif isinstance(one, StylizerState | Plan | Survey):
+        elif isinstance(one, StylizerState | Plan | Survey | Refinement):
             assert_same(one, other)
         else:
             assert one == other, name
@@ -104,6 +105,16 @@ def test_the_memory_of_a_gpu_comes_back(kept: Checkpoint, tmp_path: Path) -> Non
     kept = replace(kept, state=replace(kept.state, history=history), plan=plan)
     save_checkpoint(tmp_path / "c", kept, "job")
     assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
+
+
+def test_a_refined_scene_is_known_again(kept: Checkpoint, tmp_path: Path) -> None:
+    pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
+    made = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2)
+    refined = replace(kept, plan=replace(kept.plan, refinement=made))
+    save_checkpoint(tmp_path / "c", refined, "job")
+    found = load_checkpoint(tmp_path / "c", "job")
+    assert_same(refined, found)
+    assert found.plan.refinement is not None
 
 
 def test_a_checkpoint_of_version_4_comes_back_without_memory_of_a_gpu(kept: Checkpoint, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 from tests.networks import tiny_weights
 from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.stylizing.test_refining import on_a_rank
 from tests.small_scenes import ball, cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 
@@ -182,6 +183,15 @@ def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(sce
     again = on_ranks(2, stylize, scene, 3, values)[0]
     assert torch.equal(again["colours"], first["colours"])
     assert again["losses"] == first["losses"]
+
+
+def test_ranks_refine_a_scene_as_one_does() -> None:
+    alone = on_a_rank(ALONE, 2.0)
+    assert alone is not None
+    assert alone.split > 0
+    for found in on_ranks(2, on_a_rank, 2.0):
+        assert torch.equal(found.pieces, alone.pieces)
+        assert found.psnr == pytest.approx(alone.psnr, abs=1e-6)
 
 
 @pytest.mark.parametrize(("ranks", "views_per_step"), [(1, 2), (2, 2), (4, 2), (3, 2), (2, 4)])

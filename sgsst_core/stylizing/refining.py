@@ -1,0 +1,245 @@
+"""Cutting large Gaussians before a job: look at the views, ask the loss, cut, and prove that the picture stays.
+
+Nothing is stylized yet. The gradient is taken once for each view, of colours that have the style's mean and spread in
+closed form: what first steps would reach, and what is left to ask for is texture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Regions
+from sgsst_core.loss.scale_weights import ScaleWeights
+from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.choices import rasterizer_options
+from sgsst_core.planning.probe import Workshop, equip
+from sgsst_core.planning.refine import LEAST_PSNR, Footprints, candidates, choose_pieces, disagreement
+from sgsst_core.planning.survey import sees_something
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.split import Refinement, can_be_split, piece_counts, split
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.style_picture import prepared_style
+from sgsst_core.stylizing.warm_start import warm_start
+
+#: Views whose gradient is taken, evenly spread: each costs an iteration.
+GRADIENT_VIEWS = 24
+#: Views whose picture is compared.
+MEASURED_VIEWS = 6
+#: Rounds in which Gaussians are taken back, until the picture is close enough; and in each, their share of its error.
+_ROUNDS, _TAKEN_BACK = 24, 0.25
+
+
+def refine(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor | StyleMixture,
+    settings: Settings,
+    *,
+    weights: BackboneWeights,
+    rasterizer: str | None = None,
+    collectives: Collectives = ALONE,
+    regions: Regions | None = None,
+) -> Refinement | None:
+    """Decide which Gaussians are cut into how many; every rank calls this, and gets the same. None where it is off.
+
+    Args:
+        cameras, style, weights: as a `Stylizer` takes them.
+        rasterizer: as `make_plan` takes it.
+        regions: of the scene; what they keep stays whole.
+    """
+    if settings.refine <= 1:
+        return None
+    fitted = fit_cameras(cameras, settings)
+    workshop = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
+    kept = None if regions is None else regions.kept
+    return _Refining(workshop, StyleMixture.of(style), collectives, kept).run()
+
+
+def refined(scene: Scene, refinement: Refinement | None) -> Scene:
+    """The scene as it was refined; itself where it was not."""
+    return scene if refinement is None else split(scene, refinement.pieces)
+
+
+@dataclass(frozen=True)
+class _Change:
+    """What cutting does to the measured views.
+
+    Attributes:
+        psnr, lowest: of all views together, and of one, dB.
+        squared: [N] float64, the squared change under each Gaussian, by blend weights.
+    """
+
+    psnr: float
+    lowest: float
+    squared: Tensor
+
+
+class _Refining:
+    """Refines one scene.
+
+    Args:
+        workshop: of the scene as it is.
+        style: as it was given: that of the job, whatever regions have.
+        kept: [N] bool, Gaussians that stay whole; None for none.
+    """
+
+    def __init__(self, workshop: Workshop, style: StyleMixture, collectives: Collectives, kept: Tensor | None) -> None:
+        self._kept = kept
+        self._workshop, self._given, self._collectives = workshop, style, collectives
+        self._scene, self._settings = workshop.scene, workshop.settings
+        self._rasterizer = workshop.rasterizer
+        self._footprints = Footprints(self._scene)
+
+    def run(self) -> Refinement:
+        """Decide."""
+        covered = self._look()
+        count = len(self._scene)
+        nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
+        if not covered:
+            return nothing
+        cancels, there_is = self._ask_the_loss(spread_evenly(covered, GRADIENT_VIEWS))
+        allowed = candidates(self._footprints, self._may_be_split(), cancels, there_is)
+        budget, lengths = math.floor(self._settings.refine * count), self._footprints.lengths
+        pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, budget))
+        chosen = int((piece_counts(pieces) > 1).sum())
+        kept, change = self._as_far_as_the_picture_stays(pieces, spread_evenly(covered, MEASURED_VIEWS))
+        counts = piece_counts(kept)
+        cut = int((counts > 1).sum())
+        if change is None:
+            return replace(nothing, taken_back=chosen)
+        return Refinement(kept, cut, int(counts.sum()), size, change.psnr, change.lowest, chosen - cut)
+
+    def _may_be_split(self) -> Tensor:
+        """[N] bool."""
+        sane = can_be_split(self._scene)
+        return sane if self._kept is None else sane & ~self._kept
+
+    def _as_far_as_the_picture_stays(self, pieces: Tensor, views: Sequence[int]) -> tuple[Tensor, _Change | None]:
+        """Fewer pieces, as many as leave the picture of some views what it is, and how much it changes.
+
+        None where nothing is cut, or is left to be cut.
+        """
+        for _ in range(_ROUNDS):
+            if not bool((pieces > 1).any()):
+                break
+            change = self._change(pieces, views)
+            if change.lowest >= LEAST_PSNR:
+                return pieces, change
+            pieces = self._collectives.broadcast(partial(self._without_the_worst, pieces, change))
+        return torch.ones_like(pieces), None
+
+    def _look(self) -> list[int]:
+        """Look at every view; returns those that see anything."""
+        collectives, cameras = self._collectives, self._workshop.cameras
+        covered = []
+        for index in self._own(range(len(cameras))):
+            coverage, weights = self._rasterizer.survey(cameras[index])
+            if sees_something(coverage):
+                covered.append(index)
+                self._footprints.add(cameras[index], weights.cpu())
+        sums, reach = self._footprints.parts
+        every = torch.stack(collectives.all_gather(reach)).amax(dim=0) if collectives.size > 1 else reach
+        self._footprints.take(self._sum(sums), every)
+        return sorted(index for part in collectives.all_gather(covered) for index in part)
+
+    def _ask_the_loss(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """`disagreement` of the gradient of the style's loss, over some views."""
+        settings, cameras, total = self._settings, self._workshop.cameras, self._footprints.weights
+        device = self._workshop.network.device
+        style = prepared_style(self._given, settings, self._scene.sh_dc, total)
+        style = style.map(lambda picture: picture.to(device))
+        scene = replace(self._scene, sh_dc=warm_start(self._scene.sh_dc, total, style))
+        loss = SosLoss(
+            self._workshop.network,
+            content_weight=0.0,
+            style_loss=settings.style_loss,
+            memory=int(self._workshop.machine.memory * MEMORY_SHARES["activations"]),
+            coarsest=settings.coarsest_side,
+            style_scale=settings.style_scale,
+            scales=ScaleWeights(settings.scales),
+        )
+        targets: dict[tuple[int, int], dict[int, ScaleTarget]] = {}
+        found = torch.zeros((len(scene), 2), dtype=torch.float64)
+        for index in self._own(views):
+            camera = cameras[index]
+            size = (camera.height, camera.width)
+            if size not in targets:
+                targets[size] = loss.style_targets(style, size)
+            image = render(scene, self._rasterizer, camera)
+            weighted = settings.position_weights != "off"
+            weights = loss.position_weights(self._rasterizer.coverage(camera)) if weighted else None
+            gradient = loss.evaluate(image, targets[size], ViewTarget(coverage=weights)).image_gradient
+            assert gradient is not None
+            gradient = gradient.to(self._rasterizer.device, self._rasterizer.dtype)
+            found += torch.stack(disagreement(self._rasterizer, camera, gradient), dim=1)
+        cancels, there_is = self._sum(found).unbind(1)
+        return cancels, there_is
+
+    def _change(self, pieces: Tensor, views: Sequence[int]) -> _Change:
+        """What pieces [N, 3] do to the unstylized picture of some views."""
+        settings, cameras = self._settings, self._workshop.cameras
+        scene, name = split(self._scene, pieces), self._rasterizer.name
+        options = rasterizer_options(name, settings, self._workshop.machine.memory)
+        if "max_list_bytes" in options:
+            options["max_list_bytes"] = 0  # each view comes once
+        cut = make_rasterizer(name, scene, **options)
+        squared = torch.zeros(len(self._scene), dtype=torch.float64)
+        errors: dict[int, float] = {}
+        for index in self._own(views):
+            before = render(self._scene, self._rasterizer, cameras[index]).clamp(0, 1)
+            change = (render(scene, cut, cameras[index]).clamp(0, 1) - before).square()
+            errors[index] = float(change.mean(dtype=torch.float64))
+            squared += self._rasterizer.colour_gradient(change, cameras[index]).double().sum(dim=1).cpu()
+        every = [error for part in self._collectives.all_gather(errors) for error in part.values()]
+        return _Change(psnr(sum(every) / len(every)), psnr(max(every)), self._sum(squared))
+
+    def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
+        """Fewer pieces: Gaussians stay whole under which the picture changes most, with a share of all the change."""
+        cut = (piece_counts(pieces) > 1).nonzero()[:, 0]
+        density = change.squared[cut] / self._footprints.weights[cut].clamp_min(1.0)
+        order = torch.argsort(density, descending=True, stable=True)
+        summed = change.squared[cut][order].cumsum(0)
+        worst = cut[order[: int((summed < _TAKEN_BACK * summed[-1]).sum()) + 1]]
+        fewer = pieces.clone()
+        fewer[worst] = 1
+        return fewer
+
+    def _own(self, views: Sequence[int]) -> Sequence[int]:
+        """This rank's share."""
+        return views[self._collectives.rank :: self._collectives.size]
+
+    def _sum(self, values: Tensor) -> Tensor:
+        """Over all ranks."""
+        return self._collectives.all_reduce(values.to(self._rasterizer.device)).cpu()
+
+
+def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
+    """Image [H, W, 3] of a scene as it is, by a rasterizer of its geometry."""
+    device = rasterizer.device
+    rest = rest_colours(scene.sh_rest.to(device), scene.means.to(device), camera)
+    return rasterizer.render(view_colours(scene.sh_dc.to(device), rest), camera)
+
+
+def spread_evenly(views: Sequence[int], most: int) -> list[int]:
+    """At most so many of some views, the first of them included."""
+    count = min(most, len(views))
+    return [views[place * len(views) // count] for place in range(count)]
+
+
+def psnr(error: float) -> float:
+    """Of a mean squared error of values in 0..1, dB; 0 is taken for what float32 tells apart."""
+    return -10 * math.log10(max(error, 1e-14))

@@ -1,0 +1,142 @@
+"""What is cut: sizes as the rasterizer projects them, disagreement by definition, and never more than the budget."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sgsst_core.constants import EPS2D
+from sgsst_core.planning.refine import (
+    SIZES,
+    Footprints,
+    axes_in_view,
+    candidates,
+    choose_pieces,
+    disagreement,
+    refine_decision,
+)
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.projection import Column, project
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.split import Refinement, piece_counts
+from sgsst_core.settings import make_settings
+from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
+
+
+def test_axes_in_a_view_add_up_to_the_projected_covariance() -> None:
+    scene, view = cloud(300), camera(pose=turned_pose())
+    found = project(scene, view)
+    rows = torch.from_numpy(found.gaussians).long()
+    x, y = (torch.from_numpy(found.values[:, column]) for column in (Column.X, Column.Y))
+    inside = (x > 0) & (x < view.width) & (y > 0) & (y < view.height)  # elsewhere directions are limited
+    lengths, reach = axes_in_view(scene, rows[inside], view)
+    reference = ReferenceRasterizer(scene)
+    assert reference.dtype == torch.float64
+    # extents are t sqrt(p), t sqrt(r), with one t for both; the sum of the squares of the axes is p + r without blur
+    support = torch.from_numpy(found.values[:, Column.LOG2_OPACITY]).double()[inside] + torch.log2(torch.tensor(255.0))
+    t = (2 * torch.log(torch.tensor(2.0, dtype=torch.float64)) * support).sqrt()
+    extents = [torch.from_numpy(found.values[:, column])[inside] / t for column in (Column.EXTENT_X, Column.EXTENT_Y)]
+    expected = extents[0].square() + extents[1].square() - 2 * EPS2D
+    assert len(expected) > 50
+    assert torch.allclose(lengths.square().sum(dim=1), expected, rtol=1e-5, atol=1e-5)
+    depth = (scene.means.double() @ view.world_to_camera[2, :3].double() + view.world_to_camera[2, 3])[rows[inside]]
+    assert torch.allclose(reach, scene.scales[rows[inside]].double().exp().amax(dim=1) / depth)
+
+
+def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
+    scene, view = cloud(60), camera(20, 14, focal=18.0)
+    generator = torch.Generator().manual_seed(0)
+    gradient = torch.randn(14, 20, 3, generator=generator, dtype=torch.float64)
+    reference = ReferenceRasterizer(scene)
+    cancels, there_is = disagreement(reference, view, gradient)
+    operator = []  # blend weights [pixels, N], one pixel after the other
+    for pixel in range(14 * 20):
+        one = torch.zeros(14 * 20, 3, dtype=torch.float64)
+        one[pixel] = 1
+        operator.append(reference.colour_gradient(one.reshape(14, 20, 3), view)[:, 0])
+    weights, flat = torch.stack(operator), gradient.reshape(-1, 3)
+    whole, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
+    assert torch.allclose(there_is, whole.sum(dim=1), atol=1e-12)
+    assert torch.allclose(cancels, (whole - summed).sum(dim=1), atol=1e-12)
+    fast = disagreement(CpuRasterizer(scene), view, gradient.float())
+    assert torch.allclose(fast[0], cancels, atol=1e-4 * float(there_is.max()))
+    uniform = disagreement(reference, view, torch.full((14, 20, 3), -0.3, dtype=torch.float64))
+    assert torch.allclose(uniform[0], torch.zeros(60, dtype=torch.float64), atol=1e-12)
+
+
+def test_footprints_are_means_over_what_views_show() -> None:
+    scene, views = cloud(200), [camera(pose=turned_pose()), camera(40, 30, focal=30.0)]
+    rasterizer, prints = CpuRasterizer(scene), Footprints(scene)
+    weights = [rasterizer.survey(view)[1] for view in views]
+    for view, own in zip(views, weights, strict=True):
+        prints.add(view, own)
+    total = sum(own.double() for own in weights)
+    assert torch.equal(prints.weights, total)
+    both = ((weights[0] > 0) & (weights[1] > 0)).nonzero()[:, 0]
+    assert len(both) > 5
+    squares = sum(
+        own[both].double()[:, None] * axes_in_view(scene, both, view)[0].square()
+        for view, own in zip(views, weights, strict=True)
+    )
+    assert torch.allclose(prints.lengths[both], (squares / total[both, None]).sqrt())
+    assert bool((prints.lengths[total == 0] == 0).all())
+    other = Footprints(scene)
+    other.take(*prints.parts)
+    assert torch.equal(other.lengths, prints.lengths)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.floats(1, 16), st.floats(0.1, 300))
+def test_there_are_never_more_than_the_budget(seed: int, factor: float, largest: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    count = 50
+    lengths = largest * torch.rand(count, 3, generator=generator, dtype=torch.float64) ** 3
+    allowed = torch.rand(count, generator=generator) > 0.3
+    cancels = torch.rand(count, generator=generator, dtype=torch.float64)
+    budget = int(factor * count)
+    pieces, size = choose_pieces(lengths, allowed, cancels, budget)
+    assert int(piece_counts(pieces).sum()) <= budget
+    assert bool((pieces[~allowed] == 1).all())
+    assert bool((pieces[lengths <= SIZES[-1]] == 1).all())
+    assert (size is None) == (not bool((pieces > 1).any()))
+    again, same = choose_pieces(lengths, allowed, cancels, budget)
+    assert torch.equal(again, pieces)
+    assert same == size
+
+
+def test_where_the_budget_ends_those_that_disagree_most_go_first() -> None:
+    lengths = torch.tensor([[10.0, 0.1, 0.1]], dtype=torch.float64).repeat(6, 1)
+    cancels = torch.tensor([1.0, 5.0, 2.0, 0.5, 4.0, 3.0], dtype=torch.float64)
+    pieces, _ = choose_pieces(lengths, torch.ones(6, dtype=torch.bool), cancels, 11)
+    assert piece_counts(pieces).tolist() == [1, 3, 1, 1, 3, 1]
+    nothing, size = choose_pieces(torch.full_like(lengths, 1.0), torch.ones(6, dtype=torch.bool), cancels, 60)
+    assert bool((nothing == 1).all())
+    assert size is None
+
+
+def test_what_hardly_shows_or_has_one_colour_or_is_close_is_not_cut() -> None:
+    prints = Footprints(cloud(5))
+    prints.weights = torch.tensor([100.0, 1.0, 100.0, 100.0, 100.0], dtype=torch.float64)
+    prints.reach = torch.tensor([0.1, 0.1, 0.9, 0.1, 0.1], dtype=torch.float64)
+    there_is = torch.ones(5, dtype=torch.float64)
+    cancels = torch.tensor([0.9, 0.9, 0.9, 0.01, 0.9], dtype=torch.float64)
+    splittable = torch.tensor([True, True, True, True, False])
+    assert candidates(prints, splittable, cancels, there_is).tolist() == [True, False, False, False, False]
+    assert not candidates(prints, splittable, torch.zeros(5), torch.zeros(5)).any(), "no gradient asks for anything"
+
+
+@pytest.mark.parametrize("taken_back", [0, 7])
+def test_a_plan_tells_what_was_cut_and_what_that_costs(taken_back: int) -> None:
+    pieces = torch.ones(1000, 3, dtype=torch.uint8)
+    pieces[:10, 0] = 5
+    made = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, taken_back)
+    line = refine_decision(made, make_settings(refine=4))
+    assert line.decision == "10 are cut, which makes 1,040 of 1,000"
+    assert "6.5 pixels" in line.reason
+    assert ("7 stay whole" in line.reason) == bool(taken_back)
+    assert "43.2 dB" in line.error
+    assert "41.1 dB" in line.error
+    none = refine_decision(Refinement(torch.ones(9, 3, dtype=torch.uint8), 0, 9), make_settings(refine=4))
+    assert none.decision == "none is cut"

@@ -1,0 +1,189 @@
+"""Gaussians in pieces: moments kept whatever the shape, finite whatever the numbers, and nothing else changed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.rasterizer.reference import ReferenceRasterizer, rotation_matrices
+from sgsst_core.scene import split as module
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import (
+    MOST_PIECES,
+    can_be_split,
+    cut_into,
+    mixture_error,
+    parents_of,
+    piece_counts,
+    pieces_to,
+    ratio_of,
+    split,
+)
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from tests.sgsst_core.splat_scenes import camera, cloud, single
+
+NUMBERS = [1, *range(3, MOST_PIECES + 1)]
+
+
+def covariances(scene: Scene) -> Tensor:
+    """[N, 3, 3] float64."""
+    factors = rotation_matrices(scene.quats.double()) * scene.scales.double().exp()[:, None, :]
+    return factors @ factors.transpose(1, 2)
+
+
+def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Mean [N, 3] and covariance [N, 3, 3] of each parent's children, weighted by their opacity, in float64."""
+    opacity = torch.sigmoid(children.opacities.double())
+    share = opacity / torch.zeros(count, dtype=torch.float64).index_add(0, parents, opacity)[parents]
+    mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, parents, share[:, None] * children.means.double())
+    apart = children.means.double() - mean[parents]
+    own = covariances(children) + apart[:, :, None] * apart[:, None, :]
+    return mean, torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, parents, share[:, None, None] * own)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_an_axis_in_pieces_has_its_variance_and_nearly_its_density(number: int) -> None:
+    cut = cut_into(number)
+    assert len(cut.offsets) == len(cut.weights) == number
+    assert cut.weights.sum() == pytest.approx(1, abs=1e-14)
+    assert cut.weights @ cut.offsets == pytest.approx(0, abs=1e-12)
+    assert 1 / cut.ratio**2 + cut.weights @ cut.offsets**2 == pytest.approx(1, abs=1e-11)
+    assert cut.ratio == ratio_of(number)
+    x = np.linspace(-9, 9, 20001)
+    density = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
+    parts = np.exp(-(((x[:, None] - cut.offsets) * cut.ratio) ** 2) / 2) * cut.ratio / math.sqrt(2 * math.pi)
+    error = np.sqrt(((parts @ cut.weights - density) ** 2).sum() / (density**2).sum())
+    assert mixture_error(cut) == pytest.approx(error, abs=1e-6)
+    assert error < 0.03
+    # what a child's opacity is multiplied with: never more than the parent's own
+    assert float((cut.weights * cut.ratio).max()) <= 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.lists(st.sampled_from(NUMBERS[:8]), min_size=3, max_size=3), st.floats(-8, 2))
+def test_the_mixture_of_the_children_has_mean_and_covariance_of_the_parent(
+    seed: int, numbers: list[int], log_scale: float
+) -> None:
+    scene = cloud(30, seed=seed, log_scale=log_scale)
+    pieces = torch.tensor(numbers, dtype=torch.uint8).repeat(30, 1)
+    pieces[::3] = 1
+    children, parents = split(scene, pieces), parents_of(pieces)
+    assert len(children) == len(parents) == int(piece_counts(pieces).sum())
+    mean, covariance = mixtures(children, parents, 30)
+    expected = covariances(scene)
+    size = expected.diagonal(dim1=1, dim2=2).sum(1)
+    rounding = 1e-6 * scene.means.abs().amax(1).double()  # of places that are stored in float32
+    assert bool(((mean - scene.means).norm(dim=1) < 1e-5 * size.sqrt() + rounding).all())
+    apart = (covariance - expected).flatten(1).norm(dim=1)
+    assert bool((apart < 1e-5 * size + 10 * rounding * size.sqrt() + rounding**2).all())
+
+
+def test_what_is_not_cut_and_all_that_is_no_shape_is_the_parents_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_CHUNK", 50)
+    scene = cloud(40, degree=2)
+    pieces = torch.ones(40, 3, dtype=torch.uint8)
+    pieces[3], pieces[17], pieces[18, 1] = torch.tensor([5, 4, 1]), torch.tensor([3, 3, 3]), 32
+    children, parents = split(scene, pieces), parents_of(pieces)
+    assert bool((parents[1:] >= parents[:-1]).all())
+    for name in ("quats", "sh_dc", "sh_rest"):
+        assert torch.equal(getattr(children, name), getattr(scene, name)[parents])
+    whole = (piece_counts(pieces) == 1)[parents]
+    for field in fields(Scene):
+        assert torch.equal(getattr(children, field.name)[whole], getattr(scene, field.name)[parents][whole])
+    monkeypatch.setattr(module, "_CHUNK", 1 << 18)
+    again = split(scene, pieces)
+    assert all(torch.equal(getattr(again, field.name), getattr(children, field.name)) for field in fields(Scene))
+    assert split(scene, torch.ones(40, 3, dtype=torch.uint8)) is scene
+
+
+def test_extreme_gaussians_have_finite_children_or_stay_whole() -> None:
+    """Needles, points, huge and coincident ones, opacity 0 and 1."""
+    count = 9
+    scene = replace(
+        cloud(count, degree=1),
+        means=torch.tensor([[0.0, 0.0, 4.0]]).repeat(count, 1),
+        scales=torch.tensor(
+            [
+                [10.0, -40, -40],
+                [-59.0] * 3,
+                [59.0] * 3,
+                [-1.0] * 3,
+                [-1.0] * 3,
+                [3e38] * 3,
+                [-3e38] * 3,
+                [0.0] * 3,
+                [0.0] * 3,
+            ]
+        ),
+        opacities=torch.tensor([0.0, 0, 0, -3.4e38, 3.4e38, 0, 0, 90, -90]),
+    )
+    scene.quats[7] = 0
+    scene.quats[8] *= 1e-30
+    possible = can_be_split(scene)
+    assert possible.tolist() == [True, True, True, True, True, False, False, False, True]
+    pieces = torch.ones(count, 3, dtype=torch.uint8)
+    pieces[possible] = torch.tensor([4, 3, 5], dtype=torch.uint8)
+    children = split(scene, pieces)
+    for field in fields(Scene):
+        assert bool(torch.isfinite(getattr(children, field.name)).all()), field.name
+    opacity = torch.sigmoid(children.opacities.double())
+    assert bool((opacity <= torch.sigmoid(scene.opacities.double())[parents_of(pieces)]).all())
+    pieces[5, 0] = 3
+    with pytest.raises(ValueError, match="extreme"):
+        split(scene, pieces)
+
+
+@pytest.mark.parametrize("pieces", [[[2, 1, 1]], [[0, 1, 1]], [[33, 1, 1]], [[1, 1, 1], [1, 1, 1]]])
+def test_other_numbers_of_pieces_are_refused(pieces: list[list[int]]) -> None:
+    with pytest.raises(ValueError, match="pieces must be"):
+        split(single((0, 0, 3)), torch.tensor(pieces, dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(("opacity", "least"), [(0.1, 45.0), (0.4, 40.0), (0.7, 33.0)])
+def test_a_gaussian_in_pieces_looks_as_before(opacity: float, least: float) -> None:
+    """One on black, white itself, with nothing around that would hide a change: the hardest case."""
+    scene = single((0.1, 0, 4.0), opacity=opacity, scales=(0.5, 0.3, 0.02), quat=(0.9, 0.1, 0.1, 0.3))
+    pieces = torch.tensor([[6, 4, 1]], dtype=torch.uint8)
+    images = []
+    for each in (scene, split(scene, pieces)):
+        images.append(ReferenceRasterizer(each).render(torch.ones(len(each), 3), camera()))
+    error = float((images[0] - images[1]).square().mean())
+    assert -10 * math.log10(error) > least
+
+
+def test_lengths_are_cut_to_a_size_with_the_fewest_pieces() -> None:
+    lengths = torch.tensor([[1.0, 5.0, 0.0], [3.0, 1e9, torch.inf], [2.0, 2.0 + 1e-9, 4.0]], dtype=torch.float64)
+    pieces = pieces_to(lengths, 2.0)
+    assert pieces.dtype == torch.uint8
+    assert pieces[:, 0].tolist() == [1, 4, 1]
+    assert pieces[1, 1:].tolist() == [MOST_PIECES, MOST_PIECES]
+    assert pieces[2].tolist() == [1, 3, 5]
+    generator = torch.Generator().manual_seed(0)
+    some = 20 * torch.rand(200, 3, generator=generator, dtype=torch.float64)
+    for length, number in zip(some.flatten().tolist(), pieces_to(some, 2.0).flatten().tolist(), strict=True):
+        assert length / ratio_of(number) <= 2.0
+        fewer = NUMBERS[NUMBERS.index(number) - 1] if number > 1 else None
+        assert fewer is None or length / ratio_of(fewer) > 2.0
+
+
+def test_harmonics_that_stay_in_the_file_are_the_parents(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.ply", cloud(300, degree=3))
+    pieces = torch.ones(300, 3, dtype=torch.uint8)
+    pieces[::7, 1] = 3
+    plain = split(read_scene(tmp_path / "scene.ply").scene, pieces)
+    stored = split(read_scene(tmp_path / "scene.ply", held_bytes=0).scene, pieces)
+    assert isinstance(stored.sh_rest, StoredHarmonics)
+    assert torch.equal(held(stored.sh_rest), plain.sh_rest)
+    some = torch.arange(len(plain)) % 3 > 0
+    part = stored.sh_rest[some]
+    assert isinstance(part, StoredHarmonics)
+    assert torch.equal(held(part), plain.sh_rest[some])

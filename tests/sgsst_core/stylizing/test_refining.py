@@ -1,0 +1,156 @@
+"""A scene of large Gaussians is refined: the picture stays, the result repeats, and nobody is cut who is small."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.planning import refine as choice
+from sgsst_core.planning.refine import LEAST_PSNR
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.split import Refinement, parents_of, piece_counts
+from sgsst_core.settings import Settings, make_settings
+from sgsst_core.stylizing import refining
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.refining import psnr, refine, refined, render, spread_evenly
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import tiny_weights as make_tiny_weights
+from tests.small_scenes import ball, blind_camera, cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def large_wall() -> Scene:
+    """The wall of small Gaussians with a dozen of large faint ones in front of it, and a needle."""
+    behind = wall()
+    before = wall(4, 3, 0)
+    before = replace(
+        before,
+        means=before.means * 0.6 - torch.tensor([0.0, 0.0, -0.9]),
+        scales=torch.tensor([0.5, 0.3, 0.02]).log().repeat(12, 1),
+        opacities=torch.full((12,), -1.0),
+        sh_dc=before.sh_dc * 0.3,
+    )
+    before.scales[0] = torch.tensor([0.9, 0.002, 0.002]).log()
+    joined = {
+        field.name: torch.cat([getattr(part, field.name) for part in (behind, before)]) for field in fields(Scene)
+    }
+    return Scene(**joined)
+
+
+def settings(**values: object) -> Settings:
+    return make_settings("preview", steps_coarse=0, steps_sos=2, measure=0, **values)
+
+
+def made(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
+    found = refine(scene or large_wall(), cameras(), style(), settings(refine=factor), weights=weights)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("factor", [1.2, 2.0, 4.0])
+def test_large_gaussians_are_cut_within_the_budget_and_the_picture_stays(
+    tiny_weights: BackboneWeights, factor: float
+) -> None:
+    scene = large_wall()
+    found = made(tiny_weights, factor)
+    counts = piece_counts(found.pieces)
+    assert found.split == int((counts > 1).sum()) > 0
+    assert len(scene) < found.gaussians == int(counts.sum()) <= factor * len(scene)
+    assert found.psnr is not None
+    assert found.lowest_psnr is not None
+    assert found.psnr >= found.lowest_psnr >= LEAST_PSNR
+    cut = refined(scene, found)
+    errors = []
+    for camera in cameras():  # by the slow rasterizer, in float64
+        before, after = (render(each, ReferenceRasterizer(each), camera).clamp(0, 1) for each in (scene, cut))
+        errors.append(float((after - before).square().mean()))
+    assert psnr(max(errors)) == pytest.approx(found.lowest_psnr, abs=0.01)
+    assert psnr(sum(errors) / len(errors)) == pytest.approx(found.psnr, abs=0.01)
+
+
+def test_the_same_comes_out_every_time(tiny_weights: BackboneWeights) -> None:
+    first, second = made(tiny_weights, 2.0), made(tiny_weights, 2.0)
+    assert torch.equal(first.pieces, second.pieces)
+    assert first.psnr == second.psnr
+
+
+def test_nothing_is_cut_where_nothing_is_large(tiny_weights: BackboneWeights) -> None:
+    small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
+    found = made(tiny_weights, 8.0, small)
+    assert (found.split, found.gaussians, found.taken_back) == (0, len(small), 0)
+    assert found.psnr is None
+    assert refined(small, found) is small
+
+
+def test_nothing_is_cut_that_would_change_the_picture(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a bound that nothing can keep, all are taken back; with none, no one is."""
+    monkeypatch.setattr(refining, "LEAST_PSNR", 200.0)
+    found = made(tiny_weights, 4.0)
+    assert found.split == 0
+    assert found.taken_back > 0
+    assert "stay whole" in choice.refine_decision(found, settings(refine=4)).reason
+    monkeypatch.setattr(refining, "LEAST_PSNR", 0.0)
+    loose = made(tiny_weights, 4.0)
+    assert loose.taken_back == 0
+    assert loose.split == found.taken_back
+
+
+def test_one_is_off_and_leaves_a_run_as_it_was(tiny_weights: BackboneWeights) -> None:
+    scene = large_wall()
+    assert refine(scene, cameras(), style(), settings(refine=1), weights=tiny_weights) is None
+    assert refined(scene, None) is scene
+
+
+def test_a_blind_job_is_told_by_the_plan(tiny_weights: BackboneWeights) -> None:
+    found = refine(ball(), [blind_camera()], style(), settings(refine=2), weights=tiny_weights)
+    assert found is not None
+    assert found.split == 0
+
+
+def test_a_stylizer_goes_on_with_the_refined_scene(tiny_weights: BackboneWeights) -> None:
+    scene = large_wall()
+    stylizer = Stylizer.planned(scene, cameras(), style(), settings(refine=3), weights=tiny_weights)
+    made = stylizer.plan.refinement
+    assert made is not None
+    assert len(stylizer.scene) == made.gaussians > len(scene)
+    assert stylizer.plan.decisions[0].item == "refined Gaussians"
+    assert len(stylizer.plan.seen) == made.gaussians
+    run(stylizer)
+    assert stylizer.stylized().shape == (made.gaussians, 3)
+    parents, change = parents_of(made.pieces), stylizer.stylized() - stylizer.scene.sh_dc
+    cut = int((piece_counts(made.pieces) > 1).nonzero()[0])
+    children = change[parents == cut]
+    assert float(children.std(dim=0).max()) > 0.01, "children have colours of their own"
+
+
+def test_views_are_spread_evenly() -> None:
+    assert spread_evenly([3, 5, 8], 6) == [3, 5, 8]
+    assert spread_evenly(list(range(10)), 4) == [0, 2, 5, 7]
+    assert spread_evenly([], 4) == []
+
+
+def test_footprints_and_pictures_are_those_of_the_fast_rasterizer() -> None:
+    scene, camera = wall(sh_degree=1), cameras()[1]
+    slow, fast = ReferenceRasterizer(scene), CpuRasterizer(scene)
+    assert torch.allclose(render(scene, slow, camera).float(), render(scene, fast, camera), atol=1e-5)
+
+
+def on_a_rank(collectives: object, factor: float) -> Refinement | None:
+    """For the ranks' test, which runs it in other processes."""
+    weights = make_tiny_weights()
+    return refine(
+        large_wall(),
+        cameras(),
+        style(),
+        settings(refine=factor),
+        weights=weights,
+        collectives=collectives,  # type: ignore[arg-type]
+    )
