@@ -1,0 +1,71 @@
+"""Controls that change what others work on: regions of a refined scene, several styles in luminance, all at once."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Region, Regions
+from sgsst_core.scene.luminance import luminance
+from sgsst_core.scene.split import parents_of, piece_counts
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.refining import refine
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.stylizing.test_refining import large_wall
+from tests.small_scenes import cameras, style
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def halves() -> Regions:
+    """The left of the wall is kept, the right has a style of its own, and what is in the middle is the rest."""
+    across = large_wall().means[:, 0]
+    labels = torch.zeros(len(across), dtype=torch.uint8)
+    labels[across < -0.5], labels[across > 0.5] = 1, 2
+    own = StyleMixture.weighted([style().flip(0), style().flip(2)], [1, 3])
+    return Regions((Region("rest"), Region("left", keep=True), Region("right", style=own, weight=2.0)), labels)
+
+
+def job(weights: BackboneWeights, **values: object) -> Stylizer:
+    settings = make_settings("preview", steps_coarse=1, steps_sos=2, measure=0, coarsest_side=24, **values)
+    both = StyleMixture.weighted([style(), style().flip(1)], [2, 1])
+    return Stylizer.planned(large_wall(), cameras(), both, settings, weights=weights, regions=halves())
+
+
+def stylized(stylizer: Stylizer) -> torch.Tensor:
+    while stylizer.step < stylizer.total:
+        stylizer.run_step()
+    return stylizer.stylized()
+
+
+def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_weights: BackboneWeights) -> None:
+    settings, regions = make_settings("preview", refine=2.0), halves()
+    free = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights)
+    made = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights, regions=regions)
+    assert free is not None
+    assert made is not None
+    assert bool((piece_counts(free.pieces)[regions.kept] > 1).any()), "nothing is proved"
+    assert bool((piece_counts(made.pieces)[regions.kept] == 1).all())
+    assert made.split
+    assert torch.equal(regions.refined(made).labels, regions.labels[parents_of(made.pieces)])
+
+
+@pytest.mark.parametrize("colours", ["no", "luminance"])
+def test_all_at_once(tiny_weights: BackboneWeights, colours: str) -> None:
+    values = {"refine": 2.0, "keep_colours": colours, "sh_fade": 0.5, "scales": (1.0, 0.5), "warm_start": True}
+    stylizer = job(tiny_weights, **values)
+    before = stylizer.scene.sh_dc.clone()
+    found = stylized(stylizer)
+    assert len(found) > len(large_wall())
+    assert stylizer.regions is not None
+    kept = stylizer.regions.kept
+    assert torch.equal(found[kept], before[kept])
+    assert not torch.equal(found[~kept], before[~kept])
+    assert bool(found.isfinite().all())
+    if colours == "luminance":
+        change = found.double() - before.double()
+        assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
+        assert float(luminance(change).abs().max()) > 0.01
+    assert torch.equal(stylized(job(tiny_weights, **values)), found)
