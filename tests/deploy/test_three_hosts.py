@@ -32,7 +32,7 @@ def test_a_job_needs_no_folder_that_machines_share(how: str, tmp_path: Path, vgg
     if reason := problem() or missing():
         pytest.skip(reason)
     environment = {**os.environ, "BIN": str(Path(sys.executable).parent)}
-    command = [ROOT / "deploy" / "three_hosts.sh", tmp_path / "out", how]
+    command = [str(ROOT / "deploy" / "three_hosts.sh"), str(tmp_path / "out"), how]
     ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
     assert "computed on: host-node" in ended.stdout
