@@ -199,6 +199,16 @@ def test_a_store_that_fails_for_a_moment_costs_a_moment(fleet: Fleet, fault: Fau
     assert fleet.read(fleet.host("two"), sha256) == data
 
 
+def test_of_a_large_file_what_was_cut_off_is_fetched_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = os.urandom(100_001)
+    sha256 = fleet.take(fleet.host("one"), data)
+    monkeypatch.setattr("service.files.objects._PIECE_BYTES", 10_000)
+    before = len(fleet.s3.asked)
+    fleet.s3.fail("cut-off", 2, lambda method, path: method == "GET")
+    assert fleet.read(fleet.host("two"), sha256) == data
+    assert sum(method == "GET" for method, _ in fleet.s3.asked[before:]) == 11 + 2
+
+
 def test_a_store_that_stays_away_is_not_the_users_fault(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
     sha256 = fleet.take(fleet.host("one"), data)
