@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import secrets
+import shutil
 import time
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
-from service.errors import ConflictError, NotFoundError
+from service.errors import ConflictError, NoSpaceError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Blobs, PartWriter, write_all
 from service.files.cache import FileCache, file_digest
@@ -45,6 +46,14 @@ class StoredBlobs(Blobs):
         self._objects, self._cache = objects, open_cache(settings)
         self._before = settings.folder / "blobs"  # of a service whose files were in a local folder
         self._looked_at = float("-inf")
+
+    def ensure_room(self, size: int) -> None:
+        """As for all, but what is only kept for later makes room first."""
+        try:
+            super().ensure_room(size)
+        except NoSpaceError:
+            self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
+            super().ensure_room(size)
 
     def keep(self, path: Path, sha256: str, size: int) -> None:
         """Put a received file into the store, unless its content is there, and into the cache."""
@@ -94,16 +103,17 @@ class StoredBlobs(Blobs):
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
             parts = self._inputs.parts(upload.id)
+            locations = [part.location for part in parts]
             try:
-                self._gather([part.location for part in parts], whole, upload)
+                self._gather(locations, whole, upload)
+                sha256 = file_digest(whole)
+                can_join = self._objects.can_join([part.size for part in parts])
+                self._put(whole, sha256, upload.length, locations if can_join else [])
             except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
                     raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
                 return known
-            sha256 = file_digest(whole)
-            joined = [part.location for part in parts] if self._objects.can_join([part.size for part in parts]) else []
-            self._put(whole, sha256, upload.length, joined)
             self._inputs.finish_upload(upload.id, sha256, seconds)
             self._cache.adopt(whole, sha256)
         finally:

@@ -7,11 +7,12 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
 
-from service.errors import ConflictError, NotFoundError, StoreError
+from service.errors import ConflictError, NoSpaceError, NotFoundError, StoreError
 from service.files import stored_blobs
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Receiver
@@ -166,6 +167,25 @@ def test_of_two_who_send_the_same_bytes_one_is_told_so(fleet: Fleet) -> None:
     sha256 = fleet.host("three").finish_upload(fleet.again(upload), HOUR)
     assert fleet.read(fleet.host("one"), sha256) == b"fast" * 4 + b"and the end.!!"
     assert len(fleet.names()) == 1
+
+
+def test_what_is_kept_for_later_makes_room(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    host = fleet.host("one")
+    used, kept = (fleet.take(host, os.urandom(size)) for size in (3000, 5000))
+    folder = fleet.folder / "one" / "cache" / "files"
+
+    def free(_: Path) -> SimpleNamespace:
+        return SimpleNamespace(free=10_000 - sum(path.stat().st_size for path in folder.glob("*/*")))
+
+    monkeypatch.setattr("service.files.blobs.shutil.disk_usage", free)
+    with host.lent(fleet.store.inputs.blobs([used])):
+        host.ensure_room(2000)
+        assert (folder / kept[:2] / kept).exists()
+        host.ensure_room(7000)
+        assert {path.name for path in folder.glob("*/*")} == {used}, "it is in use"
+        with pytest.raises(NoSpaceError):
+            host.ensure_room(7001)
+    host.ensure_room(10_000)
 
 
 def test_a_half_upload_is_collected(fleet: Fleet) -> None:
