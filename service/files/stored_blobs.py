@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import shutil
 import time
@@ -9,7 +10,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
-from service.errors import ConflictError, NoSpaceError, NotFoundError
+from service.errors import ConflictError, NoSpaceError, NotFoundError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Blobs, PartWriter, write_all
 from service.files.cache import FileCache, file_digest
@@ -24,6 +25,8 @@ BLOBS, UPLOADS = "blobs", "uploads"
 _ORPHAN_SECONDS = 6 * 3600.0
 #: The store is looked through for these so often.
 _LOOK_SECONDS = 3600.0
+
+_log = logging.getLogger(__name__)
 
 
 def open_blobs(settings: ServiceSettings, inputs: Inputs, artifacts: Artifacts) -> Blobs:
@@ -82,12 +85,19 @@ class StoredBlobs(Blobs):
             return
         except NotFoundError:
             location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
-        if parts:
-            self._objects.join(parts, f"{BLOBS}/{location}")
-        else:
-            self._objects.put(path, f"{BLOBS}/{location}")
+        self._send(path, f"{BLOBS}/{location}", parts)
         if self._inputs.add_blob(sha256, location, size) != location:
             self._objects.remove(f"{BLOBS}/{location}")
+
+    def _send(self, path: Path, name: str, parts: list[str]) -> None:
+        """Join the parts, or, where there are none or the store cannot, send the file."""
+        if parts:
+            try:
+                self._objects.join(parts, name)
+                return
+            except StoreError as error:
+                _log.warning("the store does not join parts, the whole is sent: %s", error.__cause__)
+        self._objects.put(path, name)
 
     # --- uploads ---------------------------------------------------------------------------------------------------
 
