@@ -101,6 +101,10 @@ class FileCache:
                     total -= entry.size
             self._remove_half_files()
 
+    def free(self, size: int) -> None:
+        """Evict so many bytes, as far as they are not in use, for others who need the disk."""
+        self.evict(self._limit - self._total() + size)
+
     def _fill(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
         self.evict(size)
         half, found = self._half / secrets.token_hex(8), ""

@@ -21,7 +21,10 @@ from service.errors import StoreError
 #: Of S3: seconds to connect and for an answer, and tries. What answers 503 (SlowDown) is asked again after waits that
 #: double, by the client itself; together a store that is away is given up after half a minute.
 _CONNECT_SECONDS, _ANSWER_SECONDS = 3.0, 30.0
-_CLIENT_TRIES, _TRIES = 4, 2
+_CLIENT_TRIES, _TRIES = 3, 3
+#: Large objects travel to and from S3 in pieces of so many bytes, so many at a time: by default half a gigabyte of
+#: memory would be on its way.
+_PIECE_BYTES, _PIECES = 16 << 20, 3
 #: What S3 takes as a part of an object but for the last one, and how many of them.
 MIN_PART_BYTES, _MAX_PARTS = 5 << 20, 10_000
 _CHUNK = 1 << 20
@@ -49,7 +52,8 @@ class ObjectStore:
     def put(self, source: Path, name: str) -> None:
         """Bring a file in that nobody writes to; it is there as a whole or not at all."""
         with self._told(name):
-            self._files.put_file(str(source), self._path(name))
+            options = {"chunksize": _PIECE_BYTES, "max_concurrency": _PIECES} if self._s3 else {}
+            self._files.put_file(str(source), self._path(name), **options)
 
     def get(self, name: str, target: Path) -> None:
         """Copy an object to a local file.
@@ -58,7 +62,21 @@ class ObjectStore:
             FileNotFoundError: there is none of that name.
         """
         with self._told(name):
-            self._files.get_file(self._path(name), str(target))
+            if self._s3:
+                self._get_pieces(self._path(name), target)
+            else:
+                self._files.get_file(self._path(name), str(target))
+
+    def _get_pieces(self, path: str, target: Path) -> None:
+        """As `get`; a piece that is cut off is fetched again, and not the whole."""
+        size = self._files.size(path)
+        starts = range(0, size, _PIECE_BYTES)
+        with target.open("wb") as file:
+            for first in range(0, len(starts), _PIECES):
+                some = list(starts[first : first + _PIECES])
+                ends = [min(start + _PIECE_BYTES, size) for start in some]
+                for data in self._files.cat_ranges([path] * len(some), some, ends, on_error="raise"):
+                    file.write(data)
 
     def read(self, name: str, start: int, stop: int) -> Iterator[bytes]:
         """The bytes from `start` up to `stop`, in pieces.

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
+import shutil
 import time
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
-from service.errors import ConflictError, NotFoundError
+from service.errors import ConflictError, NoSpaceError, NotFoundError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Blobs, PartWriter, write_all
 from service.files.cache import FileCache, file_digest
@@ -23,6 +25,8 @@ BLOBS, UPLOADS = "blobs", "uploads"
 _ORPHAN_SECONDS = 6 * 3600.0
 #: The store is looked through for these so often.
 _LOOK_SECONDS = 3600.0
+
+_log = logging.getLogger(__name__)
 
 
 def open_blobs(settings: ServiceSettings, inputs: Inputs, artifacts: Artifacts) -> Blobs:
@@ -45,6 +49,14 @@ class StoredBlobs(Blobs):
         self._objects, self._cache = objects, open_cache(settings)
         self._before = settings.folder / "blobs"  # of a service whose files were in a local folder
         self._looked_at = float("-inf")
+
+    def ensure_room(self, size: int) -> None:
+        """As for all, but what is only kept for later makes room first."""
+        try:
+            super().ensure_room(size)
+        except NoSpaceError:
+            self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
+            super().ensure_room(size)
 
     def keep(self, path: Path, sha256: str, size: int) -> None:
         """Put a received file into the store, unless its content is there, and into the cache."""
@@ -73,12 +85,19 @@ class StoredBlobs(Blobs):
             return
         except NotFoundError:
             location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
-        if parts:
-            self._objects.join(parts, f"{BLOBS}/{location}")
-        else:
-            self._objects.put(path, f"{BLOBS}/{location}")
+        self._send(path, f"{BLOBS}/{location}", parts)
         if self._inputs.add_blob(sha256, location, size) != location:
             self._objects.remove(f"{BLOBS}/{location}")
+
+    def _send(self, path: Path, name: str, parts: list[str]) -> None:
+        """Join the parts, or, where there are none or the store cannot, send the file."""
+        if parts:
+            try:
+                self._objects.join(parts, name)
+                return
+            except StoreError as error:
+                _log.warning("the store does not join parts, the whole is sent: %s", error.__cause__)
+        self._objects.put(path, name)
 
     # --- uploads ---------------------------------------------------------------------------------------------------
 
@@ -94,16 +113,17 @@ class StoredBlobs(Blobs):
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
             parts = self._inputs.parts(upload.id)
+            locations = [part.location for part in parts]
             try:
-                self._gather([part.location for part in parts], whole, upload)
+                self._gather(locations, whole, upload)
+                sha256 = file_digest(whole)
+                can_join = self._objects.can_join([part.size for part in parts])
+                self._put(whole, sha256, upload.length, locations if can_join else [])
             except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
                     raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
                 return known
-            sha256 = file_digest(whole)
-            joined = [part.location for part in parts] if self._objects.can_join([part.size for part in parts]) else []
-            self._put(whole, sha256, upload.length, joined)
             self._inputs.finish_upload(upload.id, sha256, seconds)
             self._cache.adopt(whole, sha256)
         finally:

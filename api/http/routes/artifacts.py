@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
@@ -14,7 +16,7 @@ from api.http.context import CallerDep, Context, ContextDep
 from api.http.documentation import Responses, headers, invalid, links, problems
 from api.http.routes.jobs import IfNoneMatch, JobId, find
 from api.http.schemas import JOB_ID, SHA256, ArtifactList, artifact_view
-from service.errors import BusyError, NoSpaceError, NotFoundError, RefusedInputError, ServiceError
+from service.errors import BusyError, NoSpaceError, NotFoundError, RefusedInputError, ServiceError, StoreError
 from service.files.artifacts import media_type
 from service.files.names import RESULT
 from service.store.tables import ArtifactRow, JobRow
@@ -102,6 +104,7 @@ _ANSWERS: Responses = {
         RefusedInputError("Packing the result takes more time or memory than allowed.", "inspection-limit"),
         BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10),
         NoSpaceError("The service's disk is too full to take this in. Try again later."),
+        StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
     ),
 }
 
@@ -156,7 +159,8 @@ async def get_artifact(
     if request.method == "HEAD":
         return Response(status_code=status, headers=sent, media_type=media_type(row.name))
     body = context.artifacts.read(row.location, start, stop)
-    return StreamingResponse(body, status, sent, media_type(row.name))
+    first = await asyncio.to_thread(_first, body)  # what fails now can still be answered
+    return StreamingResponse(chain(first, body), status, sent, media_type(row.name))
 
 
 async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | None) -> ArtifactRow:
@@ -169,6 +173,11 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | 
     if row is None:
         raise NotFoundError(f"Job {job.id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")
     return row
+
+
+def _first(body: Iterator[bytes]) -> list[bytes]:
+    """The first piece of a body, where it has one."""
+    return [piece for piece in (next(body, None),) if piece is not None]
 
 
 def _headers(row: ArtifactRow, tag: str, job_name: str) -> dict[str, str]:

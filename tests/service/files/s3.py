@@ -13,13 +13,15 @@ from typing import Any, Literal
 import httpx
 import pytest
 
-#: "slow-down": 503, as S3 says that there are too many requests; "reset": the connection is broken off before the
-#: answer; "cut-off": in the middle of it; "silence": there is no answer at all.
-Fault = Literal["slow-down", "reset", "cut-off", "silence"]
+#: "slow-down": 503, as S3 says that there are too many requests; "not-implemented": 501; "reset": the connection is
+#: broken off before the answer; "cut-off": in the middle of it; "silence": there is no answer at all.
+Fault = Literal["slow-down", "not-implemented", "reset", "cut-off", "silence"]
 
 _SLOW_DOWN = (
     b"<?xml version='1.0'?><Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"
 )
+
+_NOT_IMPLEMENTED = b"<?xml version='1.0'?><Error><Code>NotImplemented</Code><Message>No.</Message></Error>"
 
 
 @contextmanager
@@ -102,6 +104,8 @@ class FaultyS3:
         fault = self._fault(handler.command, handler.path)
         if fault == "slow-down":
             self._send(handler, 503, {"Content-Type": "application/xml"}, _SLOW_DOWN)
+        elif fault == "not-implemented":
+            self._send(handler, 501, {"Content-Type": "application/xml"}, _NOT_IMPLEMENTED)
         elif fault == "reset":
             self._reset(handler)
         elif fault == "silence":

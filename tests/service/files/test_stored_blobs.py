@@ -7,11 +7,12 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
 
-from service.errors import ConflictError, NotFoundError, StoreError
+from service.errors import ConflictError, NoSpaceError, NotFoundError, StoreError
 from service.files import stored_blobs
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Receiver
@@ -127,8 +128,8 @@ def _file(folder: Path, data: bytes) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("first", "joined"), [(6 * MB, True), (1 * MB, False)])
-def test_an_upload_goes_on_at_another_host(fleet: Fleet, first: int, joined: bool) -> None:
+@pytest.mark.parametrize(("first", "able", "joined"), [(6 * MB, True, True), (6 * MB, False, False), (MB, True, False)])
+def test_an_upload_goes_on_at_another_host(fleet: Fleet, first: int, able: bool, joined: bool) -> None:
     data = os.urandom(8 * MB)
     upload = fleet.upload(len(data))
     fleet.append(fleet.host("one"), upload, data[:1000], data[1000:first])
@@ -137,6 +138,8 @@ def test_an_upload_goes_on_at_another_host(fleet: Fleet, first: int, joined: boo
     assert fleet.again(upload).offset == len(data)
     assert len(fleet.names()) == 2
     before = len(fleet.s3.asked)
+    if not able:
+        fleet.s3.fail("not-implemented", 1, lambda method, path: method == "PUT" and "partNumber=" in path)
     sha256 = two.finish_upload(fleet.again(upload), HOUR)
     assert sha256 == hashlib.sha256(data).hexdigest()
     assert [name.split("/")[0] for name in fleet.names()] == ["blobs"]
@@ -168,6 +171,25 @@ def test_of_two_who_send_the_same_bytes_one_is_told_so(fleet: Fleet) -> None:
     assert len(fleet.names()) == 1
 
 
+def test_what_is_kept_for_later_makes_room(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    host = fleet.host("one")
+    used, kept = (fleet.take(host, os.urandom(size)) for size in (3000, 5000))
+    folder = fleet.folder / "one" / "cache" / "files"
+
+    def free(_: Path) -> SimpleNamespace:
+        return SimpleNamespace(free=10_000 - sum(path.stat().st_size for path in folder.glob("*/*")))
+
+    monkeypatch.setattr("service.files.blobs.shutil.disk_usage", free)
+    with host.lent(fleet.store.inputs.blobs([used])):
+        host.ensure_room(2000)
+        assert (folder / kept[:2] / kept).exists()
+        host.ensure_room(7000)
+        assert {path.name for path in folder.glob("*/*")} == {used}, "it is in use"
+        with pytest.raises(NoSpaceError):
+            host.ensure_room(7001)
+    host.ensure_room(10_000)
+
+
 def test_a_half_upload_is_collected(fleet: Fleet) -> None:
     upload = fleet.upload(100)
     fleet.append(fleet.host("one"), upload, bytes(60))
@@ -197,6 +219,16 @@ def test_a_store_that_fails_for_a_moment_costs_a_moment(fleet: Fleet, fault: Fau
     sha256 = fleet.take(fleet.host("one"), data)
     fleet.s3.fail(fault, 1, lambda method, path: method == "GET" and "list-type" not in path)
     assert fleet.read(fleet.host("two"), sha256) == data
+
+
+def test_of_a_large_file_what_was_cut_off_is_fetched_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = os.urandom(100_001)
+    sha256 = fleet.take(fleet.host("one"), data)
+    monkeypatch.setattr("service.files.objects._PIECE_BYTES", 10_000)
+    before = len(fleet.s3.asked)
+    fleet.s3.fail("cut-off", 2, lambda method, path: method == "GET")
+    assert fleet.read(fleet.host("two"), sha256) == data
+    assert sum(method == "GET" for method, _ in fleet.s3.asked[before:]) == 11 + 2
 
 
 def test_a_store_that_stays_away_is_not_the_users_fault(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
