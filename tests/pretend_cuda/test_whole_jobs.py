@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
+from worker.regions import region_options, region_requests
 from worker.request import Resume, SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 
@@ -104,6 +106,41 @@ def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: P
         assert 1 <= counts.waits.total() <= 1 + first, counts.waits
         assert counts.copies.total() <= SCALARS * (1 + first), counts.copies
     assert (record.stage, first) == ("sos", False)
+
+
+def in_regions(asked: StylizeRequest) -> StylizeRequest:
+    """The job with a region of another style, and one that is kept."""
+    options = region_options(
+        ["right:half-space=1,0,0,0", "low:half-space=0,1,0,1"], [f"right={asked.styles[0].path}"], ["right=3"], ["low"]
+    )
+    return replace(asked, regions=region_requests(options))
+
+
+def test_regions_wait_for_nothing_more(counts: Counts, tmp_path: Path) -> None:
+    stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
+    assert stylizer.plan.device == "cuda"
+    kept, before = stylizer.regions.kept[stylizer.plan.seen], stylizer.sh_dc.detach().cpu().clone()
+    seen: set[int] = set()
+    for _ in range(stylizer.total):
+        counts.clear()
+        record = stylizer.run_step()
+        first = record.view not in seen
+        seen.add(record.view)
+        assert 1 <= counts.waits.total() <= 1 + first, counts.waits
+        assert counts.copies.total() <= SCALARS * (1 + first), counts.copies
+    after = stylizer.sh_dc.detach().cpu()
+    assert torch.equal(after[kept].view(torch.int32), before[kept].view(torch.int32))
+    assert bool((after[~kept] != before[~kept]).any(dim=1).all())
+
+
+@pytest.mark.slow
+def test_losses_of_regions_are_those_of_the_cpu(tmp_path: Path) -> None:
+    asked = in_regions(request_(tmp_path, size=(64, 48)))
+    expected = prepare(asked).stylizer
+    with pretend_cuda():
+        found = prepare(asked).stylizer
+        for _ in range(expected.total):
+            assert found.run_step().loss == pytest.approx(expected.run_step().loss, rel=2e-4)
 
 
 @pytest.mark.parametrize("scan", [pytest.param(False, marks=pytest.mark.slow), True])

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+import torch
 
 from sgsst_core.planning.cost import RasterCost
 from sgsst_core.planning.decide import decide
@@ -78,3 +79,26 @@ def test_weights_that_do_not_fit_save_nothing() -> None:
         for size in (10 * GIGABYTE // 4, 10 * GIGABYTE)
     )
     assert quarter.seconds - fit.seconds == pytest.approx(0.2 * 3 / 4)
+
+
+def test_maps_of_regions_come_with_the_first_visit() -> None:
+    """Four regions take two renders, and one of what is behind them; each is half of a render with its gradient."""
+    settings = make_settings(steps_coarse=0, steps_sos=40, position_weights="off")
+    plain = probe(raster=LARGE)
+    found = [decide(each, settings).prediction for each in (plain, replace(plain, maps=4))]
+    assert found[0] is not None
+    assert found[1] is not None
+    assert found[1].first_visit - found[0].first_visit == pytest.approx(3 * 0.5 * 2.0)
+    assert found[1].seconds == found[0].seconds
+    pixels = sum(height * width for height, width in plain.sizes)
+    assert found[1].peak_bytes - found[0].peak_bytes == pytest.approx(4 * pixels * 16 / 3, abs=2)
+
+
+def test_kept_gaussians_are_rendered_and_not_optimised() -> None:
+    plain = probe()
+    kept = torch.zeros(plain.scene.gaussians, dtype=torch.bool)
+    kept[:10] = True
+    settings = make_settings(steps_coarse=0, steps_sos=40)
+    without, found = (decide(each, settings) for each in (plain, replace(plain, kept=kept)))
+    assert torch.equal(found.seen, without.seen)
+    assert torch.equal(found.optimised, without.optimised & ~kept)
