@@ -13,7 +13,7 @@ from sgsst_core.planning.plan import Decision
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement, piece_counts, pieces_to
+from sgsst_core.scene.split import MOST_PIECES, Refinement, piece_counts, pieces_to
 from sgsst_core.scene.subject import rotations
 from sgsst_core.settings import Settings
 
@@ -24,6 +24,8 @@ LEAST_PSNR = 40.0
 SIZES = tuple(256 * 2 ** (-step / 4) for step in range(30))
 #: Gaussians that all views together show in fewer pixels carry no stroke.
 _LEAST_WEIGHT = 8.0
+#: Of one Gaussian; a flat one in the most pieces along both axes.
+_MOST_CHILDREN = MOST_PIECES**2
 #: A Gaussian's deviation over its distance from a camera that shows it: beyond, its parts lie elsewhere in the picture
 #: than the projection of the whole, which takes the perspective as linear about the centre.
 _LARGEST_REACH = 0.5
@@ -113,16 +115,29 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, ther
     return splittable & asked & large & (footprints.reach <= _LARGEST_REACH)
 
 
-def choose_pieces(lengths: Tensor, allowed: Tensor, cancels: Tensor, budget: int) -> tuple[Tensor, float | None]:
+def most_children(weights: Tensor) -> Tensor:
+    """[N], what each Gaussian may become: those that views show in so few pixels carry no stroke.
+
+    Args:
+        weights: [N], blend weights over all pixels of all views.
+    """
+    return (weights / _LEAST_WEIGHT).clamp(1, _MOST_CHILDREN)
+
+
+def choose_pieces(
+    lengths: Tensor, allowed: Tensor, cancels: Tensor, most: Tensor, budget: int
+) -> tuple[Tensor, float | None]:
     """Pieces [N, 3] uint8 of each Gaussian, and the size in pixels to which they were cut; None where none is.
 
-    Round after round all that are allowed are cut to a smaller size. In the round that the budget does not hold, those
+    Round after round all that are allowed are cut to a smaller size, but for those that would become more than they
+    may: blobs, which are cut along three axes where views need two. In the round that the budget does not hold, those
     go first that disagree most for each Gaussian that they would become.
 
     Args:
         lengths: [N, 3], see `Footprints`.
         allowed: [N] bool.
         cancels: [N], see `disagreement`.
+        most: [N], what each may become at most, see `most_children`.
         budget: Gaussians that there may be.
     """
     rows = allowed.nonzero()[:, 0]
@@ -130,10 +145,11 @@ def choose_pieces(lengths: Tensor, allowed: Tensor, cancels: Tensor, budget: int
     found, size = torch.ones((len(rows), 3), dtype=torch.uint8), None
     for smaller in SIZES:
         following = pieces_to(own, smaller)
+        following = torch.where((piece_counts(following) <= most[rows])[:, None], following, found)
         more = piece_counts(following) - piece_counts(found)
         room = rest - int(piece_counts(found).sum())
         if int(more.sum()) <= room:
-            size = smaller if bool((following > 1).any()) else size
+            size = smaller if bool((more > 0).any()) else size
             found = following
             continue
         order = torch.argsort(cancels[rows] / more.clamp_min(1), descending=True, stable=True)

@@ -24,7 +24,7 @@ from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.probe import Workshop, equip
-from sgsst_core.planning.refine import LEAST_PSNR, Footprints, candidates, choose_pieces, disagreement
+from sgsst_core.planning.refine import LEAST_PSNR, Footprints, candidates, choose_pieces, disagreement, most_children
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -114,7 +114,8 @@ class _Refining:
         cancels, there_is = self._ask_the_loss(spread_evenly(covered, GRADIENT_VIEWS))
         allowed = candidates(self._footprints, self._may_be_split(), cancels, there_is)
         budget, lengths = math.floor(self._settings.refine * count), self._footprints.lengths
-        pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, budget))
+        most = most_children(self._footprints.weights)
+        pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, most, budget))
         chosen = int((piece_counts(pieces) > 1).sum())
         kept, change = self._as_far_as_the_picture_stays(pieces, spread_evenly(covered, MEASURED_VIEWS))
         counts = piece_counts(kept)

@@ -15,6 +15,7 @@ from sgsst_core.planning.refine import (
     candidates,
     choose_pieces,
     disagreement,
+    most_children,
     refine_decision,
 )
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -72,7 +73,7 @@ def test_footprints_are_means_over_what_views_show() -> None:
     weights = [rasterizer.survey(view)[1] for view in views]
     for view, own in zip(views, weights, strict=True):
         prints.add(view, own)
-    total = sum(own.double() for own in weights)
+    total = torch.stack([own.double() for own in weights]).sum(dim=0)
     assert torch.equal(prints.weights, total)
     both = ((weights[0] > 0) & (weights[1] > 0)).nonzero()[:, 0]
     assert len(both) > 5
@@ -95,23 +96,30 @@ def test_there_are_never_more_than_the_budget(seed: int, factor: float, largest:
     lengths = largest * torch.rand(count, 3, generator=generator, dtype=torch.float64) ** 3
     allowed = torch.rand(count, generator=generator) > 0.3
     cancels = torch.rand(count, generator=generator, dtype=torch.float64)
+    most = torch.randint(1, 400, (count,), generator=generator).double()
     budget = int(factor * count)
-    pieces, size = choose_pieces(lengths, allowed, cancels, budget)
+    pieces, size = choose_pieces(lengths, allowed, cancels, most, budget)
     assert int(piece_counts(pieces).sum()) <= budget
+    assert bool((piece_counts(pieces) <= most).all())
     assert bool((pieces[~allowed] == 1).all())
     assert bool((pieces[lengths <= SIZES[-1]] == 1).all())
     assert (size is None) == (not bool((pieces > 1).any()))
-    again, same = choose_pieces(lengths, allowed, cancels, budget)
+    again, same = choose_pieces(lengths, allowed, cancels, most, budget)
     assert torch.equal(again, pieces)
     assert same == size
 
 
 def test_where_the_budget_ends_those_that_disagree_most_go_first() -> None:
     lengths = torch.tensor([[10.0, 0.1, 0.1]], dtype=torch.float64).repeat(6, 1)
+    weights = torch.full((6,), 1e4, dtype=torch.float64)
     cancels = torch.tensor([1.0, 5.0, 2.0, 0.5, 4.0, 3.0], dtype=torch.float64)
-    pieces, _ = choose_pieces(lengths, torch.ones(6, dtype=torch.bool), cancels, 11)
+    pieces, _ = choose_pieces(lengths, torch.ones(6, dtype=torch.bool), cancels, most_children(weights), 11)
     assert piece_counts(pieces).tolist() == [1, 3, 1, 1, 3, 1]
-    nothing, size = choose_pieces(torch.full_like(lengths, 1.0), torch.ones(6, dtype=torch.bool), cancels, 60)
+    blob = choose_pieces(lengths.new_full((1, 3), 200.0), torch.ones(1, dtype=torch.bool), cancels, weights[:1], 10**6)
+    assert 200 < int(piece_counts(blob[0])) <= 1024
+    nothing, size = choose_pieces(
+        torch.full_like(lengths, 1.0), torch.ones(6, dtype=torch.bool), cancels, most_children(weights), 60
+    )
     assert bool((nothing == 1).all())
     assert size is None
 
