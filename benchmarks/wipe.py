@@ -1,9 +1,10 @@
 """An animation around a scene: the original on one side of a line that moves, the stylized one on the other.
 
-python -m benchmarks.wipe SCENE.ply STYLIZED.ply CAMERAS|orbit:N OUT.webp [--frames 60] [--resolution 480]
+python -m benchmarks.wipe SCENE.ply STYLIZED.ply CAMERAS|orbit:N OUT.webp [--first 0] [--count 8] [--resolution 480]
 
-Cameras of a file are gone through there and back, those of an orbit around. The line goes over the picture and back
-once. Quality is lowered until the file is no larger than `--bytes`.
+An orbit of N views is gone around. Of a camera file, so many cameras from the first on are gone through there and back,
+with three views between each two. The line goes over the picture and back once. Quality is lowered until the file is no
+larger than `--bytes`.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ from __future__ import annotations
 import argparse
 import io
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import torch
 from PIL import Image
 
 from benchmarks.cameras import read_views
+from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, between, resized
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 
 QUALITIES = (85, 75, 65, 55, 45, 35, 25)
@@ -33,18 +37,15 @@ def main() -> None:
     parser.add_argument("stylized", type=Path)
     parser.add_argument("cameras", help="camera file, or orbit:N")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--first", type=int, default=0, help="camera of a file")
+    parser.add_argument("--count", type=int, default=8, help="cameras of a file")
     parser.add_argument("--resolution", type=int, default=480)
     parser.add_argument("--milliseconds", type=int, default=80, help="of a frame")
     parser.add_argument("--background", type=float, default=1.0, help="grey behind the Gaussians, 0 to 1")
     parser.add_argument("--bytes", type=int, default=2_000_000)
     arguments = parser.parse_args()
     scene, stylized = read_scene(arguments.scene).scene, read_scene(arguments.stylized).scene
-    around = arguments.cameras.startswith("orbit:")
-    count = arguments.frames if around else arguments.frames // 2 + 1
-    cameras = read_views(arguments.cameras, scene, count, arguments.resolution)
-    if not around:
-        cameras += cameras[-2:0:-1]
+    cameras = _way(arguments, scene)
     rasterizer = make_rasterizer("cpu", scene, background=(arguments.background,) * 3)
 
     def picture(camera: Camera, sh_dc: torch.Tensor) -> torch.Tensor:
@@ -60,6 +61,18 @@ def main() -> None:
         frame[:, max(0, line - _LINE) : line] = 255
         frames.append(Image.fromarray(frame.numpy()))
     arguments.out.write_bytes(_smallest(frames, arguments.milliseconds, arguments.bytes))
+
+
+def _way(arguments: argparse.Namespace, scene: Scene) -> list[Camera]:
+    """The cameras of all frames; the last is followed by the first."""
+    if arguments.cameras.startswith("orbit:"):
+        count = int(arguments.cameras.removeprefix("orbit:"))
+        return read_views(arguments.cameras, scene, count, arguments.resolution)
+    every = read_cameras(Path(arguments.cameras))[arguments.first : arguments.first + arguments.count]
+    way = [resized(camera, arguments.resolution) for camera in every]
+    for _ in range(2):
+        way = [camera for pair in pairwise(way) for camera in (pair[0], between(*pair))] + way[-1:]
+    return way + way[-2:0:-1]
 
 
 def _smallest(frames: list[Image.Image], milliseconds: int, most: int) -> bytes:

@@ -160,7 +160,7 @@ class Settings(BaseModel):
         description="match: the style image takes the scene's colours first, so that only its strokes are taken; "
         "luminance: colours change in luminance alone.",
     )
-    sh_fade: Annotated[Share, Option(metavar="S")] = Field(
+    sh_fade: Annotated[Share, Option(unit="share", metavar="S")] = Field(
         0.0,
         description="Fade colours that depend on the direction of view by S, in the result too: 0 leaves spherical "
         "harmonics as they are, 1 leaves none above degree 0.",

@@ -326,7 +326,8 @@ def test_the_command_line_sends_every_parameter(
         {"name": "left", "select": "half-space=-1,0,0,0", "style": ["3_style.png:0.5"], "weight": 2.0},
         {"name": "rest", "keep": True},
     ]
-    texts = {"background": "white"}
+    told["scales"] = [1.0, 0.0, 0.5]
+    texts = {"background": "white", "scales": "1,0,0.5"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
     command += ["--region", "left:half-space=-1,0,0,0", "--region-style", f"left={style}:0.5"]
