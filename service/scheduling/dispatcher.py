@@ -39,6 +39,8 @@ from service.store.tables import JobRow
 _HOUSEKEEPING_SECONDS = 60.0
 #: And for what nothing refers to.
 _STRAYS_SECONDS = 3600.0
+#: Seconds that housekeeping may take to end with the dispatcher.
+_LAST_SECONDS = 5.0
 #: Jobs that are swept at a time.
 _SWEEPS = 20
 #: Of a lease's time that passes before it is renewed, and before jobs are ended whose lease could not be: others may
@@ -67,6 +69,8 @@ class Dispatcher:
         self._work = settings.folder / "work" / self.name
         self._renewed_at = self._announced_at = self._strays_at = float("-inf")
         self._ended = threading.Event()
+        work = (self._keep_house_now_and_then, self._abandon_late)
+        self._beside = [threading.Thread(target=each, name=each.__name__, daemon=True) for each in work]
         self._deliverer = Deliverer(settings, store)
 
     def stop(self) -> None:
@@ -78,8 +82,8 @@ class Dispatcher:
         self._take_over_from_the_dead()
         self._work.mkdir(parents=True, exist_ok=True)
         self._deliverer.start()
-        for work in (self._keep_house_now_and_then, self._abandon_late):
-            threading.Thread(target=work, name=work.__name__, daemon=True).start()
+        for thread in self._beside:
+            thread.start()
         what = "GPUs" if self._machine.gpus else "places"
         _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
         while not self._stop.is_set():
@@ -196,6 +200,8 @@ class Dispatcher:
             time.sleep(0.2)
         self._ended.set()
         self._deliverer.stop()
+        for thread in self._beside:
+            thread.join(_LAST_SECONDS)
         shutil.rmtree(self._work, ignore_errors=True)
 
     # --- housekeeping ----------------------------------------------------------------------------------------------
