@@ -154,6 +154,9 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "both losses, a flat style": lambda: _unlike(crowd, lambda: _flat(1, 1, 1), style_loss="mixed"),
     "content weight 0": lambda: _job(content_weight=0),
     "content weight 1e12 in a job": lambda: _unlike(crowd, lambda: texture(30, 26, 7), content_weight=1e12),
+    "content weight 1e12, and hardly a change": lambda: _unlike(
+        crowd, lambda: texture(30, 26, 7), content_weight=1e12, learning_rate=1e-5
+    ),
     "features 1e4 times as large": lambda: _scaled(1e4),
     "features 1e4 times as small": lambda: _scaled(1e-4),
     "black views, features at the paper's scale": lambda: _black_views("paper"),

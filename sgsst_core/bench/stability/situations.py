@@ -20,7 +20,7 @@ from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, ord
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.vgg import CONTENT_LAYER, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -37,6 +37,8 @@ LONGEST_STEP = 0.1 / math.sqrt(0.001) + 0.1
 RISE = 1e-3
 #: Losses as small as this are rounding of what was equal at the start.
 NO_LOSS = 1e-3
+#: Of a gradient, whatever the rounding of content is.
+_MOST_UNCERTAIN = 0.5
 STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
 
@@ -140,15 +142,17 @@ def strain(situation: Situation) -> CaseResult:
         }.items()
         if not holds
     ]
-    error, flips = twin_error(job)
+    error, bound, flips = twin_error(job)
     note = "; ".join(broken) or f"loss {before:.3g} to {after:.3g}; {flips} ReLU and pool decisions flipped"
-    return CaseResult(math.inf if broken else error, TWIN_BOUND, note)
+    return CaseResult(math.inf if broken else error, bound, note)
 
 
-def twin_error(job: Stylizer) -> tuple[float, int]:
+def twin_error(job: Stylizer) -> tuple[float, float, int]:
     """Relative error of loss and pixel gradient of a view's present picture against float64, and flipped decisions.
 
-    Of features that are matched, the loss alone: another nearest vector, as near, is no error.
+    The second number is what the error may be: more where content has changed by little more than the rounding of its
+    features, of which the difference of both cannot be freed. Of features that are matched, the loss alone: another
+    nearest vector, as near, is no error.
     """
     index = job.views.covered[0]
     picture = job.views.render(index, job.views.colours(index, job.sh_dc.detach()))
@@ -159,12 +163,28 @@ def twin_error(job: Stylizer) -> tuple[float, int]:
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
-        return math.inf, double.flips
+        return math.inf, TWIN_BOUND, double.flips
     error = abs(found.loss - exact.loss) / max(abs(exact.loss), 1.0)
     if not job.loss.nearest_layers:
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
-    return error, double.flips
+    return error, max(TWIN_BOUND, _rounding_of_content(job, exact, content)), double.flips
+
+
+def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> float:
+    """What float32 features leave uncertain of the content term and its gradient: their rounding over the differences.
+
+    E_c = lambda mean(d^2) tells how large differences d are; features are rounded to about 2^-20 of their size.
+    """
+    weight, uncertain = job.settings.content_weight, 0.0
+    if not weight:
+        return uncertain
+    features = job.network.forward(content, keep=False).features[CONTENT_LAYER]
+    size = float(features.square().mean().sqrt()) if features.numel() else 0.0
+    for terms in exact.terms.values():
+        if terms["content"] > 0:
+            uncertain = max(uncertain, 2**-20 * size * math.sqrt(weight / terms["content"]))
+    return min(uncertain, _MOST_UNCERTAIN)
 
 
 def _evaluate(
