@@ -252,7 +252,7 @@ def test_large_styles_are_thinned_evenly() -> None:
 def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     tiny_weights: BackboneWeights, tile_size: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgsst_core.loss.sos.chosen_places", lambda count: chosen_places(count, 200))
+    monkeypatch.setattr("sgsst_core.loss.sos.MOST_VECTORS", 200)
     style = picture(130, 201, seed=3)
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
     vectors = loss.style_targets(style, (130, 201))[0].vectors
