@@ -34,7 +34,7 @@ from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, Scene
 from sgsst_core.files.splat import read_splat
 from sgsst_core.files.spz import read_spz, write_spz
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement, piece_counts, split
+from sgsst_core.scene.split import Refinement, piece_counts
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
 #: Rows handled at a time: 64k rows of 62 floats are 16 MB, so that memory stays small and the columns of a block are
@@ -98,7 +98,7 @@ class SceneFile:
                     f"{self.path}: {', '.join(whole)} are stored as integers; smaller Gaussians need float or double. "
                     "Convert the scene first, or leave --refine out."
                 )
-        scene, copies = split(self.scene, refinement.pieces), piece_counts(refinement.pieces)
+        scene, copies = refinement.of(self.scene), piece_counts(refinement.pieces)
         return replace(self, scene=scene, copies=copies.numpy())
 
     @property

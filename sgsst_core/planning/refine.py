@@ -28,7 +28,7 @@ _LEAST_WEIGHT = 8.0
 _MOST_CHILDREN = MOST_PIECES**2
 #: A Gaussian's deviation over its distance from a camera that shows it: beyond, its parts lie elsewhere in the picture
 #: than the projection of the whole, which takes the perspective as linear about the centre.
-_LARGEST_REACH = 0.5
+_LARGEST_REACH = 1.0
 #: Of the gradient's magnitude under a Gaussian, what must cancel in its sum; with less, it asks for one colour.
 _LEAST_DISAGREEMENT = 0.1
 #: Gaussians whose sizes are computed together: some tens of megabytes in float64.

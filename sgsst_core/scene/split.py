@@ -20,7 +20,7 @@ no more like it than these: docs/performance.md.)
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -70,6 +70,7 @@ class Refinement:
         psnr: of the unstylized picture against that of before, dB, over all measured views; None where nothing was cut.
         lowest_psnr: of one of these views.
         taken_back: Gaussians that were not cut after all, because the picture would have changed too much.
+        sh_dc: [M, 3] float32, colours of the refined scene: the parents', fitted to the picture; None for theirs.
     """
 
     pieces: Tensor
@@ -79,6 +80,12 @@ class Refinement:
     psnr: float | None = None
     lowest_psnr: float | None = None
     taken_back: int = 0
+    sh_dc: Tensor | None = None
+
+    def of(self, scene: Scene) -> Scene:
+        """The scene as it was refined."""
+        found = split(scene, self.pieces)
+        return found if self.sh_dc is None else replace(found, sh_dc=self.sh_dc)
 
 
 def piece_counts(pieces: Tensor) -> Tensor:

@@ -300,11 +300,13 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
     refinement = plan.refinement
     if refinement is not None:
         tensors["plan.pieces"] = refinement.pieces
-        plan = replace(plan, refinement=replace(refinement, pieces=nothing))
+        if refinement.sh_dc is not None:
+            tensors["plan.refined_sh_dc"] = refinement.sh_dc
+        plan = replace(plan, refinement=replace(refinement, pieces=nothing, sh_dc=None))
     survey = replace(plan.survey, total_blend_weights=nothing)
     values = asdict(replace(plan, survey=survey, optimised=nothing, seen=nothing))
     if refinement is not None:
-        del values["refinement"]["pieces"]
+        del values["refinement"]["pieces"], values["refinement"]["sh_dc"]
     del values["optimised"], values["seen"], values["survey"]["total_blend_weights"]
     return tensors, values
 
@@ -347,9 +349,13 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
         covered=covered,
         decisions=decisions,
         prediction=Prediction(**expected) if expected else None,
-        refinement=Refinement(pieces=tensors["plan.pieces"], **refined) if refined else None,
+        refinement=_refinement(tensors, refined) if refined else None,
         **values,
     )
+
+
+def _refinement(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Refinement:
+    return Refinement(pieces=tensors["plan.pieces"], sh_dc=tensors.get("plan.refined_sh_dc"), **values)
 
 
 def _evaluation_values(evaluation: Evaluation) -> dict[int, dict[str, float]]:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.mixture import StyleMixture
@@ -30,7 +31,7 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
-from sgsst_core.scene.split import Refinement, can_be_split, piece_counts, split
+from sgsst_core.scene.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.warm_start import warm_start
@@ -39,6 +40,8 @@ from sgsst_core.stylizing.warm_start import warm_start
 GRADIENT_VIEWS = 24
 #: Views whose picture is compared.
 MEASURED_VIEWS = 6
+#: Steps in which colours of what is cut are fitted to the unstylized picture.
+_FITTING_STEPS = 5
 #: Rounds in which Gaussians are taken back, until the picture is close enough; and in each, their share of its error.
 _ROUNDS, _TAKEN_BACK = 24, 0.25
 
@@ -71,7 +74,7 @@ def refine(
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:
     """The scene as it was refined; itself where it was not."""
-    return scene if refinement is None else split(scene, refinement.pieces)
+    return scene if refinement is None else refinement.of(scene)
 
 
 @dataclass(frozen=True)
@@ -80,11 +83,13 @@ class _Change:
 
     Attributes:
         psnr, lowest: of all views together, and of one, dB.
+        sh_dc: [M, 3] of the cut scene.
         squared: [N] float64, the squared change under each Gaussian, by blend weights.
     """
 
     psnr: float
     lowest: float
+    sh_dc: Tensor
     squared: Tensor
 
 
@@ -117,27 +122,30 @@ class _Refining:
         most = most_children(self._footprints.weights)
         pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, most, budget))
         chosen = int((piece_counts(pieces) > 1).sum())
-        kept, change = self._as_far_as_the_picture_stays(pieces, spread_evenly(covered, MEASURED_VIEWS))
+        fitted = spread_evenly(covered, GRADIENT_VIEWS)
+        kept, change = self._as_far_as_the_picture_stays(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
         counts = piece_counts(kept)
         cut = int((counts > 1).sum())
         if change is None:
             return replace(nothing, taken_back=chosen)
-        return Refinement(kept, cut, int(counts.sum()), size, change.psnr, change.lowest, chosen - cut)
+        return Refinement(kept, cut, int(counts.sum()), size, change.psnr, change.lowest, chosen - cut, change.sh_dc)
 
     def _may_be_split(self) -> Tensor:
         """[N] bool."""
         sane = can_be_split(self._scene)
         return sane if self._kept is None else sane & ~self._kept
 
-    def _as_far_as_the_picture_stays(self, pieces: Tensor, views: Sequence[int]) -> tuple[Tensor, _Change | None]:
+    def _as_far_as_the_picture_stays(
+        self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]
+    ) -> tuple[Tensor, _Change | None]:
         """Fewer pieces, as many as leave the picture of some views what it is, and how much it changes.
 
-        None where nothing is cut, or is left to be cut.
+        Colours of what is cut are fitted to others before. None where nothing is cut, or is left to be cut.
         """
         for _ in range(_ROUNDS):
             if not bool((pieces > 1).any()):
                 break
-            change = self._change(pieces, views)
+            change = self._change(pieces, fitted, views)
             if change.lowest >= LEAST_PSNR:
                 return pieces, change
             pieces = self._collectives.broadcast(partial(self._without_the_worst, pieces, change))
@@ -190,23 +198,43 @@ class _Refining:
         cancels, there_is = self._sum(found).unbind(1)
         return cancels, there_is
 
-    def _change(self, pieces: Tensor, views: Sequence[int]) -> _Change:
-        """What pieces [N, 3] do to the unstylized picture of some views."""
-        settings, cameras = self._settings, self._workshop.cameras
+    def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
+        """What pieces [N, 3] do to the unstylized picture of some views, once colours are fitted to others."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
-        options = rasterizer_options(name, settings, self._workshop.machine.memory)
-        if "max_list_bytes" in options:
-            options["max_list_bytes"] = 0  # each view comes once
+        options = rasterizer_options(name, self._settings, self._workshop.machine.memory)
         cut = make_rasterizer(name, scene, **options)
+        scene = self._fit(scene, cut, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
         for index in self._own(views):
-            before = render(self._scene, self._rasterizer, cameras[index]).clamp(0, 1)
-            change = (render(scene, cut, cameras[index]).clamp(0, 1) - before).square()
+            camera = self._workshop.cameras[index]
+            before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
+            change = (render(scene, cut, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
-            squared += self._rasterizer.colour_gradient(change, cameras[index]).double().sum(dim=1).cpu()
+            squared += self._rasterizer.colour_gradient(change, camera).double().sum(dim=1).cpu()
         every = [error for part in self._collectives.all_gather(errors) for error in part.values()]
-        return _Change(psnr(sum(every) / len(every)), psnr(max(every)), self._sum(squared))
+        return _Change(psnr(sum(every) / len(every)), psnr(max(every)), scene.sh_dc, self._sum(squared))
+
+    def _fit(self, scene: Scene, cut: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
+        """A cut scene whose children [M] bool have colours by which views look as before.
+
+        Pictures are linear in colours. Each step adds to every child's what its pixels lack, their mean by blend
+        weights (simultaneous iterative reconstruction: Gilbert 1972), which converges because no pixel's weights add up
+        to more than 1; a child then has no colour that its pixels do not ask for.
+        """
+        children = children.to(self._rasterizer.device)
+        for _ in range(_FITTING_STEPS):
+            lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
+            for index in self._own(views):
+                camera = self._workshop.cameras[index]
+                missing = render(self._scene, self._rasterizer, camera) - render(scene, cut, camera)
+                lacks[:, :3] += cut.colour_gradient(missing, camera)
+                lacks[:, 3] += cut.survey(camera)[1]
+            lacks = self._collectives.all_reduce(lacks)
+            step = lacks[:, :3] / lacks[:, 3:].clamp_min(1.0) / SH_C0
+            more = torch.where(children[:, None], step, 0.0).to("cpu", torch.float32)
+            scene = replace(scene, sh_dc=scene.sh_dc + more)
+        return scene
 
     def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
         """Fewer pieces: Gaussians stay whole under which the picture changes most, with a share of all the change."""

@@ -109,7 +109,7 @@ def test_the_memory_of_a_gpu_comes_back(kept: Checkpoint, tmp_path: Path) -> Non
 
 def test_a_refined_scene_is_known_again(kept: Checkpoint, tmp_path: Path) -> None:
     pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
-    made = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2)
+    made = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2, torch.rand(4, 3))
     refined = replace(kept, plan=replace(kept.plan, refinement=made))
     save_checkpoint(tmp_path / "c", refined, "job")
     found = load_checkpoint(tmp_path / "c", "job")
