@@ -128,7 +128,7 @@ def test_where_the_budget_ends_those_that_disagree_most_go_first() -> None:
 def test_what_hardly_shows_or_has_one_colour_or_is_close_is_not_cut() -> None:
     prints = Footprints(cloud(5))
     prints.weights = torch.tensor([100.0, 1.0, 100.0, 100.0, 100.0], dtype=torch.float64)
-    prints.reach = torch.tensor([0.1, 0.1, 0.9, 0.1, 0.1], dtype=torch.float64)
+    prints.reach = torch.tensor([0.1, 0.1, 1.9, 0.1, 0.1], dtype=torch.float64)
     there_is = torch.ones(5, dtype=torch.float64)
     cancels = torch.tensor([0.9, 0.9, 0.9, 0.01, 0.9], dtype=torch.float64)
     splittable = torch.tensor([True, True, True, True, False])
