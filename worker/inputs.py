@@ -105,15 +105,15 @@ def read_regions(
     """
     if not request.regions:
         return None
-    scale = request.settings.style_scale
+    settings, near = request.settings, request.source.near
 
     def load(files: Sequence[StyleFile]) -> StyleMixture:
         style = load_styles(files)
-        check_style_size(style, cameras, scale)
+        check_style_size(style, cameras, settings.style_scale)
         return style
 
     # One rank selects for all: votes of masks take renders, and processors may round them differently.
-    return collectives.broadcast(lambda: select_regions(request.regions, file, cameras, request.source.near, load))
+    return collectives.broadcast(lambda: select_regions(request.regions, file, cameras, near, load, settings.sh_fade))
 
 
 def load_styles(files: Sequence[StyleFile]) -> StyleMixture:

@@ -30,6 +30,7 @@ def select_regions(
     cameras: Sequence[Camera],
     near: float,
     load: Callable[[Sequence[StyleFile]], StyleMixture],
+    sh_fade: float = 0.0,
 ) -> Regions | None:
     """The regions that were asked for; None where none were. Of regions that overlap, the later one has the Gaussians.
 
@@ -38,9 +39,10 @@ def select_regions(
         cameras: that masks are matched with, at the sizes that they are stylized at.
         near: plane, as for stylizing.
         load: reads the pictures of a style.
+        sh_fade: by which spherical harmonics fade.
 
     Raises:
-        InvalidInputError: a file cannot be used, or every Gaussian is kept.
+        InvalidInputError: a file cannot be used, every Gaussian is kept, or some are and all are to fade.
     """
     if not requests:
         return None
@@ -55,7 +57,7 @@ def select_regions(
         labels[own] = len(every)
         every.append(Region(request.name, request.selection.text, style, request.weight, request.keep, int(own.sum())))
     regions = Regions(tuple(every), labels)
-    check_regions(regions)
+    check_regions(regions, sh_fade)
     return regions
 
 
