@@ -324,14 +324,14 @@ def test_the_command_line_sends_every_parameter(
     told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
     told["regions"] = [
         {"name": "left", "select": "half-space=-1,0,0,0", "style": ["3_style.png:0.5"], "weight": 2.0},
-        {"name": "rest", "keep": True},
+        {"name": "rest", "weight": 3.0},
     ]
     told["scales"] = [1.0, 0.0, 0.5]
     texts = {"background": "white", "scales": "1,0,0.5"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
     command += ["--region", "left:half-space=-1,0,0,0", "--region-style", f"left={style}:0.5"]
-    command += ["--region-weight", "left=2", "--region-keep", "rest"]
+    command += ["--region-weight", "left=2", "--region-weight", "rest=3"]
     for name, option in declared(JobParameters).items():
         told[name] = told.get(name) or value_of(option)
         command += [f"--{name.replace('_', '-')}"]
