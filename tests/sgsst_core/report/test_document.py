@@ -55,7 +55,8 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     assert report["version"] == REPORT_VERSION
     assert report["graphs"] is None  # a CPU has none
     assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
-    assert report["scene"] == {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2}
+    told = {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2, "refined": None}
+    assert report["scene"] == told
     assert report["style"] == {"path": "style.png", "width": 80, "height": 96}
     assert report["cameras"]["count"] == 6
     assert report["cameras"]["sizes"] == [[64, 48]]
