@@ -86,7 +86,7 @@ def prepare(
     refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
     if settings.refine > 1:
         with timer("refining"):
-            refinement = refinement if resumed else _refine(inputs, settings, collectives)
+            refinement = refinement if resumed else _refine(inputs, settings, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     regions = inputs.regions and inputs.regions.refined(refinement)
     plan, workshop, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
@@ -129,7 +129,9 @@ def prepare(
     return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
 
 
-def _refine(inputs: Inputs, settings: Settings, collectives: Collectives) -> Refinement | None:
+def _refine(
+    inputs: Inputs, settings: Settings, collectives: Collectives, show: ShowPlanning | None
+) -> Refinement | None:
     """How the scene is refined; None where nobody wants it."""
     return refine(
         inputs.scene_file.scene,
@@ -139,6 +141,7 @@ def _refine(inputs: Inputs, settings: Settings, collectives: Collectives) -> Ref
         weights=inputs.weights,
         collectives=collectives,
         regions=inputs.regions,
+        show=show,
     )
 
 

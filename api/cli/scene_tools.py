@@ -61,7 +61,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
         write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
-    refinement = refine(file.scene, cameras, style, settings, weights=weights, regions=regions)
+    refinement = refine(file.scene, cameras, style, settings, weights=weights, regions=regions, show=show_planning)
     plan, _ = planner.make_plan(
         refined(file.scene, refinement),
         cameras,

@@ -152,7 +152,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
     settings, regions = request.settings, read.regions
-    refinement = refine(read.scene, read.cameras, read.style, settings, weights=weights, regions=regions)
+    refinement = refine(read.scene, read.cameras, read.style, settings, weights=weights, regions=regions, show=show)
     made, _ = make_plan(
         refined(read.scene, refinement),
         read.cameras,

@@ -16,7 +16,7 @@ from torch import Tensor
 from sgsst_core.errors import CameraError
 from sgsst_core.features.partition import Rectangle, covered_region
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
+from sgsst_core.planning.progress import ShowPlanning, progress_of
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -92,10 +92,10 @@ def survey(
     started = time.perf_counter()
     for done, index in enumerate(own):
         if show:
-            show(_progress(done, len(cameras), collectives.size, time.perf_counter() - started))
+            show(progress_of(done, len(cameras), collectives.size, time.perf_counter() - started))
         looks[index] = _look(cameras[index], rasterizer, weights)
     if show:
-        show(_progress(len(own), len(cameras), collectives.size, time.perf_counter() - started))
+        show(progress_of(len(own), len(cameras), collectives.size, time.perf_counter() - started))
     for part in collectives.all_gather(looks):
         looks |= part
     covered = [index for index in range(len(cameras)) if looks[index].covered]
@@ -121,9 +121,3 @@ def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
         weights += own.double()
         shown = int((own > 0).sum())
     return _Look(covered_region(coverage), uncovered, coverage.numel(), seen, shown)
-
-
-def _progress(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
-    """After so many views of this rank: the others are taken to be as far."""
-    done = min(total, own * ranks)
-    return PlanningProgress(done, total, seconds * (total - done) / done if done else None)

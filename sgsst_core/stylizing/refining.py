@@ -7,7 +7,8 @@ closed form: what first steps would reach, and what is left to ask for is textur
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,6 +26,7 @@ from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.probe import Workshop, equip
+from sgsst_core.planning.progress import ShowPlanning, progress_of
 from sgsst_core.planning.refine import LEAST_PSNR, Footprints, candidates, choose_pieces, disagreement, most_children
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
@@ -56,6 +58,7 @@ def refine(
     rasterizer: str | None = None,
     collectives: Collectives = ALONE,
     regions: Regions | None = None,
+    show: ShowPlanning | None = None,
 ) -> Refinement | None:
     """Decide which Gaussians are cut into how many; every rank calls this, and gets the same. None where it is off.
 
@@ -63,13 +66,14 @@ def refine(
         cameras, style, weights: as a `Stylizer` takes them.
         rasterizer: as `make_plan` takes it.
         regions: of the scene; what they keep stays whole.
+        show: told before each view that is looked at, and before each whose gradient is taken.
     """
     if settings.refine <= 1:
         return None
     fitted = fit_cameras(cameras, settings)
     workshop = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
     kept = None if regions is None else regions.kept
-    return _Refining(workshop, StyleMixture.of(style), collectives, kept).run()
+    return _Refining(workshop, StyleMixture.of(style), collectives, kept, show).run()
 
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:
@@ -100,10 +104,18 @@ class _Refining:
         workshop: of the scene as it is.
         style: as it was given: that of the job, whatever regions have.
         kept: [N] bool, Gaussians that stay whole; None for none.
+        show: told how far it has come.
     """
 
-    def __init__(self, workshop: Workshop, style: StyleMixture, collectives: Collectives, kept: Tensor | None) -> None:
-        self._kept = kept
+    def __init__(
+        self,
+        workshop: Workshop,
+        style: StyleMixture,
+        collectives: Collectives,
+        kept: Tensor | None,
+        show: ShowPlanning | None,
+    ) -> None:
+        self._kept, self._show = kept, show
         self._workshop, self._given, self._collectives = workshop, style, collectives
         self._scene, self._settings = workshop.scene, workshop.settings
         self._rasterizer = workshop.rasterizer
@@ -155,7 +167,7 @@ class _Refining:
         """Look at every view; returns those that see anything."""
         collectives, cameras = self._collectives, self._workshop.cameras
         covered = []
-        for index in self._own(range(len(cameras))):
+        for index in self._shown(range(len(cameras))):
             coverage, weights = self._rasterizer.survey(cameras[index])
             if sees_something(coverage):
                 covered.append(index)
@@ -183,7 +195,7 @@ class _Refining:
         )
         targets: dict[tuple[int, int], dict[int, ScaleTarget]] = {}
         found = torch.zeros((len(scene), 2), dtype=torch.float64)
-        for index in self._own(views):
+        for index in self._shown(views):
             camera = cameras[index]
             size = (camera.height, camera.width)
             if size not in targets:
@@ -250,6 +262,14 @@ class _Refining:
     def _own(self, views: Sequence[int]) -> Sequence[int]:
         """This rank's share."""
         return views[self._collectives.rank :: self._collectives.size]
+
+    def _shown(self, views: Sequence[int]) -> Iterator[int]:
+        """This rank's share, one after the other, while somebody is shown how far it is."""
+        started = time.perf_counter()
+        for done, index in enumerate(self._own(views)):
+            if self._show:
+                self._show(progress_of(done, len(views), self._collectives.size, time.perf_counter() - started))
+            yield index
 
     def _sum(self, values: Tensor) -> Tensor:
         """Over all ranks."""

@@ -16,10 +16,10 @@ from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.cost import Rate
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import Workshop, _side, equip, measure, measure_rate
-from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.planning.progress import PlanningProgress, progress_of
 from sgsst_core.planning.pruning import pruned_image_error
 from sgsst_core.planning.ranks_model import Link
-from sgsst_core.planning.survey import _progress, survey
+from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.raster_lists import build_raster_lists
@@ -133,9 +133,9 @@ def test_the_survey_tells_how_far_it_is() -> None:
 
 
 def test_the_other_ranks_are_taken_to_be_as_far() -> None:
-    assert _progress(0, 5, 2, 0.1) == PlanningProgress(0, 5, None)
-    assert _progress(2, 5, 2, 4.0) == PlanningProgress(4, 5, 1.0)
-    assert _progress(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
+    assert progress_of(0, 5, 2, 0.1) == PlanningProgress(0, 5, None)
+    assert progress_of(2, 5, 2, 4.0) == PlanningProgress(4, 5, 1.0)
+    assert progress_of(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
 
 
 def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) -> None:

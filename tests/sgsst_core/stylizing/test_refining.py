@@ -131,6 +131,19 @@ def test_a_stylizer_goes_on_with_the_refined_scene(tiny_weights: BackboneWeights
     assert float(children.std(dim=0).max()) > 0.01, "children have colours of their own"
 
 
+def test_somebody_who_waits_is_shown_how_far_it_is(tiny_weights: BackboneWeights) -> None:
+    told: list[tuple[int, int]] = []
+    refine(
+        large_wall(),
+        cameras(),
+        style(),
+        settings(refine=2.0),
+        weights=tiny_weights,
+        show=lambda now: told.append((now.done, now.total)),
+    )
+    assert told == 2 * [(0, 3), (1, 3), (2, 3)]  # looked at, and asked for their gradient
+
+
 def test_views_are_spread_evenly() -> None:
     assert spread_evenly([3, 5, 8], 6) == [3, 5, 8]
     assert spread_evenly(list(range(10)), 4) == [0, 2, 5, 7]
