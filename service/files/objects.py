@@ -25,8 +25,8 @@ _CLIENT_TRIES, _TRIES = 3, 3
 #: Large objects travel to and from S3 in pieces of so many bytes, so many at a time: by default half a gigabyte of
 #: memory would be on its way.
 _PIECE_BYTES, _PIECES = 16 << 20, 3
-#: What S3 takes as a part of an object but for the last one, and how many of them.
-MIN_PART_BYTES, _MAX_PARTS = 5 << 20, 10_000
+#: What S3 takes as a part of an object, at least but for the last one, and at most; and how many of them.
+MIN_PART_BYTES, _MAX_PART_BYTES, _MAX_PARTS = 5 << 20, 5 << 30, 10_000
 _CHUNK = 1 << 20
 
 
@@ -121,8 +121,8 @@ class ObjectStore:
 
     def can_join(self, sizes: list[int]) -> bool:
         """Whether objects of these sizes, one behind the other, can become one without being sent again."""
-        whole = all(size >= MIN_PART_BYTES for size in sizes[:-1])
-        return self._s3 and 0 < len(sizes) <= _MAX_PARTS and whole
+        fit = all(size >= MIN_PART_BYTES for size in sizes[:-1]) and max(sizes, default=0) <= _MAX_PART_BYTES
+        return self._s3 and 0 < len(sizes) <= _MAX_PARTS and fit
 
     def join(self, parts: list[str], name: str) -> None:
         """Make objects one, in the store itself (S3's multipart upload by copies); see `can_join`."""

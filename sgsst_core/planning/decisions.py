@@ -257,7 +257,8 @@ def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[
         int(MAP_BYTES * len(resolved.active) * sum(sizes)),
         -(-len(resolved.active) // MAPS_OF_A_RENDER) + 1,
     )
-    how = f"statistics of {len(resolved.active)} regions are weighted by their share of each pixel's blend weights"
+    several = "1 region" if len(resolved.active) == 1 else f"{len(resolved.active)} regions"
+    how = f"statistics of {several} are weighted by their share of each pixel's blend weights"
     how += f"; {renders} renders at a view's first visit, {total / 1e6:.1f} MB for all views"
     return [*found, Decision("regions", how, "one style must not leak into another's region", error=_ANOTHER_LOSS)]
 
