@@ -318,6 +318,7 @@ def test_stopping_saves_running_jobs_and_starting_goes_on(
     assert not any((tmp_path / "data" / "work").iterdir())
 
 
+@pytest.mark.slow
 def test_a_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         job_id = submit(client, files, workers=2, steps_sos=4)

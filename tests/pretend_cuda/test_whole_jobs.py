@@ -90,7 +90,8 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
     assert torch.equal(before.means, after.means)
 
 
-@pytest.mark.parametrize("scan", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", [False, True])
 def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
     """One wait more where a view comes for the first time, and its lists are built."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}

@@ -137,7 +137,7 @@ def test_regions_that_cannot_be_used(
     assert not files.out.exists()
 
 
-@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
+@pytest.mark.parametrize("form", [pytest.param("compressed.ply", marks=pytest.mark.slow), "spz"])
 def test_stylize_reads_and_writes_packed_scenes(
     files: Files, capsys: pytest.CaptureFixture[str], form: PackedForm
 ) -> None:

@@ -110,6 +110,7 @@ def on_host(tensor: Tensor) -> Tensor:
     return tensor.host
 
 
+@pytest.mark.slow
 def test_a_step_reads_the_next_photo_and_waits_once(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

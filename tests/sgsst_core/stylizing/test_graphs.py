@@ -68,7 +68,8 @@ def make(
     return Stylizer(plan, scene, views, style(), settings, weights=weights)
 
 
-@pytest.mark.parametrize("scan", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", [False, True])
 def test_steps_with_graphs_are_the_same_to_the_bit(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, scan: bool
 ) -> None:

@@ -131,12 +131,13 @@ def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path
     assert undisturbed[0] == pytest.approx(mean_loss(alone.after), rel=TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
         (Fault(1, "all_gather_rows", 30, "SIGKILL", 0.001), "was killed"),
-        pytest.param(Fault(0, "checkpoint", 4, "SIGKILL"), "was killed", marks=pytest.mark.slow),
-        pytest.param(Fault(1, "render", 25, "SIGSTOP"), "not answered", marks=pytest.mark.slow),
+        (Fault(0, "checkpoint", 4, "SIGKILL"), "was killed"),
+        (Fault(1, "render", 25, "SIGSTOP"), "not answered"),
     ],
 )
 def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
