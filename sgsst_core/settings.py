@@ -204,6 +204,9 @@ class Settings(BaseModel):
     revive: bool = Field(
         False, description="Let colours that fell below black come back, by gradients that would raise them."
     )
+    bounded: bool = Field(
+        False, description="Keep colours within 0 to 1, which is what screens show, by bringing them back each step."
+    )
     early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales has stopped falling.")
     target_loss: Annotated[
         float | None, Option(unit="share of the loss at the start", metavar="R", default="never")
@@ -257,6 +260,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "learning_rate": 0.2,
         "learning_rate_end": 0.05,
         "revive": True,
+        "bounded": True,
         "max_resolution": 640,
     },
     "standard": {
@@ -265,6 +269,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "learning_rate": 0.2,
         "learning_rate_end": 0.02,
         "revive": True,
+        "bounded": True,
         "early_stop": True,
     },
     "paper": {

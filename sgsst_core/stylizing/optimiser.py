@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.scene.luminance import with_chroma_of
+from sgsst_core.scene.screen import on_screen, on_screen_by_luminance
 
 #: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
@@ -25,12 +26,22 @@ class ColourOptimiser:
             gradients grow with its square, and would sooner be too large to be squared.
         chroma_of: [n, 3], colours whose chroma is kept: what is optimised is then how far each colour's luminance is
             from theirs. None lets colours change freely.
+        bounded: bring colours back into 0..1 after each step (`scene.screen`).
+        kept: [n, 1], those that stay as they are, whose gradients are 0. None where there are none.
     """
 
     def __init__(
-        self, colours: Tensor, learning_rate: float, unit: float = 1.0, chroma_of: Tensor | None = None
+        self,
+        colours: Tensor,
+        learning_rate: float,
+        unit: float = 1.0,
+        chroma_of: Tensor | None = None,
+        *,
+        bounded: bool = False,
+        kept: Tensor | None = None,
     ) -> None:
         self._chroma_of = chroma_of
+        self._bounded, self._kept = bounded, kept
         self._colours = colours.requires_grad_()
         self._unit = unit
         self._fused = colours.is_cuda
@@ -60,16 +71,22 @@ class ColourOptimiser:
             self._adam.step()
         else:
             return largest
-        self._keep_chroma(largest)
+        self._constrain(largest)
         return largest
 
     @torch.no_grad()
-    def _keep_chroma(self, largest: Tensor) -> None:
-        """Take rounding of the step out of the colours' chroma; where no step was made, nothing changes."""
-        if self._chroma_of is None:
+    def _constrain(self, largest: Tensor) -> None:
+        """Bring colours back to where they may be: within the bounds, with their chroma.
+
+        Where no step was made, and of kept Gaussians, nothing changes.
+        """
+        if not self._bounded and self._chroma_of is None:
             return
-        kept = with_chroma_of(self._colours, self._chroma_of)
-        self._colours.copy_(torch.where(largest <= LARGEST_GRADIENT, kept, self._colours))
+        found = constrained(self._colours, self._chroma_of, bounded=self._bounded)
+        unchanged = ~(largest <= LARGEST_GRADIENT)
+        if self._kept is not None:
+            unchanged = unchanged | self._kept
+        self._colours.copy_(torch.where(unchanged, self._colours, found))
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """First and second moment [n, 3], on the CPU; zeros before the first step."""
@@ -86,6 +103,19 @@ class ColourOptimiser:
             "exp_avg": first.to(device).clone(),
             "exp_avg_sq": second.to(device).clone(),
         }
+
+
+def constrained(colours: Tensor, chroma_of: Tensor | None, *, bounded: bool) -> Tensor:
+    """DC coefficients [n, 3], brought into the bounds where there are some, without rounding of their chroma.
+
+    Args:
+        colours: [n, 3].
+        chroma_of: [n, 3], colours that they differ from in luminance alone; None where they may in anything.
+        bounded: whether colours stay in 0..1.
+    """
+    if chroma_of is None:
+        return on_screen(colours) if bounded else colours
+    return with_chroma_of(on_screen_by_luminance(colours) if bounded else colours, chroma_of)
 
 
 def is_too_large(largest: float) -> bool:

@@ -44,7 +44,7 @@ from sgsst_core.stylizing.evaluation import (
     mean_evaluation,
     mean_loss,
 )
-from sgsst_core.stylizing.optimiser import ColourOptimiser, is_too_large
+from sgsst_core.stylizing.optimiser import ColourOptimiser, constrained, is_too_large
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.regions import JobStyles, neighbours_change_by_region
 from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
@@ -138,7 +138,14 @@ class Stylizer:
         #: Of the Gaussians that are rendered, those that stay as they are; None where none do.
         self._kept = kept.to(rasterizer.device)[:, None] if kept.any() else None
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
-        self._optimiser = ColourOptimiser(self.sh_dc, settings.learning_rate, self.network.unit, chroma_of)
+        self._optimiser = ColourOptimiser(
+            self.sh_dc,
+            settings.learning_rate,
+            self.network.unit,
+            chroma_of,
+            bounded=settings.bounded,
+            kept=self._kept,
+        )
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.schedule = planned_phases(plan, settings)
@@ -558,7 +565,10 @@ class Stylizer:
                     change = neighbours_change(self.scene.means, change, weights)
                 else:
                     change = neighbours_change_by_region(self.scene.means, change, weights, regions)[takes]
-                result[takes] += change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
+                change = change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
+                own = self.scene.sh_dc[takes]
+                chroma_of = own if self._keeps_chroma else None
+                result[takes] = constrained(own + change, chroma_of, bounded=self.settings.bounded)
             self._stylized = result
         return self._stylized
 

@@ -134,7 +134,7 @@ def test_the_first_step_moves_every_seen_value_by_the_learning_rate(
 ) -> None:
     """Adam's first update is lr * sign(gradient), whatever the gradient's size."""
     hidden = replace(scene, means=torch.cat([scene.means[:-10], scene.means[-10:] * torch.tensor([1.0, 1.0, -1.0])]))
-    stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05)
+    stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05, bounded=False)
     stylizer.run_step()
     assert not stylizer.plan.seen[-10:].any()
     moved = (stylizer.sh_dc.detach() - hidden.sh_dc[stylizer.plan.seen]).abs()
