@@ -257,8 +257,9 @@ class RunningAttempt:
             self._pending = progress_record(message, self.lease.job.attempt)
 
     def _give_back(self, gpus: list[str]) -> None:
-        """Leave GPUs that the plan does without to other jobs."""
-        kept = tuple(gpu for gpu in self.grant.gpus if gpu not in gpus)
+        """Leave GPUs that the plan does without to other jobs; on a cluster it is only their number that counts."""
+        left = len(self.grant.gpus) - len(gpus)
+        kept = self.grant.gpus[:left] if self._cluster else tuple(x for x in self.grant.gpus if x not in gpus)
         self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
         _log.info("needs %d GPUs and gives %d back", len(kept), len(gpus), extra=self._log_fields)
 

@@ -258,20 +258,17 @@ class _Attempts:
         return workplace and workplace.after(self._relay.stored)
 
     def _leave_out(self, rank: RankHandle) -> None:
-        """End a rank that the plan does without, and let go of its GPU.
-
-        On a cluster its place stays reserved until the attempt ends: Ray gives places back together only.
-        """
-        if not self._cluster.local:
-            return
+        """End a rank that the plan does without, and let go of its GPU."""
         end_rank(rank)
         assert rank.place is not None
         if not rank.place.gpus:
             return
         others = [other for other in self._group.handles if other.place and not other.left_out]
         kept = [gpu for other in others if other.place for gpu in other.place.gpus]
-        self._workers, self._let_go = len(kept), True
-        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)  # for the next attempt
+        self._workers = len(kept)
+        if self._cluster.local:  # the GPU may be another process's from now on, and this Ray would give it out again
+            self._let_go = True
+            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)
         self._listener.left_out(rank.place.gpus)
 
     def _tell_resumed(self) -> None:

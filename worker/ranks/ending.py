@@ -7,6 +7,7 @@ from typing import Any
 
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster
+from worker.ranks.placement import give_back
 from worker.ranks.rank import RankPlace
 from worker.ranks.rank_group import RankGroup, RankHandle
 from worker.workplace import Workplace
@@ -28,12 +29,16 @@ def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = 
 
 
 def end_rank(rank: RankHandle) -> None:
-    """End one rank of this machine, and wait until what it held of a GPU is free."""
+    """End one rank, wherever it is, and wait until what it held of a GPU is free; its place is given back to Ray."""
     import ray
 
     assert rank.place is not None
     ray.kill(rank.actor, no_restart=True)
-    kill([rank.place.process])
+    if rank.place.process.home == home():
+        kill([rank.place.process])
+    else:
+        ray.wait([_kill_on(rank.place).remote([rank.place.process], None)], timeout=_REMOTE_SECONDS)
+    give_back(rank.group)
 
 
 def _end_remote(group: RankGroup, workplace: Workplace | None) -> None:

@@ -27,7 +27,7 @@ class Listener:
         warn: what is worth knowing although the job goes on.
         stop: asked a few times a second; True ends the job as "interrupted".
         preview: path of each picture of the running job.
-        left_out: GPUs of this machine that the job has let go of, because the plan does without them.
+        left_out: GPUs that the job has let go of, because the plan does without them, by their names on their machines.
         stored: what a workplace told of each file that it has stored, in their order.
         planning: how far the survey of the views has come, a few times a second; again where an attempt that was lost
             had not saved its plan.

@@ -6,6 +6,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+#: What Ray calls a machine by, in labels.
+NODE_LABEL = "ray.io/node-id"
 #: Seconds to wait for places that are taken; what lost ranks held is free again after a moment.
 PLACE_SECONDS = 5.0
 
@@ -16,17 +18,15 @@ class NoRoomError(Exception):
 
 @dataclass(frozen=True)
 class Reservation:
-    """Places for ranks.
+    """Places for ranks, each of which can be given back alone.
 
     Attributes:
-        group: Ray's placement group.
-        ranks: how many places.
+        groups: Ray's placement group of each rank.
         threads: processor cores for each.
         gpus: for each, 0 or 1.
     """
 
-    group: Any
-    ranks: int
+    groups: tuple[Any, ...]
     threads: int
     gpus: int
 
@@ -41,16 +41,22 @@ class Reservation:
                 "max_restarts": 0,
                 "max_task_retries": 0,
                 "max_concurrency": 2,
-                "scheduling_strategy": PlacementGroupSchedulingStrategy(self.group, placement_group_bundle_index=index),
+                "scheduling_strategy": PlacementGroupSchedulingStrategy(group, placement_group_bundle_index=0),
             }
-            for index in range(self.ranks)
+            for group in self.groups
         ]
 
     def release(self) -> None:
-        """Give the places back."""
-        from ray.util import remove_placement_group
+        """Give all places back."""
+        for group in self.groups:
+            give_back(group)
 
-        remove_placement_group(self.group)
+
+def give_back(group: Any) -> None:
+    """Give one place back; one that was given back before is no error."""
+    from ray.util import remove_placement_group
+
+    remove_placement_group(group)
 
 
 def reserve(workers: int) -> Reservation:
@@ -70,9 +76,9 @@ def reserve(workers: int) -> Reservation:
     wanted = min(wanted, sum(count // threads for count in cores))
     deadline = time.monotonic() + PLACE_SECONDS
     while wanted > 0:
-        group = _place(wanted, threads, 1 if gpus else 0, max(deadline - time.monotonic(), 1.0))
-        if group is not None:
-            return Reservation(group, wanted, threads, 1 if gpus else 0)
+        groups = _places(wanted, threads, 1 if gpus else 0, deadline)
+        if groups:
+            return Reservation(groups, threads, 1 if gpus else 0)
         if threads > 1 and not gpus:  # other work may hold a part of the cores
             threads = 1
         else:
@@ -95,13 +101,25 @@ def _threads(cores: list[int], ranks: int) -> int:
     )
 
 
-def _place(ranks: int, threads: int, gpus: int, timeout: float) -> Any:
-    """A placement group once it is there; None where that takes too long."""
-    from ray.util import placement_group, remove_placement_group
+def _places(ranks: int, threads: int, gpus: int, deadline: float) -> tuple[Any, ...]:
+    """A placement group for each rank, once all are there; empty where that takes too long.
+
+    Ray gives the bundles of a group back together only. So it is asked for all of them at once, which it puts where
+    they belong together, and then for each alone on the machine that was found. Fewer are there where others were
+    faster in between.
+    """
+    from ray.util import placement_group, placement_group_table
 
     bundle = {"CPU": threads, **({"GPU": gpus} if gpus else {})}
-    group = placement_group([bundle] * ranks, strategy="PACK" if gpus else "SPREAD")
-    if group.wait(timeout):
-        return group
-    remove_placement_group(group)
-    return None
+    together = placement_group([bundle] * ranks, strategy="PACK" if gpus else "SPREAD")
+    found = together.wait(max(deadline - time.monotonic(), 1.0))
+    nodes = dict(placement_group_table(together)["bundles_to_node_id"]) if found else {}
+    give_back(together)
+    alone = [placement_group([bundle], bundle_label_selector=[{NODE_LABEL: nodes[index]}]) for index in sorted(nodes)]
+    there = []
+    for group in alone:
+        if group.wait(max(deadline - time.monotonic(), 1.0)):
+            there.append(group)
+        else:
+            give_back(group)
+    return tuple(there)

@@ -26,6 +26,7 @@ class RankHandle:
 
     Attributes:
         actor: its Ray actor.
+        group: Ray's placement group that it runs in.
         place: where it is; None until it has told.
         pending_poll: Ray's reference to the answer that is waited for; None where nothing is.
         polled_at, answered_at: when it was last asked, and answered; monotonic seconds.
@@ -33,6 +34,7 @@ class RankHandle:
     """
 
     actor: Any
+    group: Any
     place: RankPlace | None = None
     pending_poll: Any = None
     polled_at: float = 0.0

@@ -38,7 +38,8 @@ def start_ranks(group: RankGroup, workers: int, actor: type[RankProcess], make_t
     except NoRoomError as error:
         raise AttemptFailedError(Failure("loss", str(error), ClusterAwayError(f"{error}."))) from error
     kind = ray.remote(actor)
-    group.handles = [RankHandle(kind.options(**options).remote()) for options in group.reservation.actor_options()]
+    reserved = zip(group.reservation.actor_options(), group.reservation.groups, strict=True)
+    group.handles = [RankHandle(kind.options(**options).remote(), place) for options, place in reserved]
     places = _from_all(group, "place")
     for rank, place in zip(group.handles, places, strict=True):
         rank.place = place
