@@ -1,0 +1,581 @@
+"""Faults of machines at random moments, while a cluster that shares PostgreSQL and S3 alone works through small jobs.
+
+python -m benchmarks.cluster_faults [--faults 60] [--seconds S] [--seed 0] [--kinds kill-node cut-node ...]
+
+Ten hosts of namespaces (`benchmarks.cluster_hosts`), each with its own network, processes and disk: two for the API,
+two for dispatchers, one for Ray's head, three Ray nodes that compute, PostgreSQL, and S3 (moto's server). What runs on
+a host is started again when it ends, and a killed host comes back with an empty disk, as machines of a cluster do.
+
+Counted: jobs lost (accepted, and not succeeded), published twice, of another result than `sgsst stylize` gives on one
+rank (byte for byte for jobs of one rank; colours for jobs of two), files left over, reads that no API process answered
+while the database was there, and for each kind of fault the seconds until a job makes steps again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import json
+import os
+import random
+import re
+import secrets
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from benchmarks.cluster_hosts import Host, Network, missing
+from benchmarks.machine import write_result
+from sgsst_core.files.ply import read_scene
+from tests.api.service import undisturbed
+from tests.networks import install_tiny_weights
+from tests.small_scenes import wall, write_files
+
+PARAMETERS = {"preset": "standard", "steps_coarse": 0, "steps_sos": 150, "backbone": "vgg16", "early_stop": False}
+SEEDS = (1, 2)
+#: Jobs that are kept waiting or running; every third runs on two ranks.
+QUEUE, TWO_RANKS_EVERY = 3, 3
+RAY_PORT, PG_PORT, S3_PORT, API_PORT = 6479, 5498, 5599, 8000
+NODES, DISPATCHERS, APIS = ("n1", "n2", "n3"), ("d1", "d2"), ("a1", "a2")
+FINISHED = ("succeeded", "failed", "canceled", "expired")
+#: Seconds that a cut lasts at least and at most; that S3 is away; that a cable is slow, and a disk full.
+CUT, AWAY, SLOW, FULL = (5.0, 60.0), 30.0, 30.0, 20.0
+DELAY, LOSS = 0.2, 0.05
+#: Seconds for everything that was accepted to end, once nothing is broken any more, and for what is left to be swept.
+PATIENCE, SWEEP = 900.0, 120.0
+#: Bytes of a node's disk, which a fault fills: scene, network and checkpoint are small here.
+NODE_DISK = 96 << 20
+
+
+class Cluster:
+    """The hosts and what runs on them."""
+
+    def __init__(self, network: Network, weights: Path) -> None:
+        self.network, self._weights = network, weights
+        prefix = network.prefix
+        self.urls = [f"http://{prefix}.{number}:{API_PORT}" for number in (2, 3)]
+        self._addresses = {"s3": 10, "pg": 11, "head": 9, **dict(zip(NODES, (6, 7, 8), strict=True))}
+        self._addresses |= {**dict(zip(APIS, (2, 3), strict=True)), **dict(zip(DISPATCHERS, (4, 5), strict=True))}
+        self._ray = f"{prefix}.{self._addresses['head']}:{RAY_PORT}"
+        self.database = f"postgresql+psycopg://sgsst@{prefix}.{self._addresses['pg']}:{PG_PORT}/postgres"
+        self.store = {
+            "AWS_ENDPOINT_URL": f"http://{prefix}.{self._addresses['s3']}:{S3_PORT}",
+            "AWS_ACCESS_KEY_ID": "key",
+            "AWS_SECRET_ACCESS_KEY": "secret",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }
+        self._common = {
+            "PYTHONPATH": str(Path.cwd()),
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_NUM_THREADS": "1",
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN": secrets.token_hex(32),
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "NO_PROXY": "*",
+            **self.store,
+        }
+
+    def __getitem__(self, name: str) -> Host:
+        return self.network.hosts[name]
+
+    def start(self) -> None:
+        """Everything, in no order that matters but for the database and the store, which are there first."""
+        for name, number in self._addresses.items():
+            self.network.host(name, number, NODE_DISK if name in NODES else 1 << 30)
+        self.start_services("pg")
+        self.start_services("s3")
+        _wait("S3", self._make_bucket)
+        _wait("PostgreSQL", lambda: self._answers("pg", PG_PORT))
+        for name in (*APIS, "head", *NODES, *DISPATCHERS):
+            self.start_services(name)
+        _wait("the service", lambda: all(_ready(url) for url in self.urls))
+
+    def bring_back(self, name: str) -> None:
+        """A killed host, with an empty disk."""
+        self[name].start()
+        self.start_services(name)
+
+    def start_services(self, name: str) -> None:
+        """What belongs on a host."""
+        host = self[name]
+        python, disk = sys.executable, str(host.disk)
+        if name == "pg":
+            self._start_database(host)
+        elif name == "s3":
+            host.run([str(Path(python).with_name("moto_server")), "-H", host.address, "-p", str(S3_PORT)], self._common)
+        elif name == "head":
+            first = ["--head", "--port", str(RAY_PORT), "--temp-dir", f"{disk}/ray", "--include-dashboard=false"]
+            host.run([*self._ray_start(host, 0), *first], self._common)
+        elif name in NODES:
+            own = {**self._common, "SGSST_DATA": f"{disk}/data", "SGSST_CACHE": f"{disk}/none"}
+            host.run([*self._ray_start(host, 1), "--address", self._ray], own)
+        elif name in APIS:
+            host.run([python, "-m", "api.http.server"], {**self._service(host), "SGSST_HOST": host.address})
+        else:
+            host.run(
+                [*self._ray_start(host, 0), "--address", self._ray], {**self._common, "SGSST_DATA": f"{disk}/data"}
+            )
+            host.run([python, "-m", "service.scheduling.dispatcher"], {**self._service(host), "RAY_ADDRESS": self._ray})
+
+    def _service(self, host: Host) -> dict[str, str]:
+        own = {
+            "SGSST_DATA": f"{host.disk}/data",
+            "SGSST_CACHE": str(self._weights),
+            "SGSST_ARTIFACTS": "s3://files/sgsst",
+            "SGSST_DATABASE": self.database,
+            "SGSST_REQUIRE_KEYS": "false",
+            "SGSST_MIN_FREE_BYTES": "0",
+            "SGSST_RETRY_SECONDS": "2",
+            "SGSST_CHECKPOINT_SECONDS": "1",
+            "SGSST_PREVIEW_SECONDS": "5",
+            "SGSST_PARALLEL_JOBS": "1",
+        }
+        return {**self._common, **own}
+
+    def _ray_start(self, host: Host, cores: int) -> list[str]:
+        return [
+            *(sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--disable-usage-stats"),
+            *("--node-ip-address", host.address, "--num-cpus", str(cores), "--num-gpus", "0"),
+            *("--object-store-memory", str(80 << 20)),
+        ]
+
+    def _start_database(self, host: Host) -> None:
+        programs = _postgres_programs()
+        data = host.disk / "data"
+        user = ["setpriv", "--reuid", "postgres", "--regid", "postgres", "--clear-groups"]
+        host.call("chmod", "755", str(host.disk))
+        host.call("install", "-d", "-o", "postgres", str(data))
+        made = host.call(
+            *user, f"{programs}/initdb", "-D", str(data), "-U", "sgsst", "-A", "trust", "--locale=C", "-EUTF8"
+        )
+        if made.returncode:
+            raise RuntimeError(made.stderr.decode())
+        host.call("sh", "-c", f"echo 'host all all {self.network.prefix}.0/24 trust' >> {data}/pg_hba.conf")
+        host.run([*user, f"{programs}/postgres", "-D", str(data), "-h", host.address, "-p", str(PG_PORT), "-k", ""], {})
+
+    def _make_bucket(self) -> bool:
+        return httpx.put(f"{self.store['AWS_ENDPOINT_URL']}/files", trust_env=False, timeout=5).status_code == 200
+
+    def _answers(self, name: str, port: int) -> bool:
+        import socket
+
+        with socket.create_connection((self[name].address, port), timeout=2):
+            return True
+
+
+def _postgres_programs() -> Path:
+    found = shutil.which("initdb")
+    places = [Path(found).resolve()] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    if not places:
+        raise RuntimeError("initdb is missing: apt-get install -y postgresql")
+    return places[-1].parent
+
+
+def _ready(url: str) -> bool:
+    answer = httpx.get(f"{url}/readyz", timeout=5, trust_env=False)
+    return answer.status_code == 200 and answer.json()["status"] == "ok"
+
+
+def _wait(what: str, condition: Callable[[], bool], seconds: float = 180.0) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        with contextlib.suppress(httpx.HTTPError, OSError):
+            if condition():
+                return
+        time.sleep(0.3)
+    raise RuntimeError(f"{what} does not come")
+
+
+@dataclass
+class Run:
+    """A cluster under fire, and what is counted."""
+
+    cluster: Cluster
+    files: dict[str, Path]
+    chance: random.Random
+    accepted: dict[str, tuple[int, int]] = field(default_factory=dict)  # seed and ranks
+    faults: list[dict[str, Any]] = field(default_factory=list)
+    unanswered: list[float] = field(default_factory=list)
+    database_away: bool = False
+    over: threading.Event = field(default_factory=threading.Event)
+
+    # --- through the API -------------------------------------------------------------------------------------------
+
+    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """A request to whichever API process answers, sent again while none does."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            for url in self.cluster.urls:
+                with contextlib.suppress(httpx.TransportError):
+                    answer = httpx.request(method, f"{url}{path}", timeout=15, trust_env=False, **options)
+                    if answer.status_code < 500:
+                        return answer
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"{method} {path} was never answered")
+            time.sleep(0.2)
+
+    def jobs(self) -> list[dict[str, Any]]:
+        """All jobs."""
+        found: list[dict[str, Any]] = []
+        cursor: str | None = None
+        while True:
+            answer = self.call(
+                "GET", "/v1/jobs", params={"limit": 100, **({"cursor": cursor} if cursor else {})}
+            ).json()
+            found += answer["jobs"]
+            cursor = answer.get("next_cursor") or answer.get("cursor")
+            if not cursor:
+                return found
+
+    def fill(self) -> None:
+        """Keep the queue full."""
+        waiting = sum(job["status"] not in FINISHED for job in self.jobs())
+        for _ in range(QUEUE - waiting):
+            number = len(self.accepted)
+            seed, ranks = SEEDS[number % len(SEEDS)], 2 if number % TWO_RANKS_EVERY == 2 else 1
+            body = {role: (path.name, path.read_bytes()) for role, path in self.files.items()}
+            parameters = {**PARAMETERS, "seed": seed, "workers": ranks}
+            answer = self.call(
+                "POST",
+                "/v1/jobs",
+                files=body,
+                data={"parameters": json.dumps(parameters)},
+                headers={"Idempotency-Key": secrets.token_hex(8)},
+            )
+            if answer.status_code != 202:
+                raise RuntimeError(f"a good job was refused: {answer.text}")
+            self.accepted[str(answer.json()["id"])] = seed, ranks
+
+    def steps(self) -> tuple[int, int]:
+        """Something that grows whenever a job makes a step or ends: jobs that ended, steps of those that run."""
+        jobs = self.jobs()
+        running = [job for job in jobs if job["status"] == "running" and (job["progress"] or {}).get("loss")]
+        ended = sum(job["status"] in FINISHED for job in jobs)
+        return ended, sum(job["attempt"] * 1_000_000 + job["progress"]["step"] for job in running)
+
+    def watch_reads(self) -> None:
+        """Ask for a page of jobs every half second; note the seconds of what no API process answers."""
+        while not self.over.wait(0.5):
+            started = time.monotonic()
+            if not any(self._reads(url) for url in self.cluster.urls) and not self.database_away:
+                self.unanswered.append(time.monotonic() - started + 0.5)
+
+    @staticmethod
+    def _reads(url: str) -> bool:
+        with contextlib.suppress(httpx.TransportError):
+            return httpx.get(f"{url}/v1/jobs", params={"limit": 1}, timeout=3, trust_env=False).status_code == 200
+        return False
+
+    # --- faults ----------------------------------------------------------------------------------------------------
+
+    def strike(self, kind: str) -> None:
+        """One fault, mended again, and the seconds from it until a job makes steps."""
+        self.fill()
+        self.wait_for_steps(120)
+        time.sleep(self.chance.uniform(0, 4))
+        began = time.monotonic()
+        told = getattr(self, "_" + kind.replace("-", "_"))()
+        mended = time.monotonic()
+        self.fill()
+        again = self.wait_for_steps(300)
+        record = {
+            "kind": kind,
+            **told,
+            "seconds": round(mended - began, 1),
+            "until_steps_after_mending": None if again is None else round(again, 1),
+        }
+        self.faults.append(record)
+        print(f"{len(self.faults):3} {time.strftime('%H:%M:%S')} {record}", flush=True)
+
+    def wait_for_steps(self, seconds: float) -> float | None:
+        """Seconds until a job has made steps or has ended; None where none does in time."""
+        started = time.monotonic()
+        before = self.steps()
+        while time.monotonic() - started < seconds:
+            time.sleep(0.3)
+            now = self.steps()
+            if now[0] > before[0] or now[1] > before[1]:
+                return time.monotonic() - started
+            before = min(before, now)
+        return None
+
+    def _kill(self, name: str) -> dict[str, Any]:
+        self.cluster[name].kill()
+        time.sleep(self.chance.uniform(1, 8))
+        self.cluster.bring_back(name)
+        return {"host": name}
+
+    def _kill_node(self) -> dict[str, Any]:
+        return self._kill(self.chance.choice(NODES))
+
+    def _kill_dispatcher(self) -> dict[str, Any]:
+        return self._kill(self.chance.choice(DISPATCHERS))
+
+    def _kill_api(self) -> dict[str, Any]:
+        return self._kill(self.chance.choice(APIS))
+
+    def _kill_head(self) -> dict[str, Any]:
+        return self._kill("head")
+
+    def _cut(self, names: tuple[str, ...]) -> dict[str, Any]:
+        name, seconds = self.chance.choice(names), self.chance.uniform(*CUT)
+        cable, ways = self.cluster[name].cable, self.chance.choice(("both", "to", "from"))
+        cable.to_host.cut, cable.from_host.cut = ways != "from", ways != "to"
+        time.sleep(seconds)
+        cable.mend()
+        return {"host": name, "ways": ways}
+
+    def _cut_node(self) -> dict[str, Any]:
+        return self._cut(NODES)
+
+    def _cut_dispatcher(self) -> dict[str, Any]:
+        return self._cut(DISPATCHERS)
+
+    def _slow(self) -> dict[str, Any]:
+        name = self.chance.choice((*NODES, *DISPATCHERS))
+        for way in (self.cluster[name].cable.to_host, self.cluster[name].cable.from_host):
+            way.delay, way.loss = DELAY / 2, LOSS
+        time.sleep(SLOW)
+        self.cluster[name].cable.mend()
+        return {"host": name}
+
+    def _fill_disk(self) -> dict[str, Any]:
+        name = self.chance.choice((*NODES, *DISPATCHERS))
+        full = self.cluster[name].disk / "full"
+        self.cluster[name].call("dd", "if=/dev/zero", f"of={full}", "bs=1M", "count=4096")
+        time.sleep(FULL)
+        self.cluster[name].call("rm", "-f", str(full))
+        return {"host": name}
+
+    def _restart_database(self) -> dict[str, Any]:
+        self.database_away = True
+        self.cluster["pg"].call("pkill", "-INT", "-o", "postgres")
+        time.sleep(1)
+        _wait("PostgreSQL", lambda: self.cluster._answers("pg", PG_PORT))
+        time.sleep(3)
+        self.database_away = False
+        return {}
+
+    def _lose_store(self) -> dict[str, Any]:
+        cable = self.cluster["s3"].cable
+        cable.to_host.cut = cable.from_host.cut = True
+        time.sleep(AWAY)
+        cable.mend()
+        return {}
+
+    # --- what became of it -----------------------------------------------------------------------------------------
+
+    def wait_for_all(self) -> dict[str, dict[str, Any]]:
+        """Every accepted job at its end, or as it is when patience is over; those that are gone are left out."""
+        deadline = time.monotonic() + PATIENCE
+        found: dict[str, dict[str, Any]] = {}
+        while time.monotonic() < deadline:
+            for job_id in self.accepted:
+                if found.get(job_id, {}).get("status") not in FINISHED:
+                    answer = self.call("GET", f"/v1/jobs/{job_id}")
+                    if answer.status_code == 200:
+                        found[job_id] = answer.json()
+            if all(found.get(job_id, {}).get("status") in FINISHED for job_id in self.accepted):
+                break
+            time.sleep(1)
+        return found
+
+    def published(self, job_id: str) -> int:
+        """How often the end of a job was told of."""
+        text = self.call("GET", f"/v1/jobs/{job_id}/events").text
+        return max(text.count('"name": "stylized.ply"'), text.count('"status": "succeeded"'))
+
+    def result(self, job_id: str) -> bytes:
+        """Its PLY."""
+        return self.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
+
+
+KINDS = (
+    "kill-node",
+    "cut-node",
+    "kill-dispatcher",
+    "cut-dispatcher",
+    "kill-head",
+    "slow",
+    "fill-disk",
+    "restart-database",
+    "lose-store",
+    "kill-api",
+)
+
+
+def main() -> None:
+    """Break, count, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--faults", type=int, default=60)
+    parser.add_argument("--seconds", type=float, default=None, help="no further fault after these")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--logs", type=Path, help="folder that the hosts' logs are copied to")
+    arguments = parser.parse_args()
+    if reason := missing():
+        raise SystemExit(reason)
+    folder = Path(tempfile.mkdtemp(prefix="sgsst-c-", dir="/tmp"))
+    try:
+        figures = measure(folder, arguments)
+    finally:
+        if arguments.logs:
+            arguments.logs.mkdir(parents=True, exist_ok=True)
+            for path in folder.glob("net/*.log"):
+                shutil.copy(path, arguments.logs)
+        shutil.rmtree(folder, ignore_errors=True)
+    path = write_result("cluster_faults", {"seed": arguments.seed, **figures})
+    print(json.dumps({name: value for name, value in figures.items() if name != "each"}, indent=2))
+    print(path)
+    sys.exit(1 if figures["lost"] or figures["published_twice"] or figures["different"] else 0)
+
+
+def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """All figures."""
+    folder.chmod(0o755)
+    for name in ("inputs", "weights", "net"):
+        (folder / name).mkdir()
+    install_tiny_weights(folder / "weights")
+    ply, cameras, style = write_files(folder / "inputs", wall())
+    files = {"scene": ply, "cameras": cameras, "style": style}
+    expected = _expected(folder, files)
+    with Network(folder / "net") as network:
+        cluster = Cluster(network, folder / "weights")
+        cluster.start()
+        run = Run(cluster, files, random.Random(arguments.seed))
+        reader = threading.Thread(target=run.watch_reads)
+        reader.start()
+        try:
+            started = time.monotonic()
+            attack(run, arguments, started)
+            attacked = time.monotonic() - started
+            found = run.wait_for_all()
+        finally:
+            run.over.set()
+            reader.join()
+        return {"attacked_seconds": round(attacked, 1), **_count(run, found, expected, folder), **_left(run, found)}
+
+
+def attack(run: Run, arguments: argparse.Namespace, started: float) -> None:
+    """Kinds in turns, each round in another order."""
+    kinds: list[str] = []
+    while len(run.faults) < arguments.faults:
+        if arguments.seconds and time.monotonic() - started > arguments.seconds:
+            return
+        if not kinds:
+            kinds = list(arguments.kinds)
+            run.chance.shuffle(kinds)
+        run.strike(kinds.pop())
+
+
+def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
+    os.environ["SGSST_CACHE"] = str(folder / "weights")
+    found = {}
+    for seed in SEEDS:
+        (folder / f"expected_{seed}").mkdir()
+        found[seed] = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{seed}")
+    return found
+
+
+def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:
+    """What became of the jobs."""
+    ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
+    different, farthest = 0, 0.0
+    before = read_scene(run.files["scene"]).scene.sh_dc
+    for job_id in ended:
+        seed, ranks = run.accepted[job_id]
+        content = run.result(job_id)
+        if hashlib.sha256(content).digest() == hashlib.sha256(expected[seed].read_bytes()).digest():
+            continue
+        (folder / "result.ply").write_bytes(content)
+        result, alone = (read_scene(path).scene.sh_dc for path in (folder / "result.ply", expected[seed]))
+        distance = float((result - alone).norm() / (alone - before).norm())
+        farthest = max(farthest, distance)
+        different += ranks == 1 or distance > 0.05
+    kinds = sorted({record["kind"] for record in run.faults})
+    return {
+        "faults": len(run.faults),
+        "jobs_accepted": len(run.accepted),
+        "lost": len(run.accepted) - len(ended),
+        "not_succeeded": [found.get(job_id, {}).get("error") for job_id in run.accepted if job_id not in ended],
+        "published_twice": sum(run.published(job_id) != 1 for job_id in ended),
+        "different": different,
+        "farthest_of_two_ranks": farthest,
+        "most_attempts_of_a_job": max((len(job["attempts"]) for job in found.values()), default=0),
+        "reads_unanswered": len(run.unanswered),
+        "longest_unanswered_seconds": round(max(run.unanswered, default=0.0), 1),
+        "seconds_until_steps_after_mending": {
+            kind: _spread([record["until_steps_after_mending"] for record in run.faults if record["kind"] == kind])
+            for kind in kinds
+        },
+        "each": run.faults,
+    }
+
+
+def _spread(values: list[float | None]) -> dict[str, float | int | None]:
+    known = [value for value in values if value is not None]
+    return {
+        "faults": len(values),
+        "never": len(values) - len(known),
+        "median": round(statistics.median(known), 1) if known else None,
+        "largest": max(known, default=None),
+    }
+
+
+def _left(run: Run, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """What is left on the hosts and in the store once dispatchers have had time to sweep."""
+    deadline = time.monotonic() + SWEEP
+    while True:
+        hosts = {name: _files_of_jobs(run.cluster[name]) for name in (*NODES, *DISPATCHERS)}
+        stray = _stray_objects(run, found)
+        if (not any(hosts.values()) and not stray) or time.monotonic() > deadline:
+            return {"left_on_hosts": hosts, "left_in_store": stray}
+        time.sleep(5)
+
+
+def _files_of_jobs(host: Host) -> int:
+    below = [str(host.disk / "data" / name) for name in ("ranks", "work")]
+    told = host.call("find", *below, "-mindepth", "2").stdout.decode().split()
+    return len(told)
+
+
+def _stray_objects(run: Run, found: dict[str, dict[str, Any]]) -> list[str]:
+    """Objects of jobs that no published artifact is."""
+    listing = subprocess.run(
+        [sys.executable, "-c", _LIST],
+        env={**os.environ, **run.cluster.store, "NO_PROXY": "*"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    by_job: dict[str, list[str]] = {}
+    for name in listing.stdout.split():
+        if match := re.match(r"(job_[^/]+)/", name):
+            by_job.setdefault(match[1], []).append(name)
+    stray = []
+    for job_id, names in by_job.items():
+        known = {each["name"] for each in run.call("GET", f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
+        stray += names if job_id not in found else sorted(names)[len(known) :]
+    return stray
+
+
+_LIST = """
+from service.files.objects import ObjectStore
+print("\\n".join(ObjectStore("s3://files/sgsst").below("")))
+"""
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # hosts go with this process, whatever ends it
+    main()

@@ -1,0 +1,288 @@
+"""Hosts on one machine: namespaces of Linux, each with its own network, processes, name and disk, on one switch.
+
+Every host hangs on a cable of its own (`Cable`): a pair of TAP devices between which this process carries packets, so
+that a cable can be cut in one direction or in both, lose packets and delay them, without any module of the kernel.
+Needs Linux, root, iproute2, util-linux and /dev/net/tun.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import heapq
+import os
+import random
+import selectors
+import shutil
+import signal
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+#: Of `linux/if_tun.h`: give a TAP device its name; one without a header before each packet.
+_TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x0002 | 0x1000
+_LARGEST_PACKET = 65536
+_TOOLS = ("ip", "unshare", "nsenter", "mount")
+
+
+def missing() -> str | None:
+    """What this machine lacks for hosts; None where nothing is missing."""
+    if os.name != "posix" or not hasattr(os, "geteuid") or os.geteuid() != 0:
+        return "hosts of namespaces need Linux and root"
+    for tool in _TOOLS:
+        if shutil.which(tool) is None:
+            return f"{tool} is missing: apt-get install -y iproute2 util-linux mount"
+    return None if Path("/dev/net/tun").exists() else "/dev/net/tun is missing"
+
+
+@dataclass
+class Way:
+    """One direction of a cable.
+
+    Attributes:
+        cut: nothing comes through.
+        delay: seconds that each packet takes.
+        loss: share of packets that are lost.
+    """
+
+    cut: bool = False
+    delay: float = 0.0
+    loss: float = 0.0
+
+
+@dataclass
+class Cable:
+    """Between a host and the switch."""
+
+    to_host: Way = field(default_factory=Way)
+    from_host: Way = field(default_factory=Way)
+
+    def mend(self) -> None:
+        """As new, in both directions."""
+        for way in (self.to_host, self.from_host):
+            way.cut, way.delay, way.loss = False, 0.0, 0.0
+
+
+class Carrier(threading.Thread):
+    """Carries the packets of all cables."""
+
+    def __init__(self) -> None:
+        super().__init__(name="cables", daemon=True)
+        self._selector = selectors.DefaultSelector()
+        self._lock = threading.Lock()
+        self._late: list[tuple[float, int, int, bytes]] = []
+        self._count = 0
+        self._chance = random.Random(0)
+        self._ended = threading.Event()
+
+    def add(self, source: int, way: Way, target: int) -> None:
+        """Carry from a device's descriptor to another's."""
+        with self._lock:
+            self._selector.register(source, selectors.EVENT_READ, (way, target))
+
+    def remove(self, *descriptors: int) -> None:
+        """Carry no more of these."""
+        with self._lock:
+            for each in descriptors:
+                self._drop(each)
+            self._late = [packet for packet in self._late if packet[2] not in descriptors]
+            heapq.heapify(self._late)
+
+    def end(self) -> None:
+        """Stop carrying."""
+        self._ended.set()
+        self.join()
+
+    def run(self) -> None:
+        """Until `end`."""
+        while not self._ended.is_set():
+            wait = min(0.05, max(0.0, self._late[0][0] - time.monotonic())) if self._late else 0.05
+            ready = self._selector.select(wait)
+            with self._lock:
+                for key, _ in ready:
+                    self._carry(key.fd, *key.data)
+                while self._late and self._late[0][0] <= time.monotonic():
+                    _, _, target, packet = heapq.heappop(self._late)
+                    self._write(target, packet)
+
+    def _carry(self, source: int, way: Way, target: int) -> None:
+        if source not in self._selector.get_map():  # removed since it became ready
+            return
+        try:
+            packet = os.read(source, _LARGEST_PACKET)
+        except BlockingIOError:
+            return
+        except OSError:  # its device is gone
+            self._drop(source)
+            return
+        if way.cut or (way.loss and self._chance.random() < way.loss):
+            return
+        if way.delay:
+            self._count += 1
+            heapq.heappush(self._late, (time.monotonic() + way.delay, self._count, target, packet))
+        else:
+            self._write(target, packet)
+
+    def _drop(self, descriptor: int) -> None:
+        with contextlib.suppress(KeyError, ValueError, OSError):
+            self._selector.unregister(descriptor)
+
+    @staticmethod
+    def _write(target: int, packet: bytes) -> None:
+        with contextlib.suppress(OSError):  # a full queue drops packets, as a switch does; a device may be gone
+            os.write(target, packet)
+
+
+class Network:
+    """A switch with hosts; this machine itself is at `gateway`. A context manager that leaves nothing behind.
+
+    Args:
+        folder: new, for logs and the hosts' disks.
+        prefix: of the first three numbers of all addresses.
+        name: of the switch; names of devices begin with it.
+    """
+
+    def __init__(self, folder: Path, prefix: str = "10.77.84", name: str = "sgsst4") -> None:
+        self.folder, self.prefix, self.name = folder, prefix, name
+        self.carrier = Carrier()
+        self.hosts: dict[str, Host] = {}
+
+    @property
+    def gateway(self) -> str:
+        """Address of this machine."""
+        return f"{self.prefix}.1"
+
+    def __enter__(self) -> Network:
+        _ip("link", "add", self.name, "type", "bridge")
+        _ip("link", "set", self.name, "up")
+        _ip("address", "add", f"{self.gateway}/24", "dev", self.name)
+        self.carrier.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for host in self.hosts.values():
+            host.kill()
+        self.carrier.end()
+        _ip("link", "delete", self.name, check=False)
+
+    def host(self, name: str, number: int, disk_bytes: int = 1 << 30) -> Host:
+        """A new host, which runs."""
+        host = Host(self, name, f"{self.prefix}.{number}", disk_bytes)
+        self.hosts[name] = host
+        host.start()
+        return host
+
+
+class Host:
+    """A host: what it runs (`run`) is started again whenever it ends, until the host is killed.
+
+    Attributes:
+        disk: its own, in memory: empty after each start.
+        log: what its services say, over all its lives.
+    """
+
+    def __init__(self, network: Network, name: str, address: str, disk_bytes: int) -> None:
+        self.network, self.name, self.address = network, name, address
+        self.cable = Cable()
+        self.disk = network.folder / "disk"
+        self.log = network.folder / f"{name}.log"
+        self._disk_bytes = disk_bytes
+        self._space = f"{network.name}-{name}"
+        self._descriptors: tuple[int, ...] = ()
+        self._first: subprocess.Popen[bytes] | None = None
+        self._services: list[subprocess.Popen[bytes]] = []
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has been started and not killed."""
+        return self._first is not None
+
+    def start(self) -> None:
+        """Switch it on: nothing runs on it yet, its disk is empty."""
+        self.disk.mkdir(parents=True, exist_ok=True)
+        _ip("netns", "add", self._space)
+        self._plug_in()
+        made = f"hostname {self.name}; mount -t tmpfs -o size={self._disk_bytes} tmpfs {self.disk}; exec sleep infinity"
+        command = ["ip", "netns", "exec", self._space, "unshare", "--uts", "--pid", "--mount", "--fork", "--mount-proc"]
+        with self.log.open("ab") as log:
+            self._first = subprocess.Popen([*command, "--kill-child", "bash", "-c", made], stdout=log, stderr=log)
+        deadline = time.monotonic() + 20
+        while self.call("mountpoint", "-q", str(self.disk)).returncode:
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"host {self.name} did not start: {self.log.read_text()}")
+            time.sleep(0.05)
+
+    def kill(self) -> None:
+        """Off: all its processes at once, and its disk."""
+        if self._first is None:
+            return
+        self._first.send_signal(signal.SIGKILL)
+        self._first.wait()
+        for process in self._services:
+            process.kill()
+            process.wait()
+        self._first, self._services = None, []
+        self.network.carrier.remove(*self._descriptors)
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._descriptors = ()
+        self.cable.mend()
+        _ip("netns", "delete", self._space, check=False)
+
+    def call(self, *command: str) -> subprocess.CompletedProcess[bytes]:
+        """A command on it, waited for."""
+        return subprocess.run([*self._enter(), *command], capture_output=True, check=False)
+
+    def run(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        """A service on it: started again a second after it has ended, as a supervisor of services does."""
+        again = 'while true; do "$@"; sleep 1; done'
+        with self.log.open("ab") as log:
+            self._services.append(
+                subprocess.Popen(
+                    [*self._enter(), "bash", "-c", again, "supervisor", *command],
+                    env={**os.environ, **environment},
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    start_new_session=True,
+                )
+            )
+
+    def _enter(self) -> list[str]:
+        """What a command on this machine begins with, to run on the host."""
+        assert self._first is not None
+        children = Path(f"/proc/{self._first.pid}/task/{self._first.pid}/children")
+        deadline = time.monotonic() + 10
+        while not (found := children.read_text().split()) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        return ["nsenter", "-t", found[0], "-n", "-u", "-p", "-m", f"--wd={Path.cwd()}"]
+
+    def _plug_in(self) -> None:
+        """Lay the cable: a device in the host's network, and one at the switch."""
+        own, other = f"{self._space}-h"[:15], f"{self._space}-s"[:15]
+        host, switch = _tap(own), _tap(other)
+        self._descriptors = (host, switch)
+        _ip("link", "set", other, "master", self.network.name, "up")
+        _ip("link", "set", own, "netns", self._space, "name", "eth0")
+        inside = ("-n", self._space)
+        _ip(*inside, "link", "set", "lo", "up")
+        _ip(*inside, "link", "set", "eth0", "up")
+        _ip(*inside, "address", "add", f"{self.address}/24", "dev", "eth0")
+        _ip(*inside, "route", "add", "default", "via", self.network.gateway)
+        self.network.carrier.add(host, self.cable.from_host, switch)
+        self.network.carrier.add(switch, self.cable.to_host, host)
+
+
+def _tap(name: str) -> int:
+    """Descriptor of a new TAP device, which goes when it is closed."""
+    descriptor = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack("16sH", name.encode(), _TAP_WITHOUT_HEADER))
+    return descriptor
+
+
+def _ip(*arguments: str, check: bool = True) -> None:
+    subprocess.run(["ip", *arguments], check=check, capture_output=not check)
