@@ -29,7 +29,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -429,7 +429,7 @@ def main() -> None:
         raise SystemExit(reason)
     folder = Path(tempfile.mkdtemp(prefix="sgsst-c-", dir="/tmp"))
     try:
-        figures = measure(folder, arguments)
+        figures = measure(folder, arguments.kinds, arguments.faults, arguments.seconds, arguments.seed)
     finally:
         if arguments.logs:
             arguments.logs.mkdir(parents=True, exist_ok=True)
@@ -442,8 +442,10 @@ def main() -> None:
     sys.exit(1 if figures["lost"] or figures["published_twice"] or figures["different"] else 0)
 
 
-def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """All figures."""
+def measure(
+    folder: Path, kinds: Sequence[str], faults: int, seconds: float | None = None, seed: int = 0
+) -> dict[str, Any]:
+    """All figures of so many faults, or of those that began in so many seconds, in a folder with a short name."""
     folder.chmod(0o755)
     for name in ("inputs", "weights", "net"):
         (folder / name).mkdir()
@@ -454,13 +456,11 @@ def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     with Network(folder / "net") as network:
         cluster = Cluster(network, folder / "weights")
         cluster.start()
-        run = Run(cluster, files, random.Random(arguments.seed))
+        run = Run(cluster, files, random.Random(seed))
         reader = threading.Thread(target=run.watch_reads)
         reader.start()
         try:
-            started = time.monotonic()
-            attack(run, arguments, started)
-            attacked = time.monotonic() - started
+            attacked = attack(run, kinds, faults, seconds)
             found = run.wait_for_all()
         finally:
             run.over.set()
@@ -468,25 +468,32 @@ def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
         return {"attacked_seconds": round(attacked, 1), **_count(run, found, expected, folder), **_left(run, found)}
 
 
-def attack(run: Run, arguments: argparse.Namespace, started: float) -> None:
-    """Kinds in turns, each round in another order."""
-    kinds: list[str] = []
-    while len(run.faults) < arguments.faults:
-        if arguments.seconds and time.monotonic() - started > arguments.seconds:
-            return
-        if not kinds:
-            kinds = list(arguments.kinds)
-            run.chance.shuffle(kinds)
-        run.strike(kinds.pop())
+def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> float:
+    """Kinds in turns, each round in another order; returns the seconds that it took."""
+    started = time.monotonic()
+    order: list[str] = []
+    while len(run.faults) < faults and (limit is None or time.monotonic() - started < limit):
+        if not order:
+            order = list(kinds)
+            run.chance.shuffle(order)
+        run.strike(order.pop())
+    return time.monotonic() - started
 
 
 def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
+    """What `sgsst stylize` makes of the files on one rank, with the network that the cluster has."""
+    installed = os.environ.get("SGSST_CACHE")
     os.environ["SGSST_CACHE"] = str(folder / "weights")
-    found = {}
-    for seed in SEEDS:
-        (folder / f"expected_{seed}").mkdir()
-        found[seed] = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{seed}")
-    return found
+    try:
+        found = {}
+        for seed in SEEDS:
+            (folder / f"expected_{seed}").mkdir()
+            found[seed] = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{seed}")
+        return found
+    finally:
+        os.environ.pop("SGSST_CACHE")
+        if installed is not None:
+            os.environ["SGSST_CACHE"] = installed
 
 
 def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:

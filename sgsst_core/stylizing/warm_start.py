@@ -16,6 +16,7 @@ from torch import Tensor
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 from sgsst_core.scene.luminance import luminance
+from sgsst_core.scene.screen import on_screen
 
 #: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
 #: could be stretched to the style's: it is left flat instead of blowing rounding up.
@@ -37,7 +38,7 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> 
     mean, covariance = _moments(colours, weights.double() / weights.double().amax())
     wanted_mean, wanted = _style_moments(StyleMixture.of(style))
     matched = (colours - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
-    return ((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype)
+    return on_screen(((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype))
 
 
 def in_colours_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
