@@ -25,7 +25,7 @@ _JOB = select(_JOBS).where(_JOBS.c.id == bindparam("job_id"))
 _ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
 # Names of previews sort by their steps.
 _NEWEST_PREVIEWS = (
-    select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name))
+    select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name).label("newest"))
     .where(_ARTIFACTS.c.job_id.in_(bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
     .group_by(_ARTIFACTS.c.job_id)
 )
@@ -303,7 +303,7 @@ def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: boo
 
 def _newest_previews(connection: Connection, job_ids: Sequence[str]) -> dict[str, str]:
     rows = connection.execute(_NEWEST_PREVIEWS, {"ids": list(job_ids)}) if job_ids else ()
-    return {job_id: name for job_id, name in rows}
+    return {row.job_id: row.newest for row in rows}
 
 
 def _queue_position(connection: Connection, job: JobRow) -> int | None:
