@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from service.errors import ConflictError, NotFoundError, QueueFullError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
-from service.store.history import points
+from service.store.history import Point, points
 from service.store.leases import Published
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
-from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow, ProgressPointRow
+from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
 _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
     Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
@@ -251,10 +251,10 @@ class Jobs:
                 session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **made))
         return unused
 
-    def course(self, job: JobRow, most: int) -> list[ProgressPointRow]:
+    def course(self, job: JobRow, most: int) -> list[Point]:
         """The course of a job's loss from its first step to its present one, in `most` points or fewer."""
-        with self._database.reading() as session:
-            return points(session, job.id, job.progress, most)
+        with self._database.reading_rows() as connection:
+            return points(connection, job.id, job.progress, most)
 
     def previews(self, job_ids: Sequence[str]) -> dict[str, str]:
         """The name of the newest picture of each job; jobs without one are left out."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from sgsst_core.constants import SH_C0
 from sgsst_core.errors import OutputError
 from sgsst_core.files import colours
 from sgsst_core.files.colours import write_colours
-from sgsst_core.scene.spherical_harmonics import SH_C0
 
 
 def test_colours_come_back_within_their_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
