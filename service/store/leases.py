@@ -11,15 +11,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, and_, case, delete, func, or_, select, update
+from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, upsert
+from service.store.queue import expired, mine, next_job, queued_now, reserve
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
-from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, TurnRow
+from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, ReservationRow, TurnRow
 from sgsst_core.errors import InfrastructureError
 
 #: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
@@ -76,15 +77,19 @@ class Leases:
         Jobs whose lease has run out come with the queued ones. One that has used up its attempts ends as failed
         here, one that was being canceled as canceled, and the next is looked at.
 
+        A job that there is no room for is reserved: this dispatcher takes no other one of its priority until it fits,
+        so that smaller jobs do not overtake it for ever. Other dispatchers take it where it fits them first, and pass
+        it over where it does not: one big job holds up one of them and not all.
+
         Args:
             dispatcher: its name.
-            fits: whether there is room for the job. It is asked for the next one only: smaller jobs do not
-                overtake a big one for ever.
+            fits: whether there is room for a job.
         """
+        passed: list[str] = []
         while True:
             now = self._database.clock()
             with self._database.writing() as session:
-                job = session.scalar(self._next(now))
+                job = next_job(session, dispatcher, now, passed)
                 if job is None:
                     return None
                 lost = job.status in ACTIVE
@@ -94,20 +99,19 @@ class Leases:
                     return self._lease(session, job, dispatcher, now)
                 if lost:  # else the same loss would count again the next time that somebody looks
                     self._requeue(session, job, now, now)
-                return None
+                if reserve(session, job.id, dispatcher, now, self._seconds):
+                    return None
+                passed.append(job.id)
 
-    def waiting(self) -> int:
-        """How many jobs could be leased now."""
-        with self._database.reading() as session:
-            query = select(func.count()).select_from(JobRow).where(_ready(self._database.clock()))
-            return session.scalar(query) or 0
-
-    @staticmethod
-    def _next(now: float) -> Select[JobRow]:
-        turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
-        query = select(JobRow).outerjoin(TurnRow, TurnRow.owner == JobRow.owner).where(_ready(now))
-        order = (JobRow.priority.desc(), turn, JobRow.queued_at, JobRow.id)
-        return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
+    def waiting(self, most: int = 1_000_000) -> int:
+        """How many jobs could be leased now; more than `most` are not counted."""
+        now = self._database.clock()
+        found = 0
+        with self._database.reading_rows() as connection:
+            for condition in (queued_now(now), expired(now)):
+                some = select(JobRow.id).where(condition).limit(most - found).subquery()
+                found += connection.execute(select(func.count()).select_from(some)).scalar_one()
+        return found
 
     def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
         job.attempt += 1
@@ -117,6 +121,7 @@ class Leases:
         attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
         attempt.started_at = now
         session.add(attempt)
+        session.execute(delete(ReservationRow).where(or_(mine(dispatcher), ReservationRow.job_id == job.id)))
         served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
@@ -304,13 +309,6 @@ class Leases:
         job.not_before = not_before
         job.lease_owner = job.lease_expires_at = None
         move(session, job, Transition.REQUEUE, now)
-
-
-def _ready(now: float) -> ColumnElement[bool]:
-    """Queued and to be started, or held by a dispatcher that was not heard of again."""
-    queued = and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= now)
-    expired = and_(JobRow.status.in_(ACTIVE), JobRow.lease_expires_at < now)
-    return or_(queued, expired)
 
 
 def _is_held(job: JobRow, lease: Lease) -> bool:

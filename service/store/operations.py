@@ -43,6 +43,13 @@ class Operations:
             query = select(DispatcherRow).where(DispatcherRow.seen_at >= since).order_by(DispatcherRow.name)
             return list(session.scalars(query))
 
+    def alive(self) -> int:
+        """How many dispatchers are alive."""
+        since = self._database.clock() - self._lease_seconds
+        with self._database.reading_rows() as connection:
+            query = select(func.count()).select_from(DispatcherRow).where(DispatcherRow.seen_at >= since)
+            return connection.execute(query).scalar_one()
+
     def counters(self) -> list[tuple[str, str, float]]:
         """Name, labels and value of every counter."""
         with self._database.reading() as session:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false
+from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 #: SQLite counts rows up by itself only for INTEGER, PostgreSQL needs BIGINT to count far enough.
@@ -63,6 +63,9 @@ class JobRow(Base):
 
     __table_args__ = (
         Index("ix_jobs_queue", "status", "priority", "queued_at", "id"),  # a place in the queue is counted in it alone
+        # the first job of each owner is found in it without looking at the others (`service.store.queue`)
+        Index("ix_jobs_turns", "status", "owner", text("priority DESC"), "queued_at", "id"),
+        Index("ix_jobs_lease_expires_at", "lease_expires_at"),
         Index("ix_jobs_owner_id", "owner", "id"),
         Index("ix_jobs_owner_status", "owner", "status", "id"),
         Index("ix_jobs_expires_at", "expires_at"),
@@ -103,6 +106,16 @@ class TurnRow(Base):
 
     owner: Mapped[str] = mapped_column(String(40), primary_key=True)
     served: Mapped[int] = mapped_column(Sequence)
+
+
+class ReservationRow(Base):
+    """A queued job that a dispatcher keeps its room for, until the moment `until` unless it asks again."""
+
+    __tablename__ = "reservations"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    dispatcher: Mapped[str] = mapped_column(String(120))
+    until: Mapped[float] = mapped_column(Float)
 
 
 class EventRow(Base):
