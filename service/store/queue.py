@@ -14,6 +14,7 @@ from typing import Any
 from sqlalchemy import (
     BindParameter,
     ColumnElement,
+    CompoundSelect,
     Float,
     Select,
     String,
@@ -59,23 +60,35 @@ def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str
     Args:
         passed: jobs that are not to be looked at.
     """
-    return session.scalar(_next_query(), {"dispatcher": dispatcher, "now": now, "passed": list(passed)})
+    told = {"dispatcher": dispatcher, "now": now, "passed": list(passed)}
+    candidates = [found for found in session.scalars(_candidates(), told) if found is not None]
+    if not candidates:
+        return None
+    # as a statement of its own: within one, PostgreSQL expects more candidates than there are, and reads all jobs
+    return session.scalar(_first(), {"dispatcher": dispatcher, "now": now, "candidates": candidates})
 
 
 @cache
-def _next_query() -> Select[JobRow]:
+def _candidates() -> Select[Any] | CompoundSelect[Any]:
+    """Ids of the jobs that may be next."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     passed = bindparam("passed", type_=String, expanding=True)
     lost = select(JobRow.id).where(expired(now), JobRow.id.not_in(passed))
     reserved = select(ReservationRow.job_id).where(mine(dispatcher), ReservationRow.job_id.not_in(passed))
-    candidates = union_all(_first_of_each_owner(now, passed), lost, reserved).cte("candidates")
+    return union_all(_first_of_each_owner(now, passed), lost, reserved)
+
+
+@cache
+def _first() -> Select[JobRow]:
+    """The first of them."""
+    dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
     kept = case((mine(dispatcher), 0), else_=1)
     query = (
         select(JobRow)
-        .join(candidates, candidates.c.id == JobRow.id)
         .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
         .outerjoin(ReservationRow, ReservationRow.job_id == JobRow.id)
+        .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)))
         # once more, for a row that somebody else has changed since it was found
         .where(or_(queued_now(now), expired(now)))
     )

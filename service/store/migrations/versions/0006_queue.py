@@ -19,7 +19,7 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(["job_id"], ["jobs.id"], name=op.f("fk_reservations_job_id"), ondelete="CASCADE"),
         sa.PrimaryKeyConstraint("job_id", name=op.f("pk_reservations")),
     )
-    turns = ["status", "owner", sa.text("priority DESC"), "queued_at", "id"]
+    turns: list[str | sa.TextClause] = ["status", "owner", sa.text("priority DESC"), "queued_at", "id"]
     op.create_index("ix_jobs_turns", "jobs", turns, unique=False)
     op.create_index("ix_jobs_lease_expires_at", "jobs", ["lease_expires_at"], unique=False)
 
