@@ -160,11 +160,12 @@ class Leases:
             return sorted({str(owner) for owner in session.scalars(query)})
 
     def run_out(self, dispatcher: str) -> None:
-        """Let the leases of a dispatcher run out now: it is known to be dead."""
+        """Let the leases of a dispatcher run out now, and its reservation: it is known to be dead."""
         now = self._database.clock()
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=now - 1e-3))
+            session.execute(delete(ReservationRow).where(mine(dispatcher)))
 
     # --- while the job runs ----------------------------------------------------------------------------------------
 
