@@ -19,6 +19,7 @@ from api.http.documentation import complete
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
+from api.http.rates import Rates
 from api.http.routes import artifacts, events, jobs, operations, uploads
 from api.http.schemas import ANSWERS
 from api.http.submission import JobFromUploads
@@ -57,6 +58,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             packer=Packer(settings, store, blobs, results),
             hub=Hub(store),
             metrics=Metrics(store),
+            rates=Rates(),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS

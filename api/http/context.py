@@ -13,6 +13,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from api.http.hub import Hub
 from api.http.metrics import Metrics
+from api.http.rates import Rates
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
@@ -20,6 +21,7 @@ from service.inspection.inspector import Inspector
 from service.inspection.packer import Packer
 from service.settings import ServiceSettings
 from service.store import Store
+from service.store.quotas import NO_QUOTAS, Quotas
 
 #: Who owns what is created without a key, where no key is needed.
 LOCAL_OWNER = "local"
@@ -50,6 +52,7 @@ class Context:
     packer: Packer
     hub: Hub
     metrics: Metrics
+    rates: Rates
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class Caller:
 
     owner: str
     priority: int
+    quotas: Quotas = NO_QUOTAS
 
 
 async def get_context(request: Request) -> Context:
@@ -78,12 +82,15 @@ async def get_caller(
     Raises:
         NoKeyError: a key is needed and missing, or it is no good.
         ForeignSiteError: no key, and the request comes from a web page that this service did not serve.
+        RateLimitError: requests with this key come too fast.
     """
     if given is not None:
         key = await asyncio.to_thread(context.store.keys.find, given.credentials)
         if key is None:
             raise NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one.")
-        return Caller(key.id, key.priority)
+        quotas = Quotas.of_settings(context.settings).with_own(key.quotas)
+        context.rates.take(key.id, quotas.requests_a_second)
+        return Caller(key.id, key.priority, quotas)
     if request.headers.get("authorization") is not None:
         raise NoKeyError("The Authorization header must have the form 'Bearer KEY'.")
     if context.settings.keys_required:

@@ -18,6 +18,7 @@ from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, upsert
 from service.store.queue import expired, mine, next_job, queued_now, reserve
+from service.store.quotas import count_gpu_seconds
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, ReservationRow, TurnRow
@@ -166,6 +167,15 @@ class Leases:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=now - 1e-3))
             session.execute(delete(ReservationRow).where(mine(dispatcher)))
+
+    def hold_gpus(self, lease: Lease, gpus: int) -> None:
+        """From now on the attempt holds so many GPUs; what it held until now is counted for the job's owner."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            attempt = session.get_one(AttemptRow, (job.id, job.attempt))
+            _count_gpus(session, job, attempt, now)
+            attempt.gpus, attempt.gpus_since = gpus, now
 
     # --- while the job runs ----------------------------------------------------------------------------------------
 
@@ -345,12 +355,17 @@ def _outages(session: Session, job: JobRow) -> int:
     return count
 
 
+def _count_gpus(session: Session, job: JobRow, attempt: AttemptRow, now: float) -> None:
+    if attempt.gpus and attempt.gpus_since is not None:
+        count_gpu_seconds(session, job.owner, attempt.gpus * max(0.0, now - attempt.gpus_since), now)
+
+
 def _close_attempt(
     session: Session, job: JobRow, outcome: AttemptOutcome, error: dict[str, Any] | None, now: float
 ) -> None:
-    session.execute(
-        update(AttemptRow)
-        .where(AttemptRow.job_id == job.id, AttemptRow.number == job.attempt)
-        .values(finished_at=now, outcome=outcome, error=error)
-    )
+    attempt = session.get(AttemptRow, (job.id, job.attempt))
+    if attempt is not None:
+        attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
+        if outcome != AttemptOutcome.LOST:  # nobody knows how long it has worked, and that was not its owner's doing
+            _count_gpus(session, job, attempt, now)
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

@@ -74,7 +74,10 @@ class JobRow(Base):
 
 
 class AttemptRow(Base):
-    """One lease of a job, and how it ended; `outcome` is None while it runs."""
+    """One lease of a job, and how it ended; `outcome` is None while it runs.
+
+    `gpus` are those that it holds `gpus_since` then; what it held before has been counted for its owner (`UsageRow`).
+    """
 
     __tablename__ = "attempts"
 
@@ -85,6 +88,8 @@ class AttemptRow(Base):
     started_at: Mapped[float] = mapped_column(Float)
     finished_at: Mapped[float | None] = mapped_column(Float)
     outcome: Mapped[str | None] = mapped_column(String(20))
+    gpus: Mapped[int] = mapped_column(Integer, default=0, server_default=text("0"))
+    gpus_since: Mapped[float | None] = mapped_column(Float)
     error: Mapped[dict[str, Any] | None]
 
 
@@ -203,6 +208,18 @@ class KeyRow(Base):
     priority: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[float] = mapped_column(Float)
     revoked_at: Mapped[float | None] = mapped_column(Float)
+    quotas: Mapped[dict[str, Any] | None]
+
+
+class UsageRow(Base):
+    """What an owner has used on a day, which is a number of days since 1970 (UTC)."""
+
+    __tablename__ = "usage"
+
+    owner: Mapped[str] = mapped_column(String(40), primary_key=True)
+    day: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    jobs: Mapped[int] = mapped_column(Integer, default=0)
+    gpu_seconds: Mapped[float] = mapped_column(Float, default=0.0)
 
 
 class IdempotencyRow(Base):
