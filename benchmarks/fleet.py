@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
 from dataclasses import asdict
@@ -27,16 +28,23 @@ _MEMORY = Path("/dev/shm")
 _GPUS_EACH = 8
 
 
-def simulate(demand: Demand, hours: float, host_days: float, seed: int) -> dict[str, Any]:
-    """Figures of a fleet of hosts of eight GPUs; the first sixth of the hours fills it."""
+def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience: float = math.inf) -> dict[str, Any]:
+    """Figures of a fleet of hosts of eight GPUs; the first quarter of the hours fills it."""
     seconds = hours * 3600
     started = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=_MEMORY if _MEMORY.is_dir() else None, prefix="sgsst-fleet-") as folder:
         fleet = Fleet(Path(folder), max(demand.gpus // _GPUS_EACH, 1), _GPUS_EACH, host_days, seed)
-        fleet.run(demand.jobs(hours, seed), seconds, seconds / 6)
-        found = figures(fleet, seconds, seconds / 6)
+        warm_up = seconds / 4
+        seconds = fleet.run(demand.jobs(hours, seed), seconds, warm_up, patience)
+        found = figures(fleet, seconds, warm_up)
         fleet.store.close()
-    told = {"hours": hours, "host_days": host_days, "seed": seed, **asdict(demand)}
+    told = {
+        "hours": hours,
+        "simulated_hours": round(seconds / 3600, 2),
+        "host_days": host_days,
+        "seed": seed,
+        **asdict(demand),
+    }
     statements = {what: round(count / fleet.calls[what], 1) for what, count in sorted(fleet.statements.items()) if what}
     calls = {what: round(count / seconds, 3) for what, count in sorted(fleet.calls.items())}
     took = {"simulated_in_seconds": round(time.perf_counter() - started)}
@@ -57,6 +65,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=6.0)
     parser.add_argument("--load", type=float, default=0.9, help="GPU seconds asked for, over those that there are")
     parser.add_argument("--host-days", type=float, default=30.0, help="mean days between failures of a host")
+    parser.add_argument("--patience", type=float, default=math.inf, help="seconds to simulate for, at most")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--name", default="usual", help="of the run, among those that are stored")
     parser.add_argument("--database", action="store_true", help="measure PostgreSQL instead")
@@ -69,7 +78,7 @@ def main() -> None:
         found = stored["database"] = measure(arguments.queued, arguments.gpus, arguments.gpus // _GPUS_EACH)
     else:
         demand = Demand(arguments.gpus, arguments.load)
-        found = simulate(demand, arguments.hours, arguments.host_days, arguments.seed)
+        found = simulate(demand, arguments.hours, arguments.host_days, arguments.seed, arguments.patience)
         stored["simulated"] = stored.get("simulated", {}) | {arguments.name: found}
     print(json.dumps(found, indent=1))
     print(write_result("fleet", stored))

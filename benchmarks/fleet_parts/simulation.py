@@ -9,7 +9,9 @@ would have; the same goes for checkpoints, of which the last one before a failur
 from __future__ import annotations
 
 import heapq
+import math
 import random
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -136,18 +138,31 @@ class Fleet:
     def _count(self, *args: Any) -> None:
         self.statements[self._doing] += 1
 
-    def run(self, jobs: list[SimulatedJob], seconds: float, warm_up: float) -> None:
-        """Let the jobs come, and stop after so many seconds; GPU seconds before the warm-up's end do not count."""
+    def run(self, jobs: list[SimulatedJob], seconds: float, warm_up: float, patience: float = math.inf) -> float:
+        """Let the jobs come; GPU seconds before the warm-up's end do not count.
+
+        Args:
+            seconds: to simulate.
+            patience: seconds that this may take; what has been simulated by then has to do.
+
+        Returns:
+            Seconds that were simulated.
+        """
+        started = time.perf_counter()
         self._at(warm_up, self._forget_held)
         for job in jobs:
             self._at(job.at, lambda job=job: self._arrive(job))  # type: ignore[misc]
         for host in self.hosts:
             self._fail_some_day(host)
         while self._events and self._events[0][0] <= seconds:
+            if time.perf_counter() - started > patience:
+                seconds = self.now
+                break
             self.now, _, happen = heapq.heappop(self._events)
             happen()
         self.now = seconds
         self._account_all()
+        return seconds
 
     def _account_all(self) -> None:
         for host in self.hosts:

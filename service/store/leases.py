@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, upsert
-from service.store.queue import expired, mine, next_job, queued_now, reserve
+from service.store.queue import LOST, WAITING, mine, next_job, reserve
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
@@ -109,9 +109,8 @@ class Leases:
         now = self._database.clock()
         found = 0
         with self._database.reading_rows() as connection:
-            for condition in (queued_now(now), expired(now)):
-                some = select(JobRow.id).where(condition).limit(most - found).subquery()
-                found += connection.execute(select(func.count()).select_from(some)).scalar_one()
+            for query in (WAITING, LOST):
+                found += connection.execute(query, {"now": now, "most": most - found}).scalar_one()
         return found
 
     def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import secrets
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import bindparam, delete, func, select
 
 from service.store.database import Database, upsert
 from service.store.states import JobStatus
@@ -13,6 +13,7 @@ from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow,
 
 #: A dispatcher that was not heard of for so long is not coming back.
 _FORGET_SECONDS = 86_400.0
+_ALIVE = select(func.count()).select_from(DispatcherRow).where(DispatcherRow.seen_at >= bindparam("since"))
 
 
 class Operations:
@@ -47,8 +48,7 @@ class Operations:
         """How many dispatchers are alive."""
         since = self._database.clock() - self._lease_seconds
         with self._database.reading_rows() as connection:
-            query = select(func.count()).select_from(DispatcherRow).where(DispatcherRow.seen_at >= since)
-            return connection.execute(query).scalar_one()
+            return connection.execute(_ALIVE, {"since": since}).scalar_one()
 
     def counters(self) -> list[tuple[str, str, float]]:
         """Name, labels and value of every counter."""

@@ -16,6 +16,7 @@ from sqlalchemy import (
     ColumnElement,
     CompoundSelect,
     Float,
+    Integer,
     Select,
     String,
     and_,
@@ -45,6 +46,17 @@ def queued_now(now: float | BindParameter[float]) -> ColumnElement[bool]:
 def expired(now: float | BindParameter[float]) -> ColumnElement[bool]:
     """Held by a dispatcher that was not heard of again."""
     return and_(JobRow.lease_expires_at < now, JobRow.status.in_(ACTIVE))
+
+
+def _count(condition: ColumnElement[bool]) -> Select[int]:
+    some = select(JobRow.id).where(condition).limit(bindparam("most", type_=Integer)).subquery()
+    return select(func.count()).select_from(some)
+
+
+# Built once: building a query takes longer than answering it.
+_NOW: BindParameter[float] = bindparam("now", type_=Float)
+#: How many jobs are queued `now`, and how many are lost; at `most`.
+WAITING, LOST = _count(queued_now(_NOW)), _count(expired(_NOW))
 
 
 def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
-from sqlalchemy import bindparam, func, select, union
+from sqlalchemy import BindParameter, String, bindparam, func, select, union
 from sqlalchemy.orm import Session
 
 from service.errors import QuotaError
@@ -142,7 +142,7 @@ def stored_bytes(session: Session, owner: str) -> int:
     return sum(int(session.scalar(query, {"owner": owner}) or 0) for query in _STORED)
 
 
-_OWNER = bindparam("owner")
+_OWNER: BindParameter[str] = bindparam("owner", type_=String)
 _OF_JOBS = select(BlobUseRow.sha256).join(JobRow, BlobUseRow.holder == "job:" + JobRow.id).where(JobRow.owner == _OWNER)
 _OF_UPLOADS = select(UploadRow.sha256).where(UploadRow.owner == _OWNER, UploadRow.sha256.is_not(None))
 _STORED = (
