@@ -61,6 +61,18 @@ class QueueFullError(ServiceError):
     code, status = "queue-full", 429
 
 
+class QuotaError(ServiceError):
+    """This key has used up what it may use: `extra["quota"]`; there is more after `extra["retry_after"]` seconds."""
+
+    code, status = "quota-exceeded", 429
+
+
+class RateLimitError(ServiceError):
+    """This key sends requests faster than it may."""
+
+    code, status = "rate-limited", 429
+
+
 class NoSpaceError(ServiceError, InfrastructureError):
     """The disk is too full to take more in."""
 

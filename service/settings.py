@@ -28,6 +28,9 @@ class ServiceSettings(BaseSettings):
         max_image_pixels: of the style and of each photo.
         max_photos: files in one job.
         max_jobs_per_key: unfinished jobs of one key.
+        max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: quotas
+            of keys that have none of their own (`service.store.quotas`); None for no bound.
+        max_connections: to one process of the API at the same time, watchers included.
         min_free_bytes: nothing is taken in once the disk has less left.
         inspection_seconds, inspection_bytes: what checking a job's files may take, processor time and memory; their
             size adds to both (`service.inspection.inspector`).
@@ -66,6 +69,11 @@ class ServiceSettings(BaseSettings):
     max_image_pixels: int = Field(100_000_000, gt=0)
     max_photos: int = Field(2_000, gt=0)
     max_jobs_per_key: int = Field(100, gt=0)
+    max_jobs_a_day_per_key: int | None = Field(None, ge=0)
+    max_gpu_seconds_a_day_per_key: float | None = Field(None, ge=0)
+    max_bytes_per_key: int | None = Field(None, ge=0)
+    max_requests_a_second_per_key: float | None = Field(None, gt=0)
+    max_connections: int = Field(10_000, gt=0)
     min_free_bytes: int = Field(2 * GB, ge=0)
     file_cache_bytes: int = Field(50 * GB, ge=0)
     inspection_seconds: float = Field(120, gt=0)

@@ -46,11 +46,18 @@ def serve(
 def create_key(
     name: Annotated[str, typer.Argument(help="Whose it is, for people.", show_default=False)],
     priority: Annotated[int, typer.Option(help="Jobs of a higher one go first.")] = 0,
+    jobs_a_day: Annotated[int | None, typer.Option(min=0, help="Quota. [the service's]")] = None,
+    gpu_seconds_a_day: Annotated[float | None, typer.Option(min=0, help="Quota. [the service's]")] = None,
+    stored_bytes: Annotated[int | None, typer.Option(min=0, help="Quota. [the service's]")] = None,
+    requests_a_second: Annotated[float | None, typer.Option(min=0.001, help="Quota. [the service's]")] = None,
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make an API key and print it; it is stored as a digest only, and cannot be shown again."""
-    row, text = _open_store(data).keys.create(name, priority)
+    from service.store.quotas import Quotas
+
+    quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
+    row, text = _open_store(data).keys.create(name, priority, quotas)
     if as_json:
         out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
         return

@@ -18,6 +18,7 @@ from api.http.documentation import complete
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
+from api.http.rates import Rates
 from api.http.routes import artifacts, events, inputs, jobs, operations, session, uploads
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
@@ -59,6 +60,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             hub=Hub(store),
             metrics=Metrics(store),
             sign_ins=SignIns(),
+            rates=Rates(),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS

@@ -10,7 +10,7 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from api.http.problems import HeadTooLargeError, MalformedRequestError, from_service
+from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
 from service.errors import ServiceError
 
 #: Bytes of a request's line and headers, counted in the pieces in which they come.
@@ -22,9 +22,11 @@ class Connection(HttpToolsProtocol):
 
     Attributes:
         head_seconds: from the connection, or a head's first byte, to the head's end.
+        most: connections of this process at the same time; a further one is told to come back.
     """
 
     head_seconds = 60.0
+    most = 10_000
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -34,6 +36,10 @@ class Connection(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """The time of the first head begins."""
         super().connection_made(transport)
+        if len(self.connections) > self.most:
+            error = f"There are {self.most:,} connections already. Try again later."
+            self._refuse(TooManyConnectionsError(error, retry_after=5))
+            return
         self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:

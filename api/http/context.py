@@ -19,6 +19,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 
 from api.http.hub import Hub
 from api.http.metrics import Metrics
+from api.http.rates import Rates
 from api.http.sign_ins import SignIns
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
@@ -27,6 +28,8 @@ from service.inspection.inspector import Inspector
 from service.inspection.packer import Packer
 from service.settings import ServiceSettings
 from service.store import Store
+from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.tables import KeyRow
 
 #: Who owns what is created without a key, where no key is needed.
 LOCAL_OWNER = "local"
@@ -68,6 +71,7 @@ class Context:
     hub: Hub
     metrics: Metrics
     sign_ins: SignIns
+    rates: Rates
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,7 @@ class Caller:
 
     owner: str
     priority: int
+    quotas: Quotas = NO_QUOTAS
 
 
 async def get_context(request: Request) -> Context:
@@ -108,25 +113,33 @@ async def get_caller(
         NoKeyError: a key is needed and missing, or it is no good.
         CrossOriginError: the session is good, but it is no page of this service that asks for a change.
         ForeignSiteError: no key, and the request comes from a web page that this service did not serve.
+        RateLimitError: requests with this key come too fast.
     """
     if given is not None:
         key = await asyncio.to_thread(context.store.keys.find, given.credentials)
         if key is None:
             raise NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one.")
-        return Caller(key.id, key.priority)
+        return _caller(context, key)
     if request.headers.get("authorization") is not None:
         raise NoKeyError("The Authorization header must have the form 'Bearer KEY'.")
     key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
     if key is not None:
         if request.method not in _READING:
             check_origin(request)
-        return Caller(key.id, key.priority)
+        return _caller(context, key)
     if context.settings.keys_required:
         if cookie:
             raise NoKeyError("The session is over. Sign in again with an API key.")
         raise NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'.")
     _check_site(request, context.settings)
     return Caller(LOCAL_OWNER, 0)
+
+
+def _caller(context: Context, key: KeyRow) -> Caller:
+    """The holder of a key, after counting a request of theirs."""
+    quotas = Quotas.of_settings(context.settings).with_own(key.quotas)
+    context.rates.take(key.id, quotas.requests_a_second)
+    return Caller(key.id, key.priority, quotas)
 
 
 CallerDep = Annotated[Caller, Depends(get_caller)]

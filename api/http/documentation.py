@@ -17,10 +17,11 @@ from api.http.problems import (
     HeadTooLargeError,
     InternalError,
     MalformedRequestError,
+    TooManyConnectionsError,
     from_service,
 )
 from api.http.schemas import JOB_ID, SHA256
-from service.errors import RefusedInputError, ServiceError
+from service.errors import RateLimitError, RefusedInputError, ServiceError
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -79,8 +80,15 @@ _ANYWHERE: tuple[ServiceError, ...] = (
     MalformedRequestError("The request is not HTTP as it should be: its first line, a header or a chunk is wrong."),
     HeadTooLargeError("The request's line and headers have more than 131,072 bytes."),
     InternalError(),
+    TooManyConnectionsError("There are 10,000 connections already. Try again later.", retry_after=5),
 )
 _WITH_KEY: tuple[ServiceError, ...] = (
+    RateLimitError(
+        "This key may send 20 requests a second on average. Wait, and ask less often: jobs tell of themselves by "
+        "events.",
+        limit=20,
+        retry_after=1,
+    ),
     NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'."),
     ForeignSiteError("Pages of 'https://example.com' may not use this service without an API key."),
     CrossOriginError("Pages of 'https://example.com' may not use the sessions of this service."),

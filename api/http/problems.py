@@ -63,6 +63,12 @@ class HeadTooLargeError(ServiceError):
     code, status = "head-too-large", 431
 
 
+class TooManyConnectionsError(ServiceError):
+    """As many connections as this process takes; said by `api.http.connection`, below the app."""
+
+    code, status = "too-many-connections", 503
+
+
 class InternalError(ServiceError):
     """A fault of the service itself."""
 

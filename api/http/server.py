@@ -32,6 +32,7 @@ def main() -> None:
     # algorithm on, by which every answer waits 40 ms for the client's acknowledgement of its head
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None
     Connection.head_seconds = settings.receive_seconds
+    Connection.most = settings.max_connections
     config = uvicorn.Config(
         create_app(settings),
         http=Connection,

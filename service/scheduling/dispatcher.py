@@ -128,9 +128,12 @@ class Dispatcher:
         Args:
             held: what running jobs have.
         """
-        if not (waiting := self._store.leases.waiting()):
+        if self._room.free(held) < 1:  # nothing is asked, and no row is locked that others want
             return None
-        share = -(-waiting // max(1, len(self._store.operations.dispatchers())))  # others take their part of the queue
+        dispatchers = max(1, self._store.operations.alive())
+        if not (waiting := self._store.leases.waiting(self._room.size * dispatchers)):
+            return None
+        share = -(-waiting // dispatchers)  # others take their part of the queue
         grant: Grant | None = None
 
         def fits(job: JobRow) -> bool:

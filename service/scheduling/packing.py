@@ -1,8 +1,9 @@
 """How jobs share a machine: what the next one gets of it, or that it has to wait. Decides, and does nothing.
 
-On GPUs a job has its GPUs to itself. One that names no number of `workers` is offered its part of those that are free:
-all of them where no other job waits, one where many do. The plan, made with measured times, then takes as many as make
-the job faster, and the rest are given back (see `service.scheduling.running`).
+On GPUs a job has its GPUs to itself. One that names no number of `workers` is offered its part of those that are free,
+all of them where no other job waits, one where many do, but never more than a job of its size is worth
+(`service.scheduling.job_size`). The plan, made with measured times, then takes as many as make the job faster, and the
+rest are given back (see `service.scheduling.running`).
 
 Without GPUs, places stand for parts of the processor and of the memory. There is one, unless the operator wants several
 jobs side by side: one job uses all cores well. A job that needs more memory than a place has takes several.
@@ -14,6 +15,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from service.scheduling.job_size import estimated_size
 from service.scheduling.machine import Machine
 from service.store.tables import JobRow
 
@@ -81,7 +83,7 @@ class Room:
             return None
         asked = _asked(job, "workers")
         if self._machine.gpus:
-            return self._on_gpus(asked, self._free_gpus(held), min(max(waiting, 1), places))
+            return self._on_gpus(job, asked, self._free_gpus(held), min(max(waiting, 1), places))
         return self._on_cores(job, asked or 1, places)
 
     def _free_gpus(self, held: list[Grant]) -> list[str]:
@@ -91,8 +93,12 @@ class Room:
     def _free_places(self, held: list[Grant]) -> int:
         return self._places - sum(grant.places for grant in held)
 
-    def _on_gpus(self, asked: int, free: list[str], sharers: int) -> Grant | None:
-        ranks = min(asked, len(self._machine.gpus)) if asked else max(1, len(free) // sharers)
+    def _on_gpus(self, job: JobRow, asked: int, free: list[str], sharers: int) -> Grant | None:
+        if asked:
+            ranks = min(asked, len(self._machine.gpus))
+        else:
+            share = max(1, len(free) // sharers)
+            ranks = estimated_size(job.parameters, job.inputs).gpus(share) if share > 1 else 1
         return Grant(ranks, tuple(free[:ranks])) if ranks <= len(free) else None
 
     def _on_cores(self, job: JobRow, ranks: int, free: int) -> Grant | None:

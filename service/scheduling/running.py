@@ -127,6 +127,7 @@ class RunningAttempt:
         except SettingsError as error:
             self._fail({"code": error.code, "message": str(error)}, permanent=True)
             return
+        self._count_gpus()
         self._stage(parameters)
         self._launch()
         last = self._watch()
@@ -256,11 +257,17 @@ class RunningAttempt:
         if message["kind"] in ("stage", "prepared", "progress"):
             self._pending = progress_record(message, self.lease.job.attempt)
 
+    def _count_gpus(self) -> None:
+        """What the attempt holds is counted for the job's owner."""
+        if self.grant.gpus:
+            self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
+
     def _give_back(self, gpus: list[str]) -> None:
         """Leave GPUs that the plan does without to other jobs; on a cluster it is only their number that counts."""
         left = len(self.grant.gpus) - len(gpus)
         kept = self.grant.gpus[:left] if self._cluster else tuple(x for x in self.grant.gpus if x not in gpus)
         self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
+        self._count_gpus()
         _log.info("needs %d GPUs and gives %d back", len(kept), len(gpus), extra=self._log_fields)
 
     def _write_progress(self, *, now: bool = False) -> None:

@@ -11,6 +11,7 @@ from service.store.jobs import Jobs
 from service.store.keys import Keys
 from service.store.leases import Leases
 from service.store.operations import Operations
+from service.store.quotas import Usage
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
 from service.store.sessions import Sessions
@@ -28,6 +29,7 @@ class Store:
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
         self.sessions = Sessions(self.database, settings.session_seconds)
+        self.usage = Usage(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)
 
     def close(self) -> None:

@@ -10,6 +10,7 @@ from sqlalchemy import bindparam, delete, exists, select, update
 
 from service.errors import ConflictError, NotFoundError
 from service.store.database import Database, idempotency_row, new_id, upsert
+from service.store.quotas import NO_QUOTAS, Quotas, check_bytes
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
@@ -90,9 +91,21 @@ class Inputs:
             return set(session.scalars(select(BlobRow.location)))
 
     def create_upload(
-        self, owner: str, length: int, filename: str, header: str, seconds: float, idempotency_key: str | None = None
+        self,
+        owner: str,
+        length: int,
+        filename: str,
+        header: str,
+        seconds: float,
+        idempotency_key: str | None = None,
+        quotas: Quotas = NO_QUOTAS,
     ) -> UploadRow:
-        """Begin an upload that expires when nothing has been heard of it for so many seconds."""
+        """Begin an upload that expires when nothing has been heard of it for so many seconds.
+
+        Raises:
+            IdempotencyError: the key was used for another upload.
+            QuotaError: its bytes would be too many for its owner.
+        """
         now = self._database.clock()
         with self._database.writing() as session:
             used_key = None
@@ -110,6 +123,8 @@ class Inputs:
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
             session.add(row)
+            session.flush()
+            check_bytes(session, owner, quotas)
             if used_key is not None:
                 used_key.created_id = row.id
         return row

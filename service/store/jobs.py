@@ -14,6 +14,7 @@ from service.store.changes import add_status_event, end, forget, holder_name, mo
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
 from service.store.leases import Published
+from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
@@ -84,6 +85,7 @@ class Jobs:
         new: NewJob,
         *,
         limit: int,
+        quotas: Quotas = NO_QUOTAS,
         idempotency: Idempotency | None = None,
     ) -> tuple[JobRow, bool]:
         """Queue a job; its blobs are held from now on.
@@ -94,6 +96,7 @@ class Jobs:
         Raises:
             IdempotencyError: the key was used for another request.
             QueueFullError: the owner has `limit` unfinished jobs.
+            QuotaError: it would exceed one of the owner's quotas.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -109,6 +112,7 @@ class Jobs:
                     f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.",
                     limit=limit,
                 )
+            count_job(session, new.owner, quotas, now)
             values = _row_of_new_job(new, now)
             session.execute(insert(_JOBS), values)
             job = JobRow(**values)
@@ -117,6 +121,7 @@ class Jobs:
             digests = sorted({entry["sha256"] for entry in new.inputs})
             uses = [{"holder": holder_name(job.id), "sha256": sha256} for sha256 in digests]
             session.execute(insert(_BLOB_USES), uses)
+            check_bytes(session, new.owner, quotas)
             add_status_event(session, job, now)
             count(session, "sgsst_jobs_submitted_total")
         return job, True

@@ -9,6 +9,7 @@ from sqlalchemy import bindparam, select
 
 from service.errors import NotFoundError
 from service.store.database import Database, new_id
+from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import Base, KeyRow
 
 #: What every key starts with, so that secret scanners can find one that got lost.
@@ -28,12 +29,17 @@ class Keys:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def create(self, name: str, priority: int = 0) -> tuple[KeyRow, str]:
-        """A new key, and the only copy of its text."""
+    def create(self, name: str, priority: int = 0, quotas: Quotas = NO_QUOTAS) -> tuple[KeyRow, str]:
+        """A new key, and the only copy of its text.
+
+        Args:
+            quotas: its own; for what they leave open, the service's hold.
+        """
         text = KEY_PREFIX + secrets.token_urlsafe(32)
         now = self._database.clock()
         with self._database.writing() as session:
             row = KeyRow(id=new_id("key", now), name=name, sha256=digest(text), priority=priority, created_at=now)
+            row.quotas = quotas.given() or None
             session.add(row)
         return row, text
 

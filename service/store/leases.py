@@ -11,16 +11,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, and_, case, delete, func, or_, select, update
+from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, upsert
 from service.store.history import keep_point
+from service.store.queue import LOST, WAITING, mine, next_job, reserve
+from service.store.quotas import count_gpu_seconds
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
-from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, TurnRow
+from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, ReservationRow, TurnRow
 from sgsst_core.errors import InfrastructureError
 
 #: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
@@ -77,15 +79,19 @@ class Leases:
         Jobs whose lease has run out come with the queued ones. One that has used up its attempts ends as failed
         here, one that was being canceled as canceled, and the next is looked at.
 
+        A job that there is no room for is reserved: this dispatcher takes no other one of its priority until it fits,
+        so that smaller jobs do not overtake it for ever. Other dispatchers take it where it fits them first, and pass
+        it over where it does not: one big job holds up one of them and not all.
+
         Args:
             dispatcher: its name.
-            fits: whether there is room for the job. It is asked for the next one only: smaller jobs do not
-                overtake a big one for ever.
+            fits: whether there is room for a job.
         """
+        passed: list[str] = []
         while True:
             now = self._database.clock()
             with self._database.writing() as session:
-                job = session.scalar(self._next(now))
+                job = next_job(session, dispatcher, now, passed)
                 if job is None:
                     return None
                 lost = job.status in ACTIVE
@@ -95,20 +101,18 @@ class Leases:
                     return self._lease(session, job, dispatcher, now)
                 if lost:  # else the same loss would count again the next time that somebody looks
                     self._requeue(session, job, now, now)
-                return None
+                if reserve(session, job.id, dispatcher, now, self._seconds):
+                    return None
+                passed.append(job.id)
 
-    def waiting(self) -> int:
-        """How many jobs could be leased now."""
-        with self._database.reading() as session:
-            query = select(func.count()).select_from(JobRow).where(_ready(self._database.clock()))
-            return session.scalar(query) or 0
-
-    @staticmethod
-    def _next(now: float) -> Select[JobRow]:
-        turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
-        query = select(JobRow).outerjoin(TurnRow, TurnRow.owner == JobRow.owner).where(_ready(now))
-        order = (JobRow.priority.desc(), turn, JobRow.queued_at, JobRow.id)
-        return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
+    def waiting(self, most: int = 1_000_000) -> int:
+        """How many jobs could be leased now; more than `most` are not counted."""
+        now = self._database.clock()
+        found = 0
+        with self._database.reading_rows() as connection:
+            for query in (WAITING, LOST):
+                found += connection.execute(query, {"now": now, "most": most - found}).scalar_one()
+        return found
 
     def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
         job.attempt += 1
@@ -118,6 +122,7 @@ class Leases:
         attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
         attempt.started_at = now
         session.add(attempt)
+        session.execute(delete(ReservationRow).where(or_(mine(dispatcher), ReservationRow.job_id == job.id)))
         served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
@@ -156,11 +161,21 @@ class Leases:
             return sorted({str(owner) for owner in session.scalars(query)})
 
     def run_out(self, dispatcher: str) -> None:
-        """Let the leases of a dispatcher run out now: it is known to be dead."""
+        """Let the leases of a dispatcher run out now, and its reservation: it is known to be dead."""
         now = self._database.clock()
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=now - 1e-3))
+            session.execute(delete(ReservationRow).where(mine(dispatcher)))
+
+    def hold_gpus(self, lease: Lease, gpus: int) -> None:
+        """From now on the attempt holds so many GPUs; what it held until now is counted for the job's owner."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._held_or_raise(session, lease)
+            attempt = session.get_one(AttemptRow, (job.id, job.attempt))
+            _count_gpus(session, job, attempt, now)
+            attempt.gpus, attempt.gpus_since = gpus, now
 
     # --- while the job runs ----------------------------------------------------------------------------------------
 
@@ -308,13 +323,6 @@ class Leases:
         move(session, job, Transition.REQUEUE, now)
 
 
-def _ready(now: float) -> ColumnElement[bool]:
-    """Queued and to be started, or held by a dispatcher that was not heard of again."""
-    queued = and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= now)
-    expired = and_(JobRow.status.in_(ACTIVE), JobRow.lease_expires_at < now)
-    return or_(queued, expired)
-
-
 def _is_held(job: JobRow, lease: Lease) -> bool:
     return job.status in ACTIVE and job.lease_epoch == lease.epoch and job.lease_owner == lease.dispatcher
 
@@ -348,12 +356,17 @@ def _outages(session: Session, job: JobRow) -> int:
     return count
 
 
+def _count_gpus(session: Session, job: JobRow, attempt: AttemptRow, now: float) -> None:
+    if attempt.gpus and attempt.gpus_since is not None:
+        count_gpu_seconds(session, job.owner, attempt.gpus * max(0.0, now - attempt.gpus_since), now)
+
+
 def _close_attempt(
     session: Session, job: JobRow, outcome: AttemptOutcome, error: dict[str, Any] | None, now: float
 ) -> None:
-    session.execute(
-        update(AttemptRow)
-        .where(AttemptRow.job_id == job.id, AttemptRow.number == job.attempt)
-        .values(finished_at=now, outcome=outcome, error=error)
-    )
+    attempt = session.get(AttemptRow, (job.id, job.attempt))
+    if attempt is not None:
+        attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
+        if outcome != AttemptOutcome.LOST:  # nobody knows how long it has worked, and that was not its owner's doing
+            _count_gpus(session, job, attempt, now)
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

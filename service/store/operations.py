@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import secrets
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import bindparam, delete, func, select
 
 from service.store.database import Database, upsert
 from service.store.states import JobStatus
@@ -13,6 +13,7 @@ from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow,
 
 #: A dispatcher that was not heard of for so long is not coming back.
 _FORGET_SECONDS = 86_400.0
+_ALIVE = select(func.count()).select_from(DispatcherRow).where(DispatcherRow.seen_at >= bindparam("since"))
 
 
 class Operations:
@@ -42,6 +43,12 @@ class Operations:
         with self._database.reading() as session:
             query = select(DispatcherRow).where(DispatcherRow.seen_at >= since).order_by(DispatcherRow.name)
             return list(session.scalars(query))
+
+    def alive(self) -> int:
+        """How many dispatchers are alive."""
+        since = self._database.clock() - self._lease_seconds
+        with self._database.reading_rows() as connection:
+            return connection.execute(_ALIVE, {"since": since}).scalar_one()
 
     def counters(self) -> list[tuple[str, str, float]]:
         """Name, labels and value of every counter."""

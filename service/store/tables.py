@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false
+from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 #: SQLite counts rows up by itself only for INTEGER, PostgreSQL needs BIGINT to count far enough.
@@ -63,6 +63,9 @@ class JobRow(Base):
 
     __table_args__ = (
         Index("ix_jobs_queue", "status", "priority", "queued_at", "id"),  # a place in the queue is counted in it alone
+        # the first job of each owner is found in it without looking at the others (`service.store.queue`)
+        Index("ix_jobs_turns", "status", "owner", text("priority DESC"), "queued_at", "id"),
+        Index("ix_jobs_lease_expires_at", "lease_expires_at"),
         Index("ix_jobs_owner_id", "owner", "id"),
         Index("ix_jobs_owner_status", "owner", "status", "id"),
         Index("ix_jobs_expires_at", "expires_at"),
@@ -71,7 +74,10 @@ class JobRow(Base):
 
 
 class AttemptRow(Base):
-    """One lease of a job, and how it ended; `outcome` is None while it runs."""
+    """One lease of a job, and how it ended; `outcome` is None while it runs.
+
+    `gpus` are those that it holds `gpus_since` then; what it held before has been counted for its owner (`UsageRow`).
+    """
 
     __tablename__ = "attempts"
 
@@ -82,6 +88,8 @@ class AttemptRow(Base):
     started_at: Mapped[float] = mapped_column(Float)
     finished_at: Mapped[float | None] = mapped_column(Float)
     outcome: Mapped[str | None] = mapped_column(String(20))
+    gpus: Mapped[int] = mapped_column(Integer, default=0, server_default=text("0"))
+    gpus_since: Mapped[float | None] = mapped_column(Float)
     error: Mapped[dict[str, Any] | None]
 
 
@@ -103,6 +111,16 @@ class TurnRow(Base):
 
     owner: Mapped[str] = mapped_column(String(40), primary_key=True)
     served: Mapped[int] = mapped_column(Sequence)
+
+
+class ReservationRow(Base):
+    """A queued job that a dispatcher keeps its room for, until the moment `until` unless it asks again."""
+
+    __tablename__ = "reservations"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    dispatcher: Mapped[str] = mapped_column(String(120))
+    until: Mapped[float] = mapped_column(Float)
 
 
 class EventRow(Base):
@@ -206,6 +224,18 @@ class KeyRow(Base):
     priority: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[float] = mapped_column(Float)
     revoked_at: Mapped[float | None] = mapped_column(Float)
+    quotas: Mapped[dict[str, Any] | None]
+
+
+class UsageRow(Base):
+    """What an owner has used on a day, which is a number of days since 1970 (UTC)."""
+
+    __tablename__ = "usage"
+
+    owner: Mapped[str] = mapped_column(String(40), primary_key=True)
+    day: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    jobs: Mapped[int] = mapped_column(Integer, default=0)
+    gpu_seconds: Mapped[float] = mapped_column(Float, default=0.0)
 
 
 class SessionRow(Base):

@@ -151,7 +151,9 @@ def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotenc
     values = parameters.model_dump(mode="json", exclude_unset=True)
     new = NewJob(caller.owner, parameters.name, caller.priority, values, wanted.inputs, webhook or None)
     jobs = context.store.jobs
-    job, created = jobs.create(new, limit=context.settings.max_jobs_per_key, idempotency=idempotency)
+    job, created = jobs.create(
+        new, limit=context.settings.max_jobs_per_key, quotas=caller.quotas, idempotency=idempotency
+    )
     sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
     if not created:
         sent["Idempotency-Replayed"] = "true"

@@ -21,6 +21,7 @@ from service.errors import (
     IdempotencyError,
     NoSpaceError,
     NotFoundError,
+    QuotaError,
     ServiceError,
     StoreError,
     TooLargeError,
@@ -122,6 +123,13 @@ def describe_uploads(context: ContextDep) -> Response:
             TooLargeError("The file has 20,000,000,000 bytes; 16,000,000,000 may be.", limit=16_000_000_000),
             invalid("header.Upload-Length", "Field required"),
             IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key."),
+            QuotaError(
+                "With this, 120,000,000,000 bytes would be kept for this key; 100,000,000,000 may be. Delete jobs or "
+                "uploads first.",
+                quota="stored-bytes",
+                limit=100_000_000_000,
+                retry_after=3600,
+            ),
             NoSpaceError("The service's disk is too full to take this in. Try again later."),
         ),
     },
@@ -154,7 +162,9 @@ def create_upload(
         raise ConflictError(f"There are {_MAX_OPEN} unfinished uploads of this key. Finish or delete some.")
     name = clean_name("photos", _file_name(metadata), 0)[-200:]
     seconds = context.settings.upload_hours * 3600
-    row = context.store.inputs.create_upload(caller.owner, length, name, metadata, seconds, idempotency_key)
+    row = context.store.inputs.create_upload(
+        caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
+    )
     context.blobs.begin_upload(row.id)
     sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sqlalchemy import event
 
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.machine import Machine
@@ -21,6 +22,8 @@ from service.store.tables import JobRow
 
 GB = 1_000_000_000
 SHA = "a" * 64
+#: A job of hours, worth all GPUs of a machine.
+LARGE = {"preset": "paper", "resolution": 5187}
 
 
 def machine(gpus: int, **more: Any) -> Machine:
@@ -40,7 +43,8 @@ class Queue:
 
     def add(self, owner: str = "local", priority: int = 0, **parameters: Any) -> str:
         self.now += 1
-        scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+        scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": GB}
+        parameters = LARGE | parameters
         return self.store.jobs.create(NewJob(owner, "", priority, parameters, [scene]), limit=100)[0].id
 
     def start(self) -> list[str]:
@@ -85,6 +89,23 @@ def test_jobs_that_wait_share_the_gpus(eight: Queue, jobs: int, ranks: list[int]
     assert eight.ranks() == ranks
 
 
+def test_a_small_job_that_is_alone_leaves_gpus_to_others(eight: Queue) -> None:
+    small = [eight.add(preset="preview") for _ in range(2)]
+    large = eight.add()
+    assert eight.start() == [*small, large]
+    assert eight.ranks() == [1, 1, 6]
+
+
+def test_a_dispatcher_without_room_asks_nothing(eight: Queue) -> None:
+    eight.add()
+    eight.start()
+    eight.add()
+    asked: list[str] = []
+    event.listen(eight.store.database.engine, "before_cursor_execute", lambda *args: asked.append(args[2]))
+    assert eight.start() == []
+    assert not asked
+
+
 def test_a_user_decides_for_a_job(eight: Queue) -> None:
     for workers in (2, 5, 100):
         eight.add(workers=workers)
@@ -107,6 +128,24 @@ def test_a_big_job_waits_for_its_gpus_and_nothing_overtakes_it(eight: Queue) -> 
     urgent = eight.add(priority=1)
     del eight.held[big]
     assert eight.start()[0] == urgent, "but for one of a higher priority"
+
+
+def test_a_big_job_holds_up_one_machine_and_not_all(tmp_path: Path) -> None:
+    here, there = (Queue(tmp_path, gpus=8) for _ in range(2))
+    there.dispatcher.name = "there"
+    running = [here.add(workers=1), here.add(workers=1)]
+    assert [*here.start(), *there.start()] == running
+    big, *small = [here.add(workers=workers) for workers in (8, 1, 1, 1)]
+    there.now = here.now
+    assert here.start() == [], "it keeps its seven GPUs for the big one"
+    there.held["else"] = Grant(1, ("gpu7",))
+    assert there.start() == small
+    there.held.clear()
+    assert there.start() == [big], "wherever it fits first"
+    later = here.add(workers=1)
+    assert here.start() == [later], "and who kept its room has it back"
+    for queue in (here, there):
+        queue.store.close()
 
 
 def test_keys_take_turns_whatever_they_get(eight: Queue) -> None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import os
 import shutil
-import socket
-import subprocess
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,115 +17,26 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from sqlalchemy import func, inspect, select
 
 from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
-from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.database import MIGRATIONS
 from service.store.history import GROWTH, keep_point
 from service.store.inputs import GRACE_SECONDS
-from service.store.jobs import Idempotency, NewJob
+from service.store.jobs import Idempotency
 from service.store.leases import KEPT_PROGRESS, Lease, Published
 from service.store.states import ACTIVE, FINISHED
 from service.store.tables import Base, ProgressPointRow
-
-SHA = "a" * 64
-LEASE, RETRY, ATTEMPTS = 30.0, 5.0, 3
-RETENTION = 100.0
-
-
-class Clock:
-    """Stands still until told otherwise."""
-
-    def __init__(self) -> None:
-        self.now = 1_000_000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[str]:
-    """A PostgreSQL server of our own; skipped where none is installed."""
-    bin_folder = _postgres_programs()
-    if bin_folder is None:
-        pytest.skip("PostgreSQL's server is not installed")
-    folder = Path(tempfile.mkdtemp(prefix="sgsst-pg-"))
-    user: dict[str, Any] = {}
-    if os.geteuid() == 0:  # it refuses to run as root
-        shutil.chown(folder, "postgres")
-        user = {"user": "postgres", "group": "postgres", "extra_groups": []}
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    data = str(folder / "data")
-    options = {**user, "check": True, "stdout": subprocess.DEVNULL, "cwd": folder}
-    subprocess.run([bin_folder / "initdb", "-U", "sgsst", "-A", "trust", "-D", data], **options)
-    server = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync=off"
-    subprocess.run([bin_folder / "pg_ctl", "-D", data, "-o", server, "-l", folder / "log", "-w", "start"], **options)
-    yield f"postgresql+psycopg://sgsst@127.0.0.1:{port}"
-    subprocess.run([bin_folder / "pg_ctl", "-D", data, "-m", "immediate", "stop"], **options)
-    shutil.rmtree(folder)
-
-
-def _postgres_programs() -> Path | None:
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/pg_ctl"))
-    on_path = shutil.which("pg_ctl")
-    place = found[-1] if found else Path(on_path).resolve() if on_path else None
-    return place.parent if place else None
-
-
-def _fresh_database(server: str) -> str:
-    from sqlalchemy import create_engine, text
-
-    name = f"t{os.urandom(6).hex()}"
-    engine = create_engine(f"{server}/postgres", isolation_level="AUTOCOMMIT")
-    with engine.connect() as connection:
-        connection.execute(text(f"CREATE DATABASE {name}"))
-    engine.dispose()
-    return f"{server}/{name}"
-
-
-def _settings(folder: Path, database: str | None) -> ServiceSettings:
-    return ServiceSettings(
-        data=folder,
-        database=database,
-        lease_seconds=LEASE,
-        retry_seconds=RETRY,
-        max_attempts=ATTEMPTS,
-        retention_days=RETENTION / 86_400,
-    )
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
-    """URL of an empty database; None for SQLite's default place."""
-    return None if request.param == "sqlite" else _fresh_database(request.getfixturevalue("postgres"))
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def store(database: str | None, tmp_path: Path, clock: Clock) -> Iterator[Store]:
-    made = open_store(_settings(tmp_path, database), clock)
-    made.inputs.add_blob(SHA, "aa/blob", 3)
-    yield made
-    made.close()
-
-
-def new_job(owner: str = "local", priority: int = 0) -> NewJob:
-    return NewJob(owner, "", priority, {}, [{"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}])
-
-
-def queue(store: Store, owner: str = "local", priority: int = 0) -> str:
-    return store.jobs.create(new_job(owner, priority), limit=100)[0].id
-
-
-def lease(store: Store, dispatcher: str = "one") -> Lease:
-    found = store.leases.take(dispatcher)
-    assert found is not None
-    return found
+from tests.service.store.helpers import (
+    ATTEMPTS,
+    LEASE,
+    RETENTION,
+    RETRY,
+    SHA,
+    Clock,
+    lease,
+    new_job,
+    queue,
+    store_settings,
+)
 
 
 def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tmp_path: Path) -> None:
@@ -142,7 +50,7 @@ def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tm
 
 
 def test_sqlite_is_safe_against_power_cuts(tmp_path: Path) -> None:
-    store = open_store(_settings(tmp_path, None))
+    store = open_store(store_settings(tmp_path, None))
     with store.database.reading() as session:
         pragmas = {
             name: session.connection().exec_driver_sql(f"PRAGMA {name}").scalar()
@@ -404,7 +312,7 @@ def test_the_migrations_keep_what_is_there(database: str | None, tmp_path: Path)
     from alembic import command
     from alembic.config import Config
 
-    settings = _settings(tmp_path, database)
+    settings = store_settings(tmp_path, database)
     first = Store(settings)
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS))
@@ -609,7 +517,7 @@ class StoreMachine(RuleBasedStateMachine):
         super().__init__()
         self.folder = Path(tempfile.mkdtemp(prefix="sgsst-store-"))
         self.clock = Clock()
-        self.store = open_store(_settings(self.folder, None), self.clock)
+        self.store = open_store(store_settings(self.folder, None), self.clock)
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
         self.status: dict[str, str] = {}
         self.held: dict[str, tuple[Lease, float]] = {}

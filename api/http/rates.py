@@ -1,0 +1,50 @@
+"""How many requests a second a holder of a key may send to this process."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from service.errors import RateLimitError
+
+#: Seconds' worth of requests that may come at once.
+_BURST_SECONDS = 10.0
+#: Owners that are remembered; who was forgotten has sent nothing for long, or begins with a full measure again.
+_REMEMBERED = 10_000
+
+
+class Rates:
+    """A measure of requests for each owner, which each request takes one from and time fills again."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._left: dict[str, tuple[float, float]] = {}
+
+    def take(self, owner: str, a_second: float | None) -> None:
+        """Count a request.
+
+        Args:
+            owner: who sends it.
+            a_second: that the owner may send on average; None for no bound.
+
+        Raises:
+            RateLimitError: it comes too soon.
+        """
+        if a_second is None:
+            return
+        most = max(1.0, a_second * _BURST_SECONDS)
+        now = self._clock()
+        left, seen = self._left.pop(owner, (most, now))
+        left = min(most, left + (now - seen) * a_second)
+        allowed = left >= 1
+        self._left[owner] = (left - 1 if allowed else left), now
+        if len(self._left) > _REMEMBERED:
+            del self._left[next(iter(self._left))]  # who was heard of longest ago
+        if not allowed:
+            raise RateLimitError(
+                f"This key may send {a_second:g} requests a second on average. Wait, and ask less often: jobs tell of "
+                "themselves by events.",
+                limit=a_second,
+                retry_after=math.ceil((1 - left) / a_second),
+            )

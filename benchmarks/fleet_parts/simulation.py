@@ -1,0 +1,323 @@
+"""Hosts under a simulated clock: the service's own queue, turns, leases and packing decide, and only time is made up.
+
+Each host has a dispatcher. A dispatcher asks for work when it has room and something may be there for it, within the
+half second in which a real one looks again; looks that find nothing are not simulated, but counted by
+`benchmarks.fleet_parts.database`. Leases are not renewed but hold until a host fails, and run out as late as they
+would have; the same goes for checkpoints, of which the last one before a failure is published.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import random
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import event, select
+
+from benchmarks.fleet_parts.demand import SimulatedJob
+from service.files.names import CHECKPOINT
+from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.machine import Machine
+from service.scheduling.packing import Grant
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.leases import Lease, Published
+from service.store.tables import ReservationRow
+
+LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
+#: A failed host is back after so many seconds, at least and at most.
+_REPAIR_SECONDS = (600.0, 3600.0)
+_EPOCH = 1_700_000_000.0
+_SHA = "a" * 64
+
+
+@dataclass
+class Record:
+    """What became of a job.
+
+    Attributes:
+        started: when its first attempt began.
+        offered, planned: GPUs of its last attempt.
+        held: GPU seconds, of all attempts; `lost` of them for nothing.
+        done: share of its steps that is saved.
+    """
+
+    job: SimulatedJob
+    started: float | None = None
+    ended: float | None = None
+    attempts: int = 0
+    offered: int = 0
+    planned: int = 0
+    held: float = 0.0
+    lost: float = 0.0
+    done: float = 0.0
+
+
+@dataclass
+class Attempt:
+    """A job that holds GPUs of a host."""
+
+    record: Record
+    lease: Lease
+    grant: Grant
+    begun: float
+    since: float
+    stepping_since: float | None = None
+
+
+@dataclass
+class Host:
+    """A machine with its dispatcher; `alive` counts its lives, so that what was due in an earlier one is void."""
+
+    dispatcher: Dispatcher
+    gpus: int
+    running: dict[str, Attempt] = field(default_factory=dict)
+    life: int = 0
+    up: bool = True
+    keeps_room_for: str | None = None
+
+    @property
+    def grants(self) -> list[Grant]:
+        """What its jobs hold."""
+        return [attempt.grant for attempt in self.running.values()]
+
+    @property
+    def free(self) -> int:
+        """GPUs that no job holds."""
+        return self.gpus - sum(len(grant.gpus) for grant in self.grants) if self.up else 0
+
+
+class Fleet:
+    """Hosts, their store and a clock.
+
+    Args:
+        folder: of the store, in memory by preference.
+        hosts: how many, of `gpus_each` GPUs.
+        host_days: mean days between failures of a host.
+    """
+
+    def __init__(self, folder: Path, hosts: int, gpus_each: int, host_days: float, seed: int) -> None:
+        self.now = 0.0
+        self.records: dict[str, Record] = {}
+        self.statements: Counter[str] = Counter()
+        self.calls: Counter[str] = Counter()
+        self.queue_seconds: list[tuple[float, int]] = []
+        self.failures = 0
+        self._host_days = host_days
+        self._chance = random.Random(seed)
+        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = 0
+        self._doing = ""
+        self._waiting = 0
+        # leases hold as long as the simulation lasts: `_run_out` ends those of hosts that have failed
+        settings = ServiceSettings(data=folder, lease_seconds=1e9, log_format="text")
+        self.store: Store = open_store(settings, lambda: _EPOCH + self.now)
+        self._prepare_store()
+        names = tuple(str(number) for number in range(gpus_each))
+        self.hosts = []
+        for number in range(hosts):
+            dispatcher = Dispatcher(settings, self.store, Machine(names, 64, 1 << 40))
+            dispatcher.name = f"host-{number}"
+            self.hosts.append(Host(dispatcher, gpus_each))
+            self.store.operations.beat(dispatcher.name, gpus_each, gpus_each)
+
+    def _prepare_store(self) -> None:
+        engine = self.store.database.engine
+        engine.dispose()
+        event.listen(engine, "connect", _trust_the_memory)
+        event.listen(engine, "before_cursor_execute", self._count)
+        self.store.inputs.add_blob(_SHA, "aa/blob", 3)
+
+    def _count(self, *args: Any) -> None:
+        self.statements[self._doing] += 1
+
+    def run(self, jobs: list[SimulatedJob], seconds: float, warm_up: float, patience: float = math.inf) -> float:
+        """Let the jobs come; GPU seconds before the warm-up's end do not count.
+
+        Args:
+            seconds: to simulate.
+            patience: seconds that this may take; what has been simulated by then has to do.
+
+        Returns:
+            Seconds that were simulated.
+        """
+        started = time.perf_counter()
+        self._at(warm_up, self._forget_held)
+        for job in jobs:
+            self._at(job.at, lambda job=job: self._arrive(job))  # type: ignore[misc]
+        for host in self.hosts:
+            self._fail_some_day(host)
+        while self._events and self._events[0][0] <= seconds:
+            if time.perf_counter() - started > patience:
+                seconds = self.now
+                break
+            self.now, _, happen = heapq.heappop(self._events)
+            happen()
+        self.now = seconds
+        self._account_all()
+        return seconds
+
+    def _account_all(self) -> None:
+        for host in self.hosts:
+            for attempt in host.running.values():
+                self._account(attempt)
+
+    def _forget_held(self) -> None:
+        self._account_all()
+        for record in self.records.values():
+            record.held = 0.0
+
+    # --- what happens ----------------------------------------------------------------------------------------------
+
+    def _at(self, moment: float, happen: Callable[[], None]) -> None:
+        self._number += 1
+        heapq.heappush(self._events, (moment, self._number, happen))
+
+    def _soon(self) -> float:
+        return self.now + self._chance.uniform(0, POLL_SECONDS)
+
+    def _do(self, what: str) -> None:
+        """Statements from now on are for this."""
+        self._doing = what
+        self.calls[what] += 1
+
+    def _arrive(self, job: SimulatedJob) -> None:
+        self._do("submit")
+        new = NewJob(job.owner, "", 0, job.parameters, job.inputs)
+        row, _ = self.store.jobs.create(new, limit=10**9)
+        self.records[row.id] = Record(job)
+        self._waiting += 1
+        self._at(self._soon(), self._somebody_looks)
+
+    def _somebody_looks(self) -> None:
+        """Hosts with room look for work, in the order in which they happen to."""
+        hosts = [host for host in self.hosts if host.free and host.keeps_room_for is None]
+        self._chance.shuffle(hosts)
+        for host in hosts:
+            if not self._waiting:
+                break
+            self._look(host)
+
+    def _look(self, host: Host) -> None:
+        """A dispatcher takes what it finds room for, as the real one does in each round."""
+        while host.free and self._waiting:
+            self._do("lease")
+            found = host.dispatcher.next_job(host.grants)
+            if found is None:
+                self._do("look")
+                host.keeps_room_for = self._reserved(host)
+                return
+            host.keeps_room_for = None
+            self._start(host, *found)
+
+    def _reserved(self, host: Host) -> str | None:
+        with self.store.database.reading() as session:
+            mine = ReservationRow.dispatcher == host.dispatcher.name
+            return session.scalar(select(ReservationRow.job_id).where(mine))
+
+    def _start(self, host: Host, lease: Lease, grant: Grant) -> None:
+        record = self.records[lease.job_id]
+        self._waiting -= 1
+        self.queue_seconds.append((self.now, self._waiting))
+        record.started = self.now if record.started is None else record.started
+        record.attempts += 1
+        record.offered = grant.ranks
+        attempt = Attempt(record, lease, grant, self.now, self.now)
+        host.running[lease.job_id] = attempt
+        for other in self.hosts:
+            if other.keeps_room_for == lease.job_id:
+                other.keeps_room_for = None
+                self._at(self._soon(), lambda other=other: self._look(other))  # type: ignore[misc]
+        life = host.life
+        self._at(self.now + record.job.start_seconds(), lambda: self._planned(host, life, attempt))
+
+    def _planned(self, host: Host, life: int, attempt: Attempt) -> None:
+        if host.life != life:
+            return
+        self._do("begin")
+        self.store.leases.begin(attempt.lease)
+        record = attempt.record
+        self._account(attempt)
+        record.planned = record.job.planned(attempt.grant.ranks)
+        if record.planned < attempt.grant.ranks:
+            attempt.grant = Grant(record.planned, attempt.grant.gpus[: record.planned])
+            self._at(self._soon(), lambda: self._look(host))
+        attempt.stepping_since = self.now
+        left = (1 - record.done) * record.job.seconds(record.planned)
+        self._at(self.now + left, lambda: self._done(host, life, attempt))
+
+    def _done(self, host: Host, life: int, attempt: Attempt) -> None:
+        if host.life != life:
+            return
+        self._do("end")
+        self.store.leases.succeed(attempt.lease, [Published("stylized.ply", "x", 1, _SHA)], {})
+        self._account(attempt)
+        attempt.record.ended = self.now
+        del host.running[attempt.lease.job_id]
+        self._at(self._soon(), lambda: self._look(host))
+
+    # --- failures --------------------------------------------------------------------------------------------------
+
+    def _fail_some_day(self, host: Host) -> None:
+        after = self._chance.expovariate(1 / (self._host_days * 86_400))
+        self._at(self.now + after, lambda: self._fail(host))
+
+    def _fail(self, host: Host) -> None:
+        self.failures += 1
+        for attempt in host.running.values():
+            self._lose(attempt)
+        host.running.clear()
+        host.life += 1
+        host.up = False
+        last_renewed = self._chance.uniform(0, LEASE_SECONDS / 3)
+        self._at(self.now + LEASE_SECONDS - last_renewed, lambda: self._run_out(host))
+        self._at(self.now + self._chance.uniform(*_REPAIR_SECONDS), lambda: self._repair(host))
+
+    def _lose(self, attempt: Attempt) -> None:
+        """What was done since the last checkpoint is lost, and the time before the first step."""
+        record = attempt.record
+        self._account(attempt)
+        gpus = len(attempt.grant.gpus)
+        if attempt.stepping_since is None:
+            record.lost += gpus * (self.now - attempt.begun)
+            return
+        stepped = self.now - attempt.stepping_since
+        saved = stepped // CHECKPOINT_SECONDS * CHECKPOINT_SECONDS
+        record.lost += gpus * (stepped - saved)
+        if saved:
+            record.done += saved / record.job.seconds(record.planned)
+            step = int(record.done * record.job.steps)
+            self._do("checkpoint")
+            file = Published(CHECKPOINT, f"x/{attempt.lease.epoch}", 1, _SHA, step=step)
+            self.store.leases.publish(attempt.lease, [file])
+
+    def _run_out(self, host: Host) -> None:
+        self._do("failure")
+        held = self.store.leases.waiting()
+        self.store.leases.run_out(host.dispatcher.name)
+        self.store.operations.gone(host.dispatcher.name)
+        self._waiting += self.store.leases.waiting() - held
+        self._at(self._soon(), self._somebody_looks)
+
+    def _repair(self, host: Host) -> None:
+        host.up, host.keeps_room_for = True, None
+        self._do("failure")
+        self.store.operations.beat(host.dispatcher.name, host.gpus, host.gpus)
+        self._look(host)
+        self._fail_some_day(host)
+
+    def _account(self, attempt: Attempt) -> None:
+        attempt.record.held += len(attempt.grant.gpus) * (self.now - attempt.since)
+        attempt.since = self.now
+
+
+def _trust_the_memory(connection: Any, _record: Any) -> None:
+    """Nobody needs the simulated store after a power cut."""
+    connection.execute("PRAGMA synchronous=OFF")

@@ -1,0 +1,143 @@
+"""Which job is next: the query that every dispatcher asks again and again, and reservations of jobs that wait for room.
+
+The queue may have tens of thousands of jobs, most of them of a few owners. Only the first job of each owner can be
+next, so that owners are walked from one to the other in an index, and their first jobs alone are compared: the time
+grows with the owners that wait, not with the jobs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+from sqlalchemy import (
+    BindParameter,
+    ColumnElement,
+    CompoundSelect,
+    Float,
+    Integer,
+    Select,
+    String,
+    and_,
+    bindparam,
+    case,
+    delete,
+    func,
+    or_,
+    select,
+    union_all,
+)
+from sqlalchemy.orm import Session, aliased
+
+from service.store.database import upsert
+from service.store.states import ACTIVE, JobStatus
+from service.store.tables import JobRow, ReservationRow, TurnRow
+
+#: Of a reservation's time that has to be left, or it is renewed: not every look at the queue is a write.
+_RENEW_SHARE = 0.5
+
+
+def queued_now(now: float | BindParameter[float]) -> ColumnElement[bool]:
+    """Queued, and to be started."""
+    return and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= now)
+
+
+def expired(now: float | BindParameter[float]) -> ColumnElement[bool]:
+    """Held by a dispatcher that was not heard of again."""
+    return and_(JobRow.lease_expires_at < now, JobRow.status.in_(ACTIVE))
+
+
+def _count(condition: ColumnElement[bool]) -> Select[int]:
+    some = select(JobRow.id).where(condition).limit(bindparam("most", type_=Integer)).subquery()
+    return select(func.count()).select_from(some)
+
+
+# Built once: building a query takes longer than answering it.
+_NOW: BindParameter[float] = bindparam("now", type_=Float)
+#: How many jobs are queued `now`, and how many are lost; at `most`.
+WAITING, LOST = _count(queued_now(_NOW)), _count(expired(_NOW))
+
+
+def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
+    """Reservations of a dispatcher."""
+    return ReservationRow.dispatcher == dispatcher
+
+
+def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str] = ()) -> JobRow | None:
+    """The next job for a dispatcher: by priority, then what it keeps room for, then turns of owners, then age.
+
+    Its row is locked; rows that others have locked are passed over.
+
+    Args:
+        passed: jobs that are not to be looked at.
+    """
+    told = {"dispatcher": dispatcher, "now": now, "passed": list(passed)}
+    candidates = [found for found in session.scalars(_candidates(), told) if found is not None]
+    if not candidates:
+        return None
+    # as a statement of its own: within one, PostgreSQL expects more candidates than there are, and reads all jobs
+    return session.scalar(_first(), {"dispatcher": dispatcher, "now": now, "candidates": candidates})
+
+
+@cache
+def _candidates() -> Select[Any] | CompoundSelect[Any]:
+    """Ids of the jobs that may be next."""
+    dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
+    passed = bindparam("passed", type_=String, expanding=True)
+    lost = select(JobRow.id).where(expired(now), JobRow.id.not_in(passed))
+    reserved = select(ReservationRow.job_id).where(mine(dispatcher), ReservationRow.job_id.not_in(passed))
+    return union_all(_first_of_each_owner(now, passed), lost, reserved)
+
+
+@cache
+def _first() -> Select[JobRow]:
+    """The first of them."""
+    dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
+    turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
+    kept = case((mine(dispatcher), 0), else_=1)
+    query = (
+        select(JobRow)
+        .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
+        .outerjoin(ReservationRow, ReservationRow.job_id == JobRow.id)
+        .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)))
+        # once more, for a row that somebody else has changed since it was found
+        .where(or_(queued_now(now), expired(now)))
+    )
+    order = (JobRow.priority.desc(), kept, turn, JobRow.queued_at, JobRow.id)
+    return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
+
+
+def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) -> Select[Any]:
+    """Ids of the jobs that are next of their owners."""
+    job = aliased(JobRow)
+    queued = job.status == JobStatus.QUEUED
+    owners = select(func.min(job.owner).label("owner")).where(queued).cte("owners", recursive=True)
+    following = select(func.min(job.owner)).where(queued, job.owner > owners.c.owner).scalar_subquery()
+    owners = owners.union_all(select(following).where(owners.c.owner.is_not(None)))
+    each = (
+        select(job.id)
+        .where(queued, job.owner == owners.c.owner, job.not_before <= now, job.id.not_in(passed))
+        .order_by(job.priority.desc(), job.queued_at, job.id)
+        .limit(1)
+        .scalar_subquery()
+    )
+    return select(each.label("id")).where(owners.c.owner.is_not(None))
+
+
+def reserve(session: Session, job_id: str, dispatcher: str, now: float, seconds: float) -> bool:
+    """Keep a dispatcher's room for a job and for no other one; False where another dispatcher does that already.
+
+    Args:
+        session: in which the job's row is locked.
+        seconds: that the reservation holds, unless it is made again.
+    """
+    row = session.get(ReservationRow, job_id)
+    if row is not None and row.dispatcher != dispatcher and row.until >= now:
+        return False
+    if row is None or row.dispatcher != dispatcher or row.until < now + _RENEW_SHARE * seconds:
+        session.execute(delete(ReservationRow).where(mine(dispatcher), ReservationRow.job_id != job_id))
+        values = {"dispatcher": dispatcher, "until": now + seconds}
+        insert = upsert(session)(ReservationRow).values(job_id=job_id, **values)
+        session.execute(insert.on_conflict_do_update(index_elements=["job_id"], set_=values))
+    return True

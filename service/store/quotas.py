@@ -1,0 +1,152 @@
+"""What a key may use: jobs and GPU seconds of a day (UTC), bytes kept for it. Counted where they are used up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Self
+
+from sqlalchemy import BindParameter, String, bindparam, func, select, union
+from sqlalchemy.orm import Session
+
+from service.errors import QuotaError
+from service.settings import ServiceSettings
+from service.store.database import Database, upsert
+from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
+
+_DAY = 86_400
+#: When to ask again for room: by then something may have been deleted, or has expired.
+_BYTES_AGAIN = 3600
+
+_USAGE = Base.metadata.tables[UsageRow.__tablename__]
+
+
+@dataclass(frozen=True)
+class Quotas:
+    """Of one key; None for no bound.
+
+    Attributes:
+        jobs_a_day: that are accepted.
+        gpu_seconds_a_day: of attempts, after which no more jobs are accepted; those that run go on.
+        stored_bytes: of unfinished uploads, inputs and results together; an input that several jobs use counts once.
+        requests_a_second: to each process of the API, on average over some seconds.
+    """
+
+    jobs_a_day: int | None = None
+    gpu_seconds_a_day: float | None = None
+    stored_bytes: int | None = None
+    requests_a_second: float | None = None
+
+    @classmethod
+    def of_settings(cls, settings: ServiceSettings) -> Self:
+        """Those of keys that have none of their own."""
+        return cls(
+            settings.max_jobs_a_day_per_key,
+            settings.max_gpu_seconds_a_day_per_key,
+            settings.max_bytes_per_key,
+            settings.max_requests_a_second_per_key,
+        )
+
+    def with_own(self, own: Mapping[str, Any] | None) -> Self:
+        """Where a key has its own, those; what another version of the service has stored besides is left out."""
+        known = {field.name for field in fields(self)}
+        return replace(self, **{name: value for name, value in (own or {}).items() if name in known})
+
+    def given(self) -> dict[str, Any]:
+        """Those that are bounds, for `with_own`."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+NO_QUOTAS = Quotas()
+
+
+@dataclass(frozen=True)
+class Used:
+    """What a key has used today, and what is kept for it."""
+
+    jobs: int
+    gpu_seconds: float
+    stored_bytes: int
+
+
+class Usage:
+    """What keys have used."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def of(self, owner: str) -> Used:
+        """Of one owner, now."""
+        with self._database.reading() as session:
+            row = session.get(UsageRow, (owner, day_of(self._database.clock())))
+            jobs, seconds = (row.jobs, row.gpu_seconds) if row is not None else (0, 0.0)
+            return Used(jobs, seconds, stored_bytes(session, owner))
+
+
+def day_of(now: float) -> int:
+    """Number of a day, from 1970 on."""
+    return int(now // _DAY)
+
+
+def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
+    """Count a job that is being accepted, within its transaction.
+
+    Raises:
+        QuotaError: it would be one too many, or today's GPU seconds are used up.
+    """
+    insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=1, gpu_seconds=0.0)
+    counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"jobs": _USAGE.c.jobs + 1})
+    jobs, seconds = session.execute(counted.returning(_USAGE.c.jobs, _USAGE.c.gpu_seconds)).one()
+    tomorrow = _DAY - int(now % _DAY)
+    if quotas.jobs_a_day is not None and jobs > quotas.jobs_a_day:
+        raise QuotaError(
+            f"This key may submit {quotas.jobs_a_day:,} jobs a day, and has. Come back tomorrow (UTC).",
+            quota="jobs-a-day",
+            limit=quotas.jobs_a_day,
+            retry_after=tomorrow,
+        )
+    if quotas.gpu_seconds_a_day is not None and seconds >= quotas.gpu_seconds_a_day:
+        raise QuotaError(
+            f"This key may use {quotas.gpu_seconds_a_day:,.0f} GPU seconds a day, and has. Come back tomorrow (UTC).",
+            quota="gpu-seconds-a-day",
+            limit=quotas.gpu_seconds_a_day,
+            retry_after=tomorrow,
+        )
+
+
+def count_gpu_seconds(session: Session, owner: str, seconds: float, now: float) -> None:
+    """Count what an attempt has used."""
+    insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=0, gpu_seconds=seconds)
+    added = _USAGE.c.gpu_seconds + insert.excluded.gpu_seconds
+    session.execute(insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"gpu_seconds": added}))
+
+
+def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
+    """Prove that what is kept for an owner is within its quota, in the transaction that has added to it.
+
+    Raises:
+        QuotaError: it is not; the transaction is to end without effect.
+    """
+    limit = quotas.stored_bytes
+    if limit is not None and (used := stored_bytes(session, owner)) > limit:
+        raise QuotaError(
+            f"With this, {used:,} bytes would be kept for this key; {limit:,} may be. Delete jobs or uploads first.",
+            quota="stored-bytes",
+            limit=limit,
+            retry_after=_BYTES_AGAIN,
+        )
+
+
+def stored_bytes(session: Session, owner: str) -> int:
+    """Bytes of unfinished uploads, of inputs (each content once) and of results."""
+    return sum(int(session.scalar(query, {"owner": owner}) or 0) for query in _STORED)
+
+
+_OWNER: BindParameter[str] = bindparam("owner", type_=String)
+_OF_JOBS = select(BlobUseRow.sha256).join(JobRow, BlobUseRow.holder == "job:" + JobRow.id).where(JobRow.owner == _OWNER)
+_OF_UPLOADS = select(UploadRow.sha256).where(UploadRow.owner == _OWNER, UploadRow.sha256.is_not(None))
+_STORED = (
+    select(func.sum(UploadRow.length)).where(UploadRow.owner == _OWNER, UploadRow.sha256.is_(None)),
+    select(func.sum(BlobRow.size)).where(BlobRow.sha256.in_(union(_OF_JOBS, _OF_UPLOADS))),
+    select(func.sum(ArtifactRow.size)).join(JobRow, JobRow.id == ArtifactRow.job_id).where(JobRow.owner == _OWNER),
+)

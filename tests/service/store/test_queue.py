@@ -1,0 +1,105 @@
+"""The next job of a long queue: as a plain sort of all jobs would have it, and without reading them all."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from service.store import Store
+from service.store.states import JobStatus
+from service.store.tables import JobRow
+from tests.service.store.helpers import ATTEMPTS, LEASE, Clock, lease, queue
+
+
+def sorted_queue(jobs: list[JobRow], served: dict[str, int], now: float) -> JobRow | None:
+    """The reference: all jobs that may start, in their order."""
+    ready = [job for job in jobs if job.status == JobStatus.QUEUED and job.not_before <= now]
+    lost = [job for job in jobs if job.lease_expires_at is not None and job.lease_expires_at < now]
+    ready += [job for job in lost if job.failures + 1 < ATTEMPTS]  # the others end as they are looked at
+    return min(ready, key=lambda job: (-job.priority, served.get(job.owner, 0), job.queued_at, job.id), default=None)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_is_that_of_a_plain_sort(store: Store, clock: Clock, seed: int) -> None:
+    chance = random.Random(seed)
+    served: dict[str, int] = {}
+    for turn in range(1, 60):
+        clock.now += chance.choice([0, 1, LEASE / 4])
+        for _ in range(chance.randrange(4)):
+            queue(store, chance.choice("abcdef"), chance.choice([0, 0, 0, 1]))
+        expected = sorted_queue(store.jobs.page(None, limit=1000), served, clock.now)
+        found = store.leases.take("one")
+        assert (found and found.job_id) == (expected and expected.id)
+        if found is None:
+            continue
+        served[found.job.owner] = turn
+        ending = chance.randrange(4)
+        if ending == 0:
+            store.leases.fail(found, {"code": "infrastructure", "message": "x"}, permanent=False)
+        elif ending == 1:
+            store.leases.release(found)
+        elif ending == 2:
+            store.leases.succeed(found, [], {})  # and a fourth is lost
+
+
+def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store, clock: Clock) -> None:
+    big = queue(store, "a")
+    small = []
+    for owner in "bca":
+        clock.now += 1
+        small.append(queue(store, owner))
+
+    def full(job: JobRow) -> bool:
+        return job.id != big
+
+    assert store.leases.take("one", full) is None
+    assert [held.job_id for _ in range(2) if (held := store.leases.take("two", full))] == small[:2]
+    assert store.leases.take("one", full) is None, "it is kept, however often others were served"
+    assert lease(store, "one").job_id == big
+    assert lease(store, "one").job_id == small[2]
+
+
+def test_a_job_that_room_is_kept_for_goes_where_it_fits_first(store: Store) -> None:
+    big = queue(store)
+    assert store.leases.take("one", lambda job: False) is None
+    assert lease(store, "two").job_id == big
+    other = queue(store)
+    assert lease(store, "one").job_id == other, "and nothing is kept any more"
+
+
+def test_room_is_not_kept_by_the_dead(store: Store, clock: Clock) -> None:
+    big = queue(store, "a")
+    clock.now += 1
+    small = queue(store, "b")
+    clock.now += 1
+    queue(store, "b")
+
+    def full(job: JobRow) -> bool:
+        return job.id != big
+
+    assert store.leases.take("dead", full) is None
+    found = store.leases.take("two", full)
+    assert found is not None
+    assert found.job_id == small
+    clock.now += LEASE + 1
+    assert store.leases.take("two", full) is None, "it keeps its own room from now on"
+    found = store.leases.take("three", full)
+    assert found is not None
+
+
+def test_a_higher_priority_goes_before_what_room_is_kept_for(store: Store, clock: Clock) -> None:
+    big = queue(store)
+    assert store.leases.take("one", lambda job: False) is None
+    urgent = queue(store, "b", priority=1)
+    assert lease(store, "one").job_id == urgent
+    assert lease(store, "one").job_id == big
+
+
+def test_what_waits_is_counted_no_further_than_asked(store: Store, clock: Clock) -> None:
+    for _ in range(5):
+        queue(store)
+    lease(store)
+    assert (store.leases.waiting(), store.leases.waiting(3)) == (4, 3)
+    clock.now += LEASE + 1
+    assert (store.leases.waiting(), store.leases.waiting(3)) == (5, 3)
