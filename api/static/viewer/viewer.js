@@ -8,8 +8,8 @@ import { words } from "../words.js";
 /** @typedef {{scene: SplatScene, colours: string, fade?: number}} Side what stands on one side of the wipe */
 /** @typedef {{program: WebGLProgram, at: (name: string) => WebGLUniformLocation | null}} Program */
 
-/** Milliseconds of a frame above which a moving picture has half as many pixels on each side. */
-const SLOW = 70;
+/** Milliseconds of a frame above which a moving picture has half, or a fourth, as many pixels on each side. */
+const SLOW = 70, VERY_SLOW = 350;
 /** Milliseconds without movement after which it has all. */
 const STILL = 160;
 const INK = [0.95, 0.55, 0.2, 0.95], CHOSEN = [1, 1, 1, 1];
@@ -37,7 +37,7 @@ export class Viewer {
     this.lost = false;
     this.ended = false;
     this.scale = 1;
-    this.slow = false;
+    this.movingScale = 1;
     this.movedAt = 0;
     this.requested = 0;
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false, powerPreference: "high-performance" });
@@ -151,16 +151,16 @@ export class Viewer {
       return;
     }
     const moving = performance.now() - this.movedAt < STILL;
-    const scale = moving && this.slow ? 0.5 : 1;
+    const scale = moving ? this.movingScale : 1;
     const again = this.askForOrder();
-    const now = this.sides ? [this.camera.number, this.orders(), this.cut, scale].join() : "";
     this.scale = scale;
     this.render();
     this.begun = performance.now();
     this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     this.gl.flush();
     this.frames++;
-    this.settled = !again && scale === 1 && now !== "";
+    this.settled = !again && scale === 1 && this.sides !== null;
+    if (!this.sides) return;
     this.requested = requestAnimationFrame(() => (this.settled ? this.settle() : this.step()));
   }
 
@@ -189,12 +189,8 @@ export class Viewer {
     const took = performance.now() - (this.begun ?? 0);
     this.milliseconds.push(took);
     if (this.milliseconds.length > 100) this.milliseconds.shift();
-    if (this.scale === 1) this.slow = took > SLOW;
+    if (this.scale === 1) this.movingScale = took > VERY_SLOW ? 0.25 : took > SLOW ? 0.5 : 1;
     return true;
-  }
-
-  orders() {
-    return [this.sides?.left.scene, this.sides?.right.scene].map((scene) => `${scene?.sortedFor}/${scene?.sortedOf}`).join();
   }
 
   /** Have the scenes sorted for this view; whether the picture is not yet that of the newest order. */
