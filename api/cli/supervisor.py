@@ -122,7 +122,7 @@ def _run(children: list[_Child], settings: ServiceSettings, announce: Callable[[
         signal.signal(number, handle)
     for child in children:
         child.start()
-    announce(f"Serving at {address} (documentation: {address}/docs). Data: {settings.folder}. Ctrl-C stops.")
+    announce(f"The page: {address}/ (the API's documentation: {address}/docs). Data: {settings.folder}. Ctrl-C stops.")
     while not signals:
         for child in children:
             child.restart_if_dead(announce)

@@ -11,7 +11,6 @@ from typing import Any
 
 import anyio.to_thread
 from fastapi import FastAPI
-from fastapi.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.context import Context
@@ -21,6 +20,7 @@ from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
 from api.http.routes import artifacts, events, jobs, operations, uploads
 from api.http.schemas import ANSWERS
+from api.http.static import add_static
 from api.http.submission import JobFromUploads
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
@@ -67,15 +67,19 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         await context.packer.close()
         store.close()
 
-    app = FastAPI(title="sgsst", version=_version(), description=_DESCRIPTION, lifespan=lifespan)
+    app = FastAPI(
+        title="sgsst",
+        version=_version(),
+        description=_DESCRIPTION,
+        lifespan=lifespan,
+        docs_url=None,  # FastAPI's own page loads its script from elsewhere
+        redoc_url=None,
+    )
     for module in (jobs, events, artifacts, uploads, operations):
         app.include_router(module.router)
+    add_static(app)
     add_handlers(app)
     app.add_middleware(Observed, state=app.state)
-
-    @app.get("/", include_in_schema=False)
-    def root() -> RedirectResponse:
-        return RedirectResponse("/docs")
 
     plain = app.openapi
 

@@ -1,0 +1,12 @@
+// The API's documentation, shown by Swagger UI (vendor/swagger-ui).
+"use strict";
+
+/* global SwaggerUIBundle */
+SwaggerUIBundle({
+  url: "/openapi.json",
+  dom_id: "#api",
+  deepLinking: true,
+  presets: [SwaggerUIBundle.presets.apis],
+  layout: "BaseLayout",
+  validatorUrl: null, // else the document would be sent to a validator on the internet
+});

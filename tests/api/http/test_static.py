@@ -1,0 +1,121 @@
+"""The page's files: addresses, caching, policy."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
+from tests.api.service import Service
+
+BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    data = tmp_path_factory.mktemp("static") / "data"
+    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as running, running.client() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def files() -> StaticFiles:
+    return static_files()
+
+
+@pytest.mark.parametrize(("path", "policy"), [("/", POLICY), ("/docs", DOCS_POLICY)])
+def test_pages_name_only_files_that_are_there(client: httpx.Client, path: str, policy: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    assert answer.headers["content-security-policy"] == policy
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["cache-control"] == "no-cache"
+    assert "{{" not in answer.text
+    named = re.findall(r'(?:src|href)="([^"]+)"', answer.text)
+    assert not [name for name in named if re.match("(https?:)?//", name)], "something of another site"
+    for name in named:
+        if name.startswith("/"):
+            assert client.get(name).status_code == 200, name
+
+
+def test_policies_let_no_text_of_a_page_run() -> None:
+    for policy in (POLICY, DOCS_POLICY):
+        assert "unsafe" not in policy
+        assert "http" not in policy
+        assert policy.startswith("default-src 'none'; script-src 'self';")
+
+
+def test_files_are_kept_for_ever_under_their_digest(client: httpx.Client, files: StaticFiles) -> None:
+    for name in files.files:
+        path = f"/static/{files.digest}/{name}"
+        plain = client.get(path, headers={"Accept-Encoding": "identity"})
+        assert plain.content == Path(FOLDER, name).read_bytes()
+        assert "max-age=31536000" in plain.headers["cache-control"]
+        assert "immutable" in plain.headers["cache-control"]
+        assert plain.headers["content-security-policy"] == POLICY
+        known = client.get(path, headers={"Accept-Encoding": "identity", "If-None-Match": plain.headers["etag"]})
+        assert (known.status_code, known.content) == (304, b"")
+
+
+def test_modules_have_the_type_that_browsers_ask_for(client: httpx.Client, files: StaticFiles) -> None:
+    for name, file in files.files.items():
+        if name.endswith(".js"):
+            assert file.kind.startswith("text/javascript"), name
+
+
+def test_what_is_worth_it_is_compressed_once(client: httpx.Client, files: StaticFiles) -> None:
+    path = f"/static/{files.digest}/{BUNDLE}"
+    with client.stream("GET", path, headers={"Accept-Encoding": "br, gzip;q=0.5"}) as answer:
+        assert answer.headers["content-encoding"] == "gzip"
+        assert answer.headers["vary"] == "Accept-Encoding"
+        packed, tag = b"".join(answer.iter_raw()), answer.headers["etag"]
+    assert gzip.decompress(packed) == Path(FOLDER, BUNDLE).read_bytes()
+    assert len(packed) < Path(FOLDER, BUNDLE).stat().st_size / 3
+    refused = client.get(path, headers={"Accept-Encoding": "gzip;q=0, identity"})
+    assert "content-encoding" not in refused.headers
+    assert refused.headers["etag"] != tag
+
+
+@pytest.mark.parametrize(
+    "name", ["0123456789abcdef/index.html", "{digest}/nothing.js", "{digest}/%2e%2e/%2e%2e/http/app.py", "{digest}/"]
+)
+def test_nothing_else_is_there(client: httpx.Client, files: StaticFiles, name: str) -> None:
+    answer = client.get(f"/static/{name.replace('{digest}', files.digest)}")
+    assert answer.status_code == 404
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "immutable" not in answer.headers.get("cache-control", "")
+
+
+def test_another_byte_is_another_address(tmp_path: Path) -> None:
+    for version, text in enumerate(("let a = 1;", "let a = 2;")):
+        folder = tmp_path / str(version)
+        folder.mkdir()
+        for page in ("index.html", "docs.html"):
+            (folder / page).write_text('<script src="{{static}}/page.js"></script>')
+        (folder / "page.js").write_text(text)
+    first, second = (static_files(tmp_path / name) for name in "01")
+    assert first.digest != second.digest
+    assert first.pages["index.html"].digest != second.pages["index.html"].digest
+
+
+def test_methods_that_change_something_are_refused(client: httpx.Client) -> None:
+    for path in ("/", "/docs", "/static/x/y"):
+        answer = client.post(path)
+        assert (answer.status_code, answer.headers["allow"]) == (405, "GET, HEAD")
+        assert client.head("/").status_code == 200
+
+
+def test_swagger_ui_is_what_its_makers_published() -> None:
+    folder = FOLDER / "vendor" / "swagger-ui"
+    lines = (folder / "SHA256SUMS").read_text().splitlines()
+    sums = {name: digest for digest, name in (line.split() for line in lines)}
+    assert {path.name for path in folder.iterdir()} == {*sums, "README.md", "SHA256SUMS"}
+    for name, digest in sums.items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest, name
