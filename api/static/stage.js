@@ -142,7 +142,7 @@ export class Stage {
     if (!viewer) return;
     const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
     const shown = this.showFrames ? this.cameras.filter((_, i) => i !== this.stood) : [];
-    viewer.lines.points = cameraLines(shown, length);
+    viewer.lines = cameraLines(shown, length);
     viewer.draw();
   }
 

@@ -3,7 +3,7 @@
 import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
-import { optionControl, showWrong } from "./options.js";
+import { optionControl } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
 import { droppedFiles, Slot, sorted } from "./slots.js";
@@ -52,7 +52,7 @@ export class SubmitView {
     this.ring = h("div.options");
     this.around = this.choice("views", say.around, false);
     this.fromFiles = this.choice("views", say.fromFiles, true);
-    this.viewsBody = h("div");
+    this.viewsBody = h("div.views-body");
     this.found = h("p.quiet");
     this.shares = h("div.options", { hidden: true });
     this.all = h("div.options");
@@ -346,10 +346,8 @@ export class SubmitView {
   async send() {
     const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files];
     const all = [scene.files, style.files, ...files].flat();
-    const rows = all.length > 8 ? null : new Map();
     for (const file of all) if (!this.uploads.has(file)) this.uploads.set(file, new Upload(file, () => this.showSending(all)));
     this.showSending(all);
-    void rows;
     this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
     for (const upload of this.sending) upload.over = false;
     const ids = await sendAll(this.sending);
@@ -463,5 +461,3 @@ export class SubmitView {
     this.opened?.end();
   }
 }
-
-void showWrong;

@@ -12,7 +12,8 @@ import { words } from "../words.js";
 const SLOW = 70, VERY_SLOW = 350;
 /** Milliseconds without movement after which it has all. */
 const STILL = 160;
-const INK = [0.95, 0.55, 0.2, 0.95], CHOSEN = [1, 1, 1, 1];
+/** Of lines, and how much of what is behind them they hide. */
+const INK = [0.98, 0.6, 0.28, 0.55];
 
 export class Viewer {
   /**
@@ -28,8 +29,8 @@ export class Viewer {
     /** Share of the width that shows the left side. */
     this.cut = 0;
     this.background = [0, 0, 0];
-    /** Lines in the world, pairs of points; `chosen`: those of the camera that is stood at. */
-    this.lines = { points: new Float32Array(0), chosen: new Float32Array(0) };
+    /** Lines in the world, pairs of points [n * 2 * 3]. */
+    this.lines = new Float32Array(0);
     this.touched = false;
     this.frames = 0;
     /** Of the last frames, milliseconds from its begin to its end on the GPU. @type {number[]} */
@@ -237,7 +238,7 @@ export class Viewer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     this.composite(w / width);
-    if (this.lines.points.length) this.drawLines(width, height);
+    if (this.lines.length) this.drawLines(width, height);
   }
 
   /**
@@ -358,12 +359,12 @@ export class Viewer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.lineBuffer ?? null);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-    for (const [points, ink] of /** @type {[Float32Array, number[]][]} */ ([[this.lines.points, INK], [this.lines.chosen, CHOSEN]])) {
-      if (!points.length) continue;
-      gl.bufferData(gl.ARRAY_BUFFER, points, gl.STREAM_DRAW);
-      gl.uniform4fv(at("ink"), ink);
-      gl.drawArrays(gl.LINES, 0, points.length / 3);
-    }
+    gl.bufferData(gl.ARRAY_BUFFER, this.lines, gl.STREAM_DRAW);
+    gl.uniform4fv(at("ink"), INK);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArrays(gl.LINES, 0, this.lines.length / 3);
+    gl.disable(gl.BLEND);
   }
 
   /**
