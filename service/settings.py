@@ -33,6 +33,7 @@ class ServiceSettings(BaseSettings):
             size adds to both (`service.inspection.inspector`).
         dry_run_seconds: processor time that planning without running may take; Gaussians and views add to it.
         receive_seconds: a request's body that stands still for so long is given up.
+        session_days: that a browser stays signed in which has shown a key.
         upload_hours: after which an unfinished upload, or a finished one that no job uses, expires.
         retention_days: after which a finished job's results expire; the job's record stays as long again.
         lease_seconds: after which another dispatcher takes a job over that has not been heard of.
@@ -72,6 +73,7 @@ class ServiceSettings(BaseSettings):
     dry_run_seconds: float = Field(600, gt=0)
     receive_seconds: float = Field(60, gt=0)
 
+    session_days: float = Field(7, gt=0)
     upload_hours: float = Field(24, gt=0)
     retention_days: float = Field(30, gt=0)
 
@@ -103,6 +105,11 @@ class ServiceSettings(BaseSettings):
     def artifacts_url(self) -> str:
         """The results' URL, a folder in `data` by default."""
         return self.artifacts or f"file://{self.folder / 'artifacts'}"
+
+    @property
+    def session_seconds(self) -> float:
+        """`session_days`, in seconds."""
+        return self.session_days * 86_400.0
 
     @property
     def retention_seconds(self) -> float:

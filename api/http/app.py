@@ -18,8 +18,9 @@ from api.http.documentation import complete
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
-from api.http.routes import artifacts, events, jobs, operations, uploads
+from api.http.routes import artifacts, events, inputs, jobs, operations, session, uploads
 from api.http.schemas import ANSWERS
+from api.http.sign_ins import SignIns
 from api.http.static import add_static
 from api.http.submission import JobFromUploads
 from service.files.artifacts import Artifacts
@@ -57,6 +58,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             packer=Packer(settings, store, blobs, results),
             hub=Hub(store),
             metrics=Metrics(store),
+            sign_ins=SignIns(),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
@@ -75,7 +77,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         docs_url=None,  # FastAPI's own page loads its script from elsewhere
         redoc_url=None,
     )
-    for module in (jobs, events, artifacts, uploads, operations):
+    for module in (jobs, events, inputs, artifacts, uploads, session, operations):
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)

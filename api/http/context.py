@@ -1,4 +1,10 @@
-"""What routes need: the parts of the service, and who is asking."""
+"""What routes need: the parts of the service, and who is asking.
+
+Programs send an API key with each request. A browser shows one once (`POST /v1/session`) and has a cookie from then on,
+which it also sends with pictures, downloads and event streams. A cookie comes along with whatever any page makes the
+browser ask for: SameSite=Strict keeps it from other sites, and what changes something must besides come from a page of
+this very origin, by the browser's own word (`Origin`, `Sec-Fetch-Site`).
+"""
 
 from __future__ import annotations
 
@@ -9,10 +15,11 @@ from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
 from api.http.hub import Hub
 from api.http.metrics import Metrics
+from api.http.sign_ins import SignIns
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
@@ -23,6 +30,10 @@ from service.store import Store
 
 #: Who owns what is created without a key, where no key is needed.
 LOCAL_OWNER = "local"
+#: Name of the cookie that holds a session.
+SESSION_COOKIE = "sgsst_session"
+#: Methods that change nothing.
+_READING = ("GET", "HEAD", "OPTIONS")
 _LOOPBACK_NAMES = {"localhost", "127.0.0.1", "::1"}
 
 
@@ -38,6 +49,12 @@ class ForeignSiteError(ServiceError):
     code, status = "foreign-site", 403
 
 
+class CrossOriginError(ServiceError):
+    """A request that would change something comes with a session's cookie, and not from a page of this service."""
+
+    code, status = "cross-origin", 403
+
+
 @dataclass(frozen=True)
 class Context:
     """The parts of the service, made once a process."""
@@ -50,6 +67,7 @@ class Context:
     packer: Packer
     hub: Hub
     metrics: Metrics
+    sign_ins: SignIns
 
 
 @dataclass(frozen=True)
@@ -70,13 +88,25 @@ ContextDep = Annotated[Context, Depends(get_context)]
 _bearer = HTTPBearer(auto_error=False, description="An API key: `sgsst keys create NAME` on the service's machine.")
 
 
+session_cookie = APIKeyCookie(
+    name=SESSION_COOKIE,
+    auto_error=False,
+    description="A browser's session: `POST /v1/session` gives it for an API key.",
+)
+
+
 async def get_caller(
-    request: Request, context: ContextDep, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+    request: Request,
+    context: ContextDep,
+    given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
+    cookie: Annotated[str | None, Depends(session_cookie)],
 ) -> Caller:
-    """The holder of the request's API key; everybody on this machine is the same one where no key is needed.
+    """The holder of the request's API key, or of its session's where there is no key; everybody on this machine is the
+    same one where no key is needed.
 
     Raises:
         NoKeyError: a key is needed and missing, or it is no good.
+        CrossOriginError: the session is good, but it is no page of this service that asks for a change.
         ForeignSiteError: no key, and the request comes from a web page that this service did not serve.
     """
     if given is not None:
@@ -86,13 +116,41 @@ async def get_caller(
         return Caller(key.id, key.priority)
     if request.headers.get("authorization") is not None:
         raise NoKeyError("The Authorization header must have the form 'Bearer KEY'.")
+    key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
+    if key is not None:
+        if request.method not in _READING:
+            check_origin(request)
+        return Caller(key.id, key.priority)
     if context.settings.keys_required:
+        if cookie:
+            raise NoKeyError("The session is over. Sign in again with an API key.")
         raise NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'.")
     _check_site(request, context.settings)
     return Caller(LOCAL_OWNER, 0)
 
 
 CallerDep = Annotated[Caller, Depends(get_caller)]
+
+
+def check_origin(request: Request, *, required: bool = True) -> None:
+    """Prove that a request comes from a page of this service, as far as the browser tells.
+
+    Args:
+        required: a request that tells nothing of where it comes from, as programs send it, is refused.
+
+    Raises:
+        CrossOriginError: it comes from elsewhere.
+    """
+    origin, site = request.headers.get("origin"), request.headers.get("sec-fetch-site")
+    if origin is not None and _netloc(origin) != request.headers.get("host"):
+        raise CrossOriginError(f"Pages of {origin[:100]!r} may not use the sessions of this service.")
+    if site is not None and site != "same-origin":
+        raise CrossOriginError("Pages of other sites may not use the sessions of this service.")
+    if required and origin is None and site is None:
+        raise CrossOriginError(
+            "A request with a session's cookie that changes something must say which page it comes from (Origin). "
+            "Programs send an API key instead: 'Authorization: Bearer KEY'."
+        )
 
 
 def _check_site(request: Request, settings: ServiceSettings) -> None:
@@ -103,8 +161,15 @@ def _check_site(request: Request, settings: ServiceSettings) -> None:
     if settings.on_loopback and host not in _LOOPBACK_NAMES and not host.startswith("127."):
         raise ForeignSiteError(f"The service is open to this machine only, and {host!r} is not one of its names.")
     origin = request.headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != request.headers.get("host"):
+    if origin is not None and _netloc(origin) != request.headers.get("host"):
         raise ForeignSiteError(f"Pages of {origin!r} may not use this service without an API key.")
+
+
+def _netloc(origin: str) -> str:
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:  # such as "http://[" , which no browser sends
+        return ""
 
 
 def _hostname(text: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from api.http.context import ForeignSiteError, NoKeyError
+from api.http.context import CrossOriginError, ForeignSiteError, NoKeyError
 from api.http.problems import (
     MEDIA_TYPE,
     HeadTooLargeError,
@@ -40,6 +40,11 @@ _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
     "Idempotency-Replayed": ("Nothing was made: it was there already.", {"const": "true"}, "true"),
     "Location": ("Where what was made is.", _TEXT, f"/v1/jobs/{JOB_ID}"),
     "Retry-After": ("Seconds after which to ask again.", _COUNT, 2),
+    "Set-Cookie": (
+        "The session.",
+        {"type": "string", "pattern": "^sgsst_session="},
+        'sgsst_session=""; HttpOnly; Max-Age=0; Path=/; SameSite=strict',
+    ),
     "Tus-Checksum-Algorithm": ("For `Upload-Checksum`.", _TEXT, "sha256,sha1,md5"),
     "Tus-Extension": ("What is spoken beside the protocol's core.", _TEXT, "creation,expiration,checksum,termination"),
     "Tus-Max-Size": ("Bytes that a file may have.", _COUNT, 16_000_000_000),
@@ -78,6 +83,7 @@ _ANYWHERE: tuple[ServiceError, ...] = (
 _WITH_KEY: tuple[ServiceError, ...] = (
     NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'."),
     ForeignSiteError("Pages of 'https://example.com' may not use this service without an API key."),
+    CrossOriginError("Pages of 'https://example.com' may not use the sessions of this service."),
 )
 
 

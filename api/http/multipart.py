@@ -312,6 +312,24 @@ def _kind(role: str) -> str:
     return {"style": "image", "photos": "image"}.get(role, role)
 
 
+async def read_json(request: Request, settings: ServiceSettings, most: int) -> Any:
+    """A body of JSON, of so many bytes at most.
+
+    Raises:
+        TooLargeError, BadRequestError, RefusedInputError: it has more, or is none; and as `body_blocks`.
+    """
+    body = bytearray()
+    async for block in body_blocks(request, settings):
+        body += block
+        if len(body) > most:
+            raise TooLargeError(f"A JSON body may have {most:,} bytes.", limit=most)
+    try:
+        text = body.decode()
+    except UnicodeDecodeError as error:
+        raise BadRequestError("The body is not UTF-8.") from error
+    return parse_json(text, "body")
+
+
 def parse_json(text: str, what: str) -> Any:
     """JSON of a field or body.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.files.artifacts import media_type
 from service.parameters import JobParameters
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
-from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
+from service.store.tables import ArtifactRow, AttemptRow, JobRow, ProgressPointRow, UploadRow
 
 if TYPE_CHECKING:
     StatusName = str
@@ -19,6 +20,8 @@ else:  # named where they stand in the OpenAPI document, which makes a schema of
     StatusName = Literal[tuple(map(str, JobStatus))]
     OutcomeName = Literal[tuple(map(str, AttemptOutcome))]
 
+#: Points of a job's course that are sent at most.
+MOST_POINTS = 512
 #: Of the examples, which tell of one job.
 JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
 UPLOAD_ID = "upl_1a1fe701a104f943e9d4d8cce5b818c"
@@ -62,6 +65,7 @@ class ProgressView(BaseModel):
         fraction=0.4,
         eta_s=310.5,
         loss=23729174.8,
+        scales=[41029174.8, 19120331.2, 11038018.4],
         seconds=205.1,
         attempt=1,
         updated_at=_NOW,
@@ -76,9 +80,47 @@ class ProgressView(BaseModel):
     fraction: float = Field(description="Of the steps, or of the views, 0 to 1.")
     eta_s: float | None = Field(description="Seconds left with all that is measured, as far as that can be told.")
     loss: float | None
+    scales: list[float | None] | None = Field(
+        None, description="The loss of each scale, full size first; null for scales that the step has left out."
+    )
     seconds: float | None = Field(description="Of all steps so far.")
     attempt: int
     updated_at: datetime
+
+
+class ProgressPoint(BaseModel):
+    """How far a job was at a moment."""
+
+    model_config = _with_example(
+        attempt=1,
+        stage="sos",
+        step=120,
+        total=300,
+        seconds=205.1,
+        loss=23729174.8,
+        scales=[41029174.8, 19120331.2, 11038018.4],
+        updated_at=_NOW,
+    )
+
+    attempt: int
+    stage: str = Field(description="As in a job's progress.")
+    step: int = Field(description="Of an attempt that goes on from a checkpoint, they begin behind that.")
+    total: int
+    seconds: float = Field(description="Of all steps so far.")
+    loss: float
+    scales: list[float | None] | None = Field(description="As in a job's progress.")
+    updated_at: datetime
+
+
+class ProgressHistory(BaseModel):
+    """The course of a job's loss, the oldest point first."""
+
+    model_config = _with_example(points=[_example_of(ProgressPoint)])
+
+    points: list[ProgressPoint] = Field(
+        max_length=MOST_POINTS,
+        description="Evenly in the logarithm of seconds; first and last are the job's first and last.",
+    )
 
 
 class InputView(BaseModel):
@@ -135,6 +177,7 @@ class JobView(BaseModel):
         expires_at=None,
         attempt=1,
         queue_position=None,
+        preview="previews/step_0000100.jpg",
         progress=_example_of(ProgressView),
         result=None,
         error=None,
@@ -155,6 +198,9 @@ class JobView(BaseModel):
     expires_at: datetime | None = Field(description="When the results are removed, or the record of an expired job.")
     attempt: int = Field(description="Of the attempt that runs or ran last; 0 before the first.")
     queue_position: int | None = Field(description="1 is next; null where the job is not queued.")
+    preview: str | None = Field(
+        description="The artifact with the newest picture of the job; null where there is none yet."
+    )
     progress: ProgressView | None
     result: dict[str, Any] | None = Field(description="Steps, why it stopped, loss before and after.")
     error: ErrorView | None
@@ -209,6 +255,22 @@ class ArtifactList(BaseModel):
     model_config = _with_example(artifacts=[_example_of(ArtifactView)])
 
     artifacts: list[ArtifactView]
+
+
+class InputFileView(InputView):
+    """A file that a job was created from, and where its bytes are."""
+
+    model_config = _with_example(**_example_of(InputView), url=f"/v1/jobs/{JOB_ID}/inputs/scene")
+
+    url: str
+
+
+class InputList(BaseModel):
+    """The files that a job was created from, in the order in which they came."""
+
+    model_config = _with_example(inputs=[_example_of(InputFileView)])
+
+    inputs: list[InputFileView]
 
 
 class UploadView(BaseModel):
@@ -277,6 +339,27 @@ class PlanView(BaseModel):
     plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
 
 
+class SignIn(BaseModel):
+    """An API key that a browser shows."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        hide_input_in_errors=True,
+        json_schema_extra={"examples": [{"key": "sgsst_ThisIsNoKeyButAnExampleOfOne"}]},
+    )
+
+    key: str = Field(min_length=1, max_length=200, description="`sgsst keys create NAME` on the service's machine.")
+
+
+class SessionView(BaseModel):
+    """Who is asking, as far as a browser needs to know."""
+
+    model_config = _with_example(keys_needed=True, signed_in=True)
+
+    keys_needed: bool = Field(description="Whether anything can be done without an API key.")
+    signed_in: bool = Field(description="Whether the cookie is that of a session.")
+
+
 class Health(BaseModel):
     """Whether the service can do its work."""
 
@@ -290,7 +373,7 @@ class Health(BaseModel):
     checks: dict[str, str]
 
 
-ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health)
+ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health, SignIn)
 
 
 def utc(seconds: float) -> datetime:
@@ -302,12 +385,12 @@ def _utc_or_none(seconds: float | None) -> datetime | None:
     return None if seconds is None else utc(seconds)
 
 
-def job_view(job: JobRow, queue_position: int | None) -> JobView:
-    """A job as the API shows it."""
-    return JobView(**_job_fields(job, queue_position))
+def job_view(job: JobRow, queue_position: int | None, preview: str | None) -> JobView:
+    """A job as the API shows it; `preview` is the name of its newest picture."""
+    return JobView(**_job_fields(job, queue_position, preview))
 
 
-def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow]) -> JobDetail:
+def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow], preview: str | None) -> JobDetail:
     """A job with its attempts."""
     shown = [
         AttemptView(
@@ -319,10 +402,10 @@ def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRo
         )
         for row in attempts
     ]
-    return JobDetail(**_job_fields(job, queue_position), attempts=shown)
+    return JobDetail(**_job_fields(job, queue_position, preview), attempts=shown)
 
 
-def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
+def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) -> dict[str, Any]:
     here = f"/v1/jobs/{job.id}"
     progress = job.progress
     return {
@@ -335,6 +418,7 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
         "expires_at": _utc_or_none(job.expires_at),
         "attempt": job.attempt,
         "queue_position": queue_position,
+        "preview": preview,
         "progress": ProgressView(**{**progress, "updated_at": utc(progress["updated_at"])}) if progress else None,
         "result": job.result,
         "error": ErrorView(**job.error) if job.error else None,
@@ -347,6 +431,24 @@ def _job_fields(job: JobRow, queue_position: int | None) -> dict[str, Any]:
             result=f"{here}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
         ),
     }
+
+
+def input_views(job: JobRow) -> list[InputFileView]:
+    """The files that a job was created from."""
+    found, places = [], Counter[str]()
+    for entry in job.inputs:
+        role, place = entry["role"], places[entry["role"]]
+        places[role] += 1
+        address = f"/v1/jobs/{job.id}/inputs/{role}" + (f":{place}" if place else "")
+        found.append(InputFileView(**entry, url=address))
+    return found
+
+
+def progress_history(rows: list[ProgressPointRow]) -> ProgressHistory:
+    """The course of a job's loss as the API shows it."""
+    names = ("attempt", "stage", "step", "total", "seconds", "loss", "scales")
+    shown = [{name: getattr(row, name) for name in names} | {"updated_at": utc(row.updated_at)} for row in rows]
+    return ProgressHistory(points=[ProgressPoint(**point) for point in shown])
 
 
 def poll_seconds(job: JobRow) -> int | None:

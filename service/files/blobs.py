@@ -26,6 +26,8 @@ from service.store.tables import BlobRow, UploadRow
 
 #: Files that no row refers to are removed at this age: a younger one's row may still be on its way.
 _ORPHAN_SECONDS = 3600.0
+#: Bytes that a blob is read in.
+_PIECE = 1 << 20
 #: Unfinished uploads whose digests so far are remembered; what is forgotten is read again at the end.
 _MAX_DIGESTS = 10_000
 
@@ -134,6 +136,15 @@ class Blobs(ABC):
             StoreError: one cannot be had.
         """
 
+    @abstractmethod
+    def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
+        """The bytes of a blob from `start` up to `stop`, in pieces.
+
+        Raises:
+            FileNotFoundError: it has just been removed.
+            StoreError: the store of files is away.
+        """
+
     @contextmanager
     def lent(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
         """As `bring`, for as long as the block takes."""
@@ -225,6 +236,14 @@ class BlobFolder(Blobs):
                 gone
             )
         return found
+
+    def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
+        """From its file."""
+        with (self._blobs / row.location).open("rb", buffering=0) as file:
+            file.seek(start)
+            while start < stop and (data := file.read(min(_PIECE, stop - start))):
+                start += len(data)
+                yield data
 
     def begin_upload(self, upload_id: str) -> None:
         """Its file, empty."""

@@ -6,7 +6,7 @@ import logging
 import secrets
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -72,6 +72,10 @@ class StoredBlobs(Blobs):
             found[sha256] = place / sha256
             self._cache.link(sha256, row.size, found[sha256], partial(self._objects.get, f"{BLOBS}/{row.location}"))
         return found
+
+    def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
+        """From the store: who downloads a part needs no copy of the whole on this host."""
+        return self._objects.read(f"{BLOBS}/{row.location}", start, stop)
 
     def _put(self, path: Path, sha256: str, size: int, parts: list[str]) -> None:
         """Make a file a blob of the store.

@@ -188,6 +188,7 @@ def tell_progress(now: Progress) -> None:
             "loss": now.loss,
             "seconds": now.seconds,
             "seconds_left": now.seconds_left,
+            "scales": list(now.scales) or None,
         }
     )
 

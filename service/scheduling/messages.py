@@ -15,6 +15,7 @@ class Message(TypedDict, total=False):
     loss: float
     seconds: float
     seconds_left: float | None
+    scales: list[float | None] | None
     path: str
     gpus: list[str]
     file: dict[str, Any]

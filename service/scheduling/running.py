@@ -313,6 +313,7 @@ def progress_record(message: Message, attempt: int) -> dict[str, Any]:
         "fraction": step / total if total else 0.0,
         "eta_s": message.get("seconds_left"),
         "loss": message.get("loss"),
+        "scales": message.get("scales"),
         "seconds": message.get("seconds"),
         "attempt": attempt,
     }

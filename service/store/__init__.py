@@ -13,6 +13,7 @@ from service.store.leases import Leases
 from service.store.operations import Operations
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
+from service.store.sessions import Sessions
 
 
 class Store:
@@ -26,6 +27,7 @@ class Store:
         self.retention = Retention(self.database, settings.retention_seconds)
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
+        self.sessions = Sessions(self.database, settings.session_seconds)
         self.operations = Operations(self.database, settings.lease_seconds)
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ from service.errors import IdempotencyError
 from service.store.tables import Base, CounterRow, IdempotencyRow
 
 #: The newest migration; a database that says so needs no look at the migrations themselves.
-SCHEMA = "0004"
+SCHEMA = "0005"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Seconds that a writer waits for another one's transaction. All are short.
 _BUSY_SECONDS = 30

@@ -12,14 +12,23 @@ from sqlalchemy.orm import Session
 from service.errors import ConflictError, NotFoundError, QueueFullError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
+from service.store.history import points
 from service.store.leases import Published
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
-from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
+from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow, ProgressPointRow
 
-_JOBS, _ATTEMPTS, _BLOB_USES = (Base.metadata.tables[name] for name in ("jobs", "attempts", "blob_uses"))
+_JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
+    Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
+)
 # What is asked most, built once: building a query takes longer than answering it.
 _JOB = select(_JOBS).where(_JOBS.c.id == bindparam("job_id"))
 _ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
+# Names of previews sort by their steps.
+_NEWEST_PREVIEWS = (
+    select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name))
+    .where(_ARTIFACTS.c.job_id.in_(bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
+    .group_by(_ARTIFACTS.c.job_id)
+)
 _UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"), _JOBS.c.status.in_(UNFINISHED))
 
 
@@ -121,8 +130,8 @@ class Jobs:
         with self._database.reading() as session:
             return _job_of_owner(session, job_id, owner)
 
-    def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow]]:
-        """A job, its place in the queue and its attempts, as of one moment.
+    def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow], str | None]:
+        """A job, its place in the queue, its attempts and its newest picture's name, as of one moment.
 
         Raises:
             NotFoundError: as `get`.
@@ -134,7 +143,8 @@ class Jobs:
             job = JobRow(**row._mapping)
             found = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
             attempts = [AttemptRow(**each._mapping) for each in found]
-            return job, _queue_position(connection, job), attempts
+            preview = _newest_previews(connection, [job_id] if job.attempt else []).get(job_id)
+            return job, _queue_position(connection, job), attempts, preview
 
     def page(
         self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
@@ -241,6 +251,16 @@ class Jobs:
                 session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **made))
         return unused
 
+    def course(self, job: JobRow, most: int) -> list[ProgressPointRow]:
+        """The course of a job's loss from its first step to its present one, in `most` points or fewer."""
+        with self._database.reading() as session:
+            return points(session, job.id, job.progress, most)
+
+    def previews(self, job_ids: Sequence[str]) -> dict[str, str]:
+        """The name of the newest picture of each job; jobs without one are left out."""
+        with self._database.reading_rows() as connection:
+            return _newest_previews(connection, job_ids)
+
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
         """What happened to a job after the event of that number."""
         query = select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after)
@@ -279,6 +299,11 @@ def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: boo
     if job is None or (owner is not None and job.owner != owner):
         raise NotFoundError(f"There is no job {job_id}.")
     return job
+
+
+def _newest_previews(connection: Connection, job_ids: Sequence[str]) -> dict[str, str]:
+    rows = connection.execute(_NEWEST_PREVIEWS, {"ids": list(job_ids)}) if job_ids else ()
+    return {job_id: name for job_id, name in rows}
 
 
 def _queue_position(connection: Connection, job: JobRow) -> int | None:

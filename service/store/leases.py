@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, upsert
+from service.store.history import keep_point
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, TurnRow
@@ -172,12 +173,13 @@ class Leases:
                 move(session, job, Transition.BEGIN, now)
 
     def report_progress(self, lease: Lease, progress: dict[str, Any]) -> None:
-        """Replace the job's progress."""
+        """Replace the job's progress, and take it into the course of its loss (`history`)."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
             job.progress = {**progress, "updated_at": now}
             add_event(session, job.id, "progress", job.progress, now)
+            keep_point(session, job.id, job.progress)
             mine = and_(EventRow.job_id == job.id, EventRow.kind == "progress")
             oldest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(KEPT_PROGRESS).limit(1)
             found = session.scalar(oldest)

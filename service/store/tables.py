@@ -119,6 +119,22 @@ class EventRow(Base):
     __table_args__ = (Index("ix_events_job_id", "job_id", "id"), {"sqlite_autoincrement": True})
 
 
+class ProgressPointRow(Base):
+    """A point of the course of a job's loss; `scales` has the loss of each scale, None where one took no part."""
+
+    __tablename__ = "progress_points"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    attempt: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    step: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    total: Mapped[int] = mapped_column(Integer)
+    stage: Mapped[str] = mapped_column(String(20))
+    seconds: Mapped[float] = mapped_column(Float)
+    loss: Mapped[float] = mapped_column(Float)
+    scales: Mapped[list[Any] | None]
+    updated_at: Mapped[float] = mapped_column(Float)
+
+
 class ArtifactRow(Base):
     """A published file of a job; it is there as soon as this row is, and not before."""
 
@@ -190,6 +206,19 @@ class KeyRow(Base):
     priority: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[float] = mapped_column(Float)
     revoked_at: Mapped[float | None] = mapped_column(Float)
+
+
+class SessionRow(Base):
+    """A browser that has shown an API key: the SHA-256 of what its cookie holds, never the key."""
+
+    __tablename__ = "sessions"
+
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    key_id: Mapped[str] = mapped_column(ForeignKey("api_keys.id", ondelete="CASCADE"))
+    created_at: Mapped[float] = mapped_column(Float)
+    expires_at: Mapped[float] = mapped_column(Float, index=True)
+
+    __table_args__ = (Index("ix_sessions_key_id", "key_id", "created_at"),)
 
 
 class IdempotencyRow(Base):

@@ -38,6 +38,7 @@ class Progress:
         loss: of the step.
         seconds: of all steps so far.
         seconds_left: until the job ends, with all that is measured and written.
+        scales: loss of the step by scale, full size first; None for scales that it has left out.
     """
 
     stage: str
@@ -46,6 +47,7 @@ class Progress:
     loss: float
     seconds: float
     seconds_left: float
+    scales: tuple[float | None, ...] = ()
 
 
 class Measuring(Protocol):
@@ -192,9 +194,11 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Pr
         limit=most - stylizer.seconds if most else None,
     )
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
-    return Progress(
-        stage, record.step, stylizer.total, record.loss, stylizer.seconds, left + (expected.ending if expected else 0.0)
-    )
+    if expected:
+        left += expected.ending
+    terms = record.terms
+    scales = tuple(terms[scale].total if scale in terms else None for scale in range(max(terms, default=-1) + 1))
+    return Progress(stage, record.step, stylizer.total, record.loss, stylizer.seconds, left, scales)
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

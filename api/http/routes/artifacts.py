@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Iterator
-from itertools import chain
+from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import CallerDep, Context, ContextDep
-from api.http.documentation import Responses, headers, invalid, links, problems
-from api.http.routes.jobs import IfNoneMatch, JobId, find
-from api.http.schemas import JOB_ID, SHA256, ArtifactList, artifact_view
-from service.errors import BusyError, NoSpaceError, NotFoundError, RefusedInputError, ServiceError, StoreError
+from api.http.documentation import Responses, invalid, links, problems
+from api.http.routes.jobs import JobId, find
+from api.http.schemas import JOB_ID, ArtifactList, artifact_view
+from api.http.sending import NO_SUCH_RANGE, IfNoneMatch, IfRange, RangeHeader, SentFile, file_answers, send_file
+from service.errors import BusyError, NoSpaceError, NotFoundError, RefusedInputError, StoreError
 from service.files.artifacts import media_type
 from service.files.names import RESULT
 from service.store.tables import ArtifactRow, JobRow
@@ -34,12 +34,6 @@ _SANDBOX = (
 
 
 _NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
-
-
-class RangeError(ServiceError):
-    """A range that the file does not have."""
-
-    code, status = "range-not-satisfiable", 416
 
 
 @router.get(
@@ -71,31 +65,17 @@ _CONTENT = {
     "image/jpeg": "\xff\xd8\xff\xe0",
     "image/png": "\x89PNG\r\n\x1a\n",
 }
-_FILE = {
+_FILE: dict[str, Any] = {
     "content": {
         kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
         for kind, begin in _CONTENT.items()
     }
 }
-_SENT = ("ETag", "Accept-Ranges", "Cache-Control", "Content-Disposition", "X-Content-Type-Options")
 _ANSWERS: Responses = {
-    200: {
-        "description": "The file. Its ETag is the SHA-256 of its content.",
-        "headers": headers(*_SENT, "Content-Length", maybe=("Content-Security-Policy",)),
-        **_FILE,
-    },
-    206: {
-        "description": "The part that `Range` asks for.",
-        "headers": headers(*_SENT, "Content-Length", "Content-Range", maybe=("Content-Security-Policy",)),
-        **_FILE,
-    },
-    304: {
-        "description": "`If-None-Match` names what is there.",
-        "headers": headers(*_SENT, maybe=("Content-Security-Policy",)),
-    },
+    **file_answers(_FILE),
     **problems(
         NotFoundError(f"Job {JOB_ID} has no file 'stylized.ply' (yet). Its artifacts list has all there are."),
-        RangeError("The file has 42301 bytes.", headers={"Content-Range": "bytes */42301"}),
+        NO_SUCH_RANGE,
         invalid("query.format", "Input should be 'ply', 'compressed.ply' or 'spz'"),
         RefusedInputError(
             "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
@@ -124,13 +104,8 @@ async def get_artifact(
     name: Annotated[str, Path(description="As the list of artifacts has it.", examples=["stylized.ply"])],
     context: ContextDep,
     caller: CallerDep,
-    range_: Annotated[
-        str | None, Header(alias="Range", description="One range of bytes.", examples=["bytes=0-1023"])
-    ] = None,
-    if_range: Annotated[
-        str | None,
-        Header(alias="If-Range", description="An ETag; for another one all is sent.", examples=[f'"{SHA256}"']),
-    ] = None,
+    range_: RangeHeader = None,
+    if_range: IfRange = None,
     if_none_match: IfNoneMatch = None,
     form: Annotated[
         Form | None,
@@ -146,21 +121,17 @@ async def get_artifact(
     """Download a file, whole or in ranges, to be resumed with `Range` and `If-Range`."""
     job = await asyncio.to_thread(find, context, caller, job_id)
     row = await _find_artifact(context, job, name, form)
-    tag = f'"{row.sha256}"'
-    sent = _headers(row, tag, job.name)
-    if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
-        return Response(status_code=304, headers=sent)
-    span = _parse_range(range_, row.size) if range_ and if_range in (None, tag) else None
-    start, stop = span or (0, row.size)
-    sent["Content-Length"] = str(stop - start)
-    if span:
-        sent["Content-Range"] = f"bytes {start}-{stop - 1}/{row.size}"
-    status = 206 if span else 200
-    if request.method == "HEAD":
-        return Response(status_code=status, headers=sent, media_type=media_type(row.name))
-    body = context.artifacts.read(row.location, start, stop)
-    first = await asyncio.to_thread(_first, body)  # what fails now can still be answered
-    return StreamingResponse(chain(first, body), status, sent, media_type(row.name))
+    kind = media_type(row.name)
+    file = SentFile(
+        sha256=row.sha256,
+        size=row.size,
+        name=_file_name(job.name, row.name),
+        kind=kind,
+        inline=kind.startswith(_INLINE),
+        policy=_SANDBOX if kind.startswith("text/html") else None,
+        read=partial(context.artifacts.read, row.location),
+    )
+    return await send_file(request, file, range_, if_range, if_none_match)
 
 
 async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | None) -> ArtifactRow:
@@ -175,44 +146,7 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | 
     return row
 
 
-def _first(body: Iterator[bytes]) -> list[bytes]:
-    """The first piece of a body, where it has one."""
-    return [piece for piece in (next(body, None),) if piece is not None]
-
-
-def _headers(row: ArtifactRow, tag: str, job_name: str) -> dict[str, str]:
-    kind = media_type(row.name)
+def _file_name(job_name: str, name: str) -> str:
+    """Under which a result is saved: the job's name tells results of several jobs apart."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", job_name).strip("._")[:60]
-    file_name = f"{plain}-{PurePosixPath(row.name).name}" if plain else PurePosixPath(row.name).name
-    inline = kind.startswith(_INLINE)
-    sent = {
-        "ETag": tag,
-        "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",
-        "X-Content-Type-Options": "nosniff",
-        "Content-Disposition": f'{"inline" if inline else "attachment"}; filename="{file_name}"',
-    }
-    if kind.startswith("text/html"):
-        sent["Content-Security-Policy"] = _SANDBOX
-    return sent
-
-
-def _parse_range(text: str, size: int) -> tuple[int, int] | None:
-    """First byte and the one behind the last; None where the header asks for several ranges or makes no sense.
-
-    Raises:
-        RangeError: the range lies behind the end.
-    """
-    match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text.strip())
-    if match is None or match[0] == "bytes=-":
-        return None
-    first, last = match[1], match[2]
-    if not first:
-        start, stop = max(0, size - int(last)), size
-    else:
-        start, stop = int(first), min(size, int(last) + 1) if last else size
-        if last and int(last) < start:
-            return None
-    if start >= stop:
-        raise RangeError(f"The file has {size} bytes.", headers={"Content-Range": f"bytes */{size}"})
-    return start, stop
+    return f"{plain}-{PurePosixPath(name).name}" if plain else PurePosixPath(name).name

@@ -14,20 +14,24 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
-from api.http.multipart import BadRequestError, Received, body_blocks, check_file, parse_json, receive
+from api.http.multipart import Received, check_file, parse_json, read_json, receive
 from api.http.planning import DRY_RUN, answer_plan
 from api.http.schemas import (
     JOB_ID,
+    MOST_POINTS,
     JobDetail,
     JobPage,
     JobView,
+    ProgressHistory,
     StatusName,
     job_detail,
     job_view,
     poll_seconds,
+    progress_history,
 )
+from api.http.sending import IfNoneMatch
 from api.http.submission import BODY, REFUSALS, JobFromUploads
-from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError, TooLargeError
+from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError
 from service.files.staging import check_roles, clean_name, region_styles
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
@@ -50,16 +54,21 @@ IdempotencyHeader = Annotated[
 ]
 
 
-IfNoneMatch = Annotated[
-    str | None,
-    Header(alias="If-None-Match", description="An ETag; the same one is answered with 304.", examples=['"e7d2c939"']),
-]
 JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
 #: Headers of an answer that shows a job.
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 _NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
 #: What can be done with a job.
-_FOLLOWING_OPERATIONS = ("get_job", "cancel_job", "retry_job", "delete_job", "watch_job", "list_artifacts")
+_FOLLOWING_OPERATIONS = (
+    "get_job",
+    "cancel_job",
+    "retry_job",
+    "delete_job",
+    "watch_job",
+    "get_progress",
+    "list_inputs",
+    "list_artifacts",
+)
 
 
 @router.post(
@@ -146,7 +155,8 @@ def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotenc
     sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
     if not created:
         sent["Idempotency-Replayed"] = "true"
-    body = job_view(job, jobs.queue_position(job)).model_dump_json()
+    preview = None if created else jobs.previews([job.id]).get(job.id)
+    body = job_view(job, jobs.queue_position(job), preview).model_dump_json()
     return Response(body, 202, sent, media_type="application/json")
 
 
@@ -162,16 +172,7 @@ async def _from_form(request: Request, context: Context) -> Parts:
 
 
 async def _from_json(request: Request, context: Context) -> Parts:
-    body = bytearray()
-    async for block in body_blocks(request, context.settings):
-        body += block
-        if len(body) > _MAX_JSON:
-            raise TooLargeError(f"A JSON body may have {_MAX_JSON:,} bytes.", limit=_MAX_JSON)
-    try:
-        text = body.decode()
-    except UnicodeDecodeError as error:
-        raise BadRequestError("The body is not UTF-8.") from error
-    job = JobFromUploads.model_validate(parse_json(text, "body"))
+    job = JobFromUploads.model_validate(await read_json(request, context.settings, _MAX_JSON))
     job.parameters.settings()
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
@@ -256,7 +257,8 @@ def list_jobs(
     jobs = context.store.jobs
     found = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)
     shown = found[:limit]
-    views = [job_view(job, jobs.queue_position(job)) for job in shown]
+    previews = jobs.previews([job.id for job in shown])
+    views = [job_view(job, jobs.queue_position(job), previews.get(job.id)) for job in shown]
     return JobPage(jobs=views, next_cursor=shown[-1].id if len(found) > limit else None)
 
 
@@ -279,6 +281,17 @@ def get_job(
     """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
     check_id(job_id)
     return _job_response(context, caller, job_id, if_none_match)
+
+
+@router.get(
+    "/{job_id}/progress",
+    response_model=ProgressHistory,
+    responses=problems(_NOT_THERE),
+    operation_id="get_progress",
+)
+def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
+    """The course of a job's loss from its first step on, while it runs and after its end."""
+    return progress_history(context.store.jobs.course(find(context, caller, job_id), MOST_POINTS))
 
 
 @router.post(
@@ -373,8 +386,8 @@ def check_id(job_id: str) -> None:
 def _job_response(
     context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
 ) -> Response:
-    job, position, attempts = context.store.jobs.detail(job_id, caller.owner)
-    view = job_detail(job, position, attempts)
+    job, position, attempts, preview = context.store.jobs.detail(job_id, caller.owner)
+    view = job_detail(job, position, attempts, preview)
     body = view.model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     sent = {"ETag": tag, "Cache-Control": "private, no-cache"}

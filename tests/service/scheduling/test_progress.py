@@ -32,7 +32,7 @@ def records(channel: io.StringIO) -> list[dict[str, Any]]:
 def test_planning_is_a_stage_whose_steps_are_views(channel: io.StringIO) -> None:
     tell_planning(PlanningProgress(0, 8))
     tell_planning(PlanningProgress(2, 8, 31.5))
-    nothing = {"loss": None, "seconds": None, "attempt": 2}
+    nothing = {"loss": None, "scales": None, "seconds": None, "attempt": 2}
     assert records(channel) == [
         {"stage": "planning", "step": 0, "total": 8, "fraction": 0.0, "eta_s": None, **nothing},
         {"stage": "planning", "step": 2, "total": 8, "fraction": 0.25, "eta_s": 31.5, **nothing},
@@ -41,8 +41,8 @@ def test_planning_is_a_stage_whose_steps_are_views(channel: io.StringIO) -> None
 
 def test_steps_follow_where_the_job_goes_on(channel: io.StringIO, capsys: pytest.CaptureFixture[str]) -> None:
     tell_prepared(Prepared([("scene", "616 Gaussians")], 3, 12))
-    tell_progress(Progress("sos", 6, 12, 0.5, 20.0, 10.0))
+    tell_progress(Progress("sos", 6, 12, 0.5, 20.0, 10.0, (None, 0.5)))
     starting, step = records(channel)
     assert (starting["stage"], starting["step"], starting["fraction"]) == ("starting", 3, 0.25)
-    assert (step["stage"], step["fraction"], step["loss"]) == ("sos", 0.5, 0.5)
+    assert (step["stage"], step["fraction"], step["loss"], step["scales"]) == ("sos", 0.5, 0.5, [None, 0.5])
     assert "scene: 616 Gaussians" in capsys.readouterr().err

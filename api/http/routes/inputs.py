@@ -1,0 +1,126 @@
+"""`/v1/jobs/{id}/inputs`: the files that a job was created from, as they were sent."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from functools import partial
+from pathlib import PurePosixPath
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.responses import StreamingResponse
+
+from api.http.context import Caller, CallerDep, Context, ContextDep
+from api.http.documentation import Responses, links, problems
+from api.http.routes.jobs import JobId, find
+from api.http.schemas import JOB_ID, InputList, input_views
+from api.http.sending import NO_SUCH_RANGE, IfNoneMatch, IfRange, RangeHeader, SentFile, file_answers, send_file
+from service.errors import NotFoundError, StoreError
+from service.store.states import JobStatus
+from service.store.tables import BlobRow
+
+router = APIRouter(prefix="/v1/jobs", tags=["inputs"])
+
+#: What inputs are sent as, by the endings of their names: pictures can be shown in a page, everything else is bytes.
+_KINDS = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".webp": "image/webp",
+    ".json": "application/json",
+}
+#: They are a user's files: nothing in them may run.
+_POLICY = "sandbox; default-src 'none'"
+
+_NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
+_CONTENT: dict[str, Any] = {
+    "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
+    "application/json": [{"id": 0, "img_name": "view_0", "width": 64, "height": 48}],
+    "image/jpeg": "\xff\xd8\xff\xe0",
+    "image/png": "\x89PNG\r\n\x1a\n",
+    "image/webp": "RIFF",
+}
+_FILE: dict[str, Any] = {
+    "content": {
+        kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
+        for kind, begin in _CONTENT.items()
+    }
+}
+_ANSWERS: Responses = {
+    **file_answers(_FILE, always_policy=True),
+    **problems(
+        NotFoundError(f"Job {JOB_ID} has no input 'style:1' (any more). Its list of inputs has all there are."),
+        NO_SUCH_RANGE,
+        StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
+    ),
+}
+
+
+@router.get(
+    "/{job_id}/inputs",
+    response_model=InputList,
+    responses={
+        200: {
+            "links": links(
+                "get_input", "head_input", job_id="$request.path.job_id", role="$response.body#/inputs/0/role"
+            )
+        },
+        **problems(_NO_JOB),
+    },
+    operation_id="list_inputs",
+)
+def list_inputs(job_id: JobId, context: ContextDep, caller: CallerDep) -> InputList:
+    """The files that a job was created from."""
+    return InputList(inputs=input_views(find(context, caller, job_id)))
+
+
+@router.head("/{job_id}/inputs/{role}", operation_id="head_input", response_class=Response, responses=_ANSWERS)
+@router.get("/{job_id}/inputs/{role}", operation_id="get_input", response_class=StreamingResponse, responses=_ANSWERS)
+async def get_input(
+    request: Request,
+    job_id: JobId,
+    role: Annotated[
+        str,
+        Path(
+            description="`scene`, `style`, `cameras` or `photos`; of several files the first one, or `style:1` and so "
+            "on, counted from 0 in the order of the list.",
+            examples=["scene"],
+        ),
+    ],
+    context: ContextDep,
+    caller: CallerDep,
+    range_: RangeHeader = None,
+    if_range: IfRange = None,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """Download a file that a job was created from, whole or in ranges, until the job expires."""
+    entry, row = await asyncio.to_thread(_find_input, context, caller, job_id, role)
+    file = SentFile(
+        sha256=row.sha256,
+        size=row.size,
+        name=entry["name"],
+        kind=_KINDS.get(PurePosixPath(entry["name"]).suffix.lower(), "application/octet-stream"),
+        inline=False,
+        policy=_POLICY,
+        read=partial(context.blobs.read, row),
+    )
+    return await send_file(request, file, range_, if_range, if_none_match)
+
+
+def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tuple[dict[str, Any], BlobRow]:
+    """A job's entry for a file, and the file.
+
+    Raises:
+        NotFoundError: there is none, or no more: an expired job has let go of its inputs.
+    """
+    job = find(context, caller, job_id)
+    match = re.fullmatch(r"([a-z]{1,10})(?::(\d{1,6}))?", role, re.ASCII)
+    found = [entry for entry in job.inputs if match is not None and entry["role"] == match[1]]
+    place = int(match[2] or 0) if match is not None else 0
+    if place < len(found) and job.status != JobStatus.EXPIRED:
+        entry = found[place]
+        row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
+        if row is not None:
+            return entry, row
+    raise NotFoundError(f"Job {job.id} has no input {role[:40]!r} (any more). Its list of inputs has all there are.")

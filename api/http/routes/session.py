@@ -1,0 +1,119 @@
+"""`/v1/session`: a browser shows an API key once, and has a cookie from then on."""
+
+from __future__ import annotations
+
+import asyncio
+
+from fastapi import APIRouter, Request, Response
+
+from api.http.context import (
+    SESSION_COOKIE,
+    Context,
+    ContextDep,
+    CrossOriginError,
+    NoKeyError,
+    check_origin,
+)
+from api.http.documentation import headers, invalid, problems
+from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError, read_json
+from api.http.schemas import SessionView, SignIn
+from api.http.sign_ins import TooManyTriesError
+from service.errors import TooLargeError
+
+router = APIRouter(prefix="/v1/session", tags=["session"])
+
+#: Bytes of a body, which only holds a key.
+_MAX_BODY = 4096
+_ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the sessions of this service.")
+
+
+@router.post(
+    "",
+    status_code=204,
+    response_class=Response,
+    operation_id="sign_in",
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/SignIn"}}},
+        }
+    },
+    responses={
+        204: {"description": "The cookie is the session.", "headers": headers("Set-Cookie", "Cache-Control")},
+        **problems(
+            NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one."),
+            _ELSEWHERE,
+            TooManyTriesError("Too many keys that are no good came from this address. Try again later."),
+            invalid("key", "Field required"),
+            MediaTypeError("The body must be application/json."),
+            TooLargeError("A JSON body may have 4,096 bytes.", limit=_MAX_BODY),
+            BadRequestError("The body is not UTF-8."),
+            TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
+            key=False,
+        ),
+    },
+)
+async def sign_in(request: Request, context: ContextDep) -> Response:
+    """Show an API key once, and have a cookie from then on: it is HttpOnly, and sent by this site's pages alone. A
+    session ends after some days (`SGSST_SESSION_DAYS`), with `DELETE`, or with its key.
+    """
+    check_origin(request, required=False)
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        raise MediaTypeError("The body must be application/json.")
+    wanted = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
+    address = request.client.host if request.client else ""
+    context.sign_ins.check(address)
+    key = await asyncio.to_thread(context.store.keys.find, wanted.key)
+    if key is None:
+        context.sign_ins.failed(address)
+        raise NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one.")
+    context.sign_ins.succeeded(address)
+    await _end(request, context)
+    text = await asyncio.to_thread(context.store.sessions.create, key.id)
+    return _answer(request, text, int(context.store.sessions.seconds))
+
+
+@router.get("", response_model=SessionView, operation_id="get_session", responses=problems(key=False))
+async def get_session(request: Request, context: ContextDep, response: Response) -> SessionView:
+    """Whether a key is needed, and whether this browser has shown one."""
+    response.headers["Cache-Control"] = "no-store"
+    cookie = request.cookies.get(SESSION_COOKIE)
+    key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
+    return SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None)
+
+
+@router.delete(
+    "",
+    status_code=204,
+    response_class=Response,
+    operation_id="sign_out",
+    responses={
+        204: {"description": "The session is over.", "headers": headers("Set-Cookie", "Cache-Control")},
+        **problems(_ELSEWHERE, key=False),
+    },
+)
+async def sign_out(request: Request, context: ContextDep) -> Response:
+    """End the session, here and in the browser; without one, nothing happens."""
+    check_origin(request, required=SESSION_COOKIE in request.cookies)
+    await _end(request, context)
+    return _answer(request, "", 0)
+
+
+async def _end(request: Request, context: Context) -> None:
+    """End the session of the request's cookie, where there is one."""
+    cookie = request.cookies.get(SESSION_COOKIE)
+    if cookie:
+        await asyncio.to_thread(context.store.sessions.end, cookie)
+
+
+def _answer(request: Request, text: str, seconds: int) -> Response:
+    """204 with the cookie.
+
+    Where a proxy has ended TLS, the request itself came without: the browser's `Origin` tells how it sees this site.
+    """
+    secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
+    response = Response(status_code=204, headers={"Cache-Control": "no-store"})
+    response.set_cookie(
+        SESSION_COOKIE, text, max_age=seconds, path="/", secure=secure, httponly=True, samesite="strict"
+    )
+    return response

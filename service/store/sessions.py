@@ -1,0 +1,60 @@
+"""Sessions of browsers in the store: who has shown an API key once need not send it again."""
+
+from __future__ import annotations
+
+import secrets
+
+from sqlalchemy import bindparam, delete, select
+
+from service.store.database import Database
+from service.store.keys import digest
+from service.store.tables import Base, KeyRow, SessionRow
+
+#: Of one key; the oldest ends when there would be more.
+MOST_SESSIONS = 100
+
+_KEYS, _SESSIONS = (Base.metadata.tables[name] for name in ("api_keys", "sessions"))
+_KEY = (
+    select(_KEYS)
+    .join(_SESSIONS, _SESSIONS.c.key_id == _KEYS.c.id)
+    .where(
+        _SESSIONS.c.sha256 == bindparam("sha256"),
+        _SESSIONS.c.expires_at > bindparam("now"),
+        _KEYS.c.revoked_at.is_(None),
+    )
+)
+
+
+class Sessions:
+    """Sessions; the text of one is a secret of 256 random bits, of which the SHA-256 is stored.
+
+    Args:
+        seconds: that one lasts.
+    """
+
+    def __init__(self, database: Database, seconds: float) -> None:
+        self._database = database
+        self.seconds = seconds
+
+    def create(self, key_id: str) -> str:
+        """A new session of a key, and the only copy of its text; sessions that have expired are forgotten."""
+        text, now = secrets.token_urlsafe(32), self._database.clock()
+        with self._database.writing() as session:
+            session.execute(delete(SessionRow).where(SessionRow.expires_at <= now))
+            mine = select(SessionRow.sha256).where(SessionRow.key_id == key_id)
+            old = session.scalars(mine.order_by(SessionRow.created_at.desc()).offset(MOST_SESSIONS - 1)).all()
+            session.execute(delete(SessionRow).where(SessionRow.sha256.in_(old)))
+            row = SessionRow(sha256=digest(text), key_id=key_id, created_at=now, expires_at=now + self.seconds)
+            session.add(row)
+        return text
+
+    def find(self, text: str) -> KeyRow | None:
+        """The key of a session, unless the session is unknown or over, or the key was revoked."""
+        with self._database.reading_rows() as connection:
+            row = connection.execute(_KEY, {"sha256": digest(text), "now": self._database.clock()}).one_or_none()
+        return KeyRow(**row._mapping) if row is not None else None
+
+    def end(self, text: str) -> None:
+        """End a session, if there is one."""
+        with self._database.writing() as session:
+            session.execute(delete(SessionRow).where(SessionRow.sha256 == digest(text)))

@@ -1,0 +1,371 @@
+"""Browsers: a key shown once, a cookie from then on, and pages of other sites that try to use it."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterator
+from http.cookies import Morsel, SimpleCookie
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.http.sign_ins import MOST_FAILURES, WITHIN_SECONDS, SignIns, TooManyTriesError
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.sessions import MOST_SESSIONS
+from tests.api.service import Service, check_documented
+
+COOKIE = "sgsst_session"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("session") / "data"
+
+
+@pytest.fixture(scope="module")
+def service(data: Path) -> Iterator[Service]:
+    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[Store]:
+    opened = open_store(ServiceSettings(data=service.data))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def browser(service: Service) -> Iterator[httpx.Client]:
+    """It keeps cookies, and names the page that asks, as browsers do."""
+    with service.client() as made:
+        made.headers["Origin"] = service.url
+        yield made
+
+
+@pytest.fixture
+def key(store: Store) -> str:
+    return store.keys.create("alice")[1]
+
+
+def sign_in(browser: httpx.Client, key: str, **headers: str) -> httpx.Response:
+    return browser.post("/v1/session", json={"key": key}, headers=headers)
+
+
+def cookie_of(answer: httpx.Response) -> Morsel[str]:
+    found: SimpleCookie = SimpleCookie(answer.headers["set-cookie"])
+    return found[COOKIE]
+
+
+def refused(answer: httpx.Response, status: int, code: str) -> None:
+    assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
+    check_documented(answer)
+
+
+def job_of(store: Store, owner: str) -> str:
+    """A job of a scene that was never sent: nobody runs it."""
+    sha256 = "a" * 64
+    store.inputs.add_blob(sha256, "aa/a", 10)
+    inputs = [{"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 10}]
+    return store.jobs.create(NewJob(owner, "job", 0, {}, inputs), limit=1000)[0].id
+
+
+def test_a_key_is_shown_once(browser: httpx.Client, store: Store) -> None:
+    row, key = store.keys.create("alice")
+    job_id = job_of(store, row.id)
+    refused(browser.get("/v1/jobs"), 401, "unauthorized")
+    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
+    answer = sign_in(browser, key)
+    assert (answer.status_code, answer.content) == (204, b"")
+    cookie = cookie_of(answer)
+    assert cookie["httponly"]
+    assert cookie["samesite"].lower() == "strict"
+    assert cookie["path"] == "/"
+    assert not cookie["domain"]
+    assert not cookie["secure"], "this is http"
+    assert int(cookie["max-age"]) == 7 * 86_400
+    assert key not in cookie.value
+    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": True}
+    assert [job["id"] for job in browser.get("/v1/jobs").json()["jobs"]] == [job_id]
+
+
+def test_the_cookie_is_for_https_where_the_page_came_by_it(service: Service, key: str) -> None:
+    # behind a proxy that ends TLS: the request itself came by http
+    with service.client() as browser:
+        host = service.url.removeprefix("http://")
+        assert cookie_of(sign_in(browser, key, Origin=f"https://{host}"))["secure"]
+
+
+def test_what_is_stored_opens_nothing(browser: httpx.Client, service: Service, data: Path, key: str) -> None:
+    text = cookie_of(sign_in(browser, key)).value
+    with sqlite3.connect(data / "sgsst.db") as connection:
+        (stored,) = connection.execute("SELECT group_concat(sha256) FROM sessions").fetchone()
+        everything = "\n".join(connection.iterdump())
+    assert text not in everything
+    assert key not in everything
+    with service.client() as thief:
+        for digest in stored.split(","):
+            refused(thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={digest}"}), 401, "unauthorized")
+        assert thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
+
+
+def test_signing_out_ends_the_session_itself(browser: httpx.Client, service: Service, key: str) -> None:
+    text = cookie_of(sign_in(browser, key)).value
+    answer = browser.delete("/v1/session")
+    assert answer.status_code == 204
+    assert cookie_of(answer)["max-age"] == "0"
+    assert browser.get("/v1/session").json()["signed_in"] is False
+    with service.client() as thief:
+        refused(thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}), 401, "unauthorized")
+    assert browser.delete("/v1/session").status_code == 204, "again"
+
+
+def test_signing_in_again_ends_the_session_before(browser: httpx.Client, service: Service, key: str) -> None:
+    first = cookie_of(sign_in(browser, key)).value
+    second = cookie_of(sign_in(browser, key)).value
+    assert first != second
+    with service.client() as thief:
+        refused(thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={first}"}), 401, "unauthorized")
+        assert thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={second}"}).status_code == 200
+
+
+def test_a_revoked_key_ends_its_sessions(browser: httpx.Client, store: Store) -> None:
+    row, key = store.keys.create("bob")
+    sign_in(browser, key)
+    assert browser.get("/v1/jobs").status_code == 200
+    store.keys.revoke(row.id)
+    refused(browser.get("/v1/jobs"), 401, "unauthorized")
+    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
+
+
+def test_every_api_process_knows_a_session(browser: httpx.Client, data: Path, key: str) -> None:
+    text = cookie_of(sign_in(browser, key)).value
+    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as other, other.client() as client:
+        assert client.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
+    assert browser.get("/v1/jobs").status_code == 200
+
+
+def test_a_key_in_the_request_wins(browser: httpx.Client, store: Store, key: str) -> None:
+    other, text = store.keys.create("carol")
+    job_id = job_of(store, other.id)
+    sign_in(browser, key)
+    asked = browser.get("/v1/jobs", headers={"Authorization": f"Bearer {text}"})
+    assert [job["id"] for job in asked.json()["jobs"]] == [job_id]
+    refused(browser.get("/v1/jobs", headers={"Authorization": "Bearer wrong"}), 401, "unauthorized")
+    # and needs no page: nothing adds it to a request of another site
+    del browser.headers["Origin"]
+    canceled = browser.post(f"/v1/jobs/{job_id}/cancel", headers={"Authorization": f"Bearer {text}"})
+    assert canceled.status_code == 200
+
+
+def test_two_sessions_do_not_see_each_others_jobs(service: Service, store: Store) -> None:
+    rows = [store.keys.create(name) for name in ("dora", "emil")]
+    jobs = [job_of(store, row.id) for row, _ in rows]
+    for (_, key), own, other in zip(rows, jobs, jobs[::-1], strict=True):
+        with service.client() as browser:
+            browser.headers["Origin"] = service.url
+            sign_in(browser, key)
+            assert browser.get(f"/v1/jobs/{own}").status_code == 200
+            for path in ("", "/events", "/progress", "/inputs", "/inputs/scene", "/artifacts", "/artifacts/plan.json"):
+                refused(browser.get(f"/v1/jobs/{other}{path}"), 404, "not-found")
+            refused(browser.delete(f"/v1/jobs/{other}"), 404, "not-found")
+
+
+# --- other sites ---------------------------------------------------------------------------------------------------
+
+#: What browsers send with a request that a page of another site makes, or that nobody knows who makes.
+ELSEWHERE: list[dict[str, str]] = [
+    {"Origin": "https://evil.example"},
+    {"Origin": "https://evil.example", "Sec-Fetch-Site": "cross-site"},
+    {"Origin": "null"},
+    {"Origin": ""},
+    {"Origin": "http://["},
+    {"Origin": "http://127.0.0.1"},  # another port of this machine
+    {"Origin": "SELF.evil.example"},
+    {"Origin": "http://evil@SELF"},
+    {"Sec-Fetch-Site": "cross-site"},
+    {"Sec-Fetch-Site": "same-site"},
+    {"Sec-Fetch-Site": "none"},
+    {"Origin": "SELF", "Sec-Fetch-Site": "cross-site"},
+    {"Origin": "https://evil.example", "Sec-Fetch-Site": "same-origin"},
+    {},
+]
+
+
+@pytest.mark.parametrize("headers", ELSEWHERE, ids=str)
+def test_pages_of_other_sites_change_nothing(
+    service: Service, store: Store, headers: dict[str, str], browser: httpx.Client
+) -> None:
+    row, key = store.keys.create("fred")
+    job_id = job_of(store, row.id)
+    sign_in(browser, key)
+    del browser.headers["Origin"]
+    sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}
+    upload = {"Tus-Resumable": "1.0.0", "Upload-Length": "5"}
+    simple = {"Content-Type": "text/plain"}  # what a form can send without being asked first
+    for method, path, more, body in (
+        ("POST", "/v1/jobs", simple, b"{}"),
+        ("POST", f"/v1/jobs/{job_id}/cancel", {}, b""),
+        ("POST", f"/v1/jobs/{job_id}/retry", {}, b""),
+        ("DELETE", f"/v1/jobs/{job_id}", {}, b""),
+        ("POST", "/v1/uploads", upload, b""),
+        ("DELETE", "/v1/session", {}, b""),
+    ):
+        answer = browser.request(method, path, headers={**sent, **more}, content=body)
+        refused(answer, 403, "cross-origin")
+        assert "set-cookie" not in answer.headers
+    assert store.jobs.get(job_id, row.id).status == "queued"
+    assert store.inputs.open_uploads(row.id) == 0
+    assert browser.get("/v1/session").json()["signed_in"] is True
+
+
+@pytest.mark.parametrize("headers", [{"Origin": "SELF"}, {"Sec-Fetch-Site": "same-origin"}], ids=str)
+def test_the_services_own_pages_change_something(
+    service: Service, store: Store, headers: dict[str, str], browser: httpx.Client
+) -> None:
+    row, key = store.keys.create("gina")
+    job_id = job_of(store, row.id)
+    sign_in(browser, key)
+    del browser.headers["Origin"]
+    sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}
+    assert browser.post(f"/v1/jobs/{job_id}/cancel", headers=sent).json()["status"] == "canceled"
+
+
+def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, store: Store) -> None:
+    """A link or a picture of another site can make a browser GET anything (without the cookie, by SameSite)."""
+    row, key = store.keys.create("hans")
+    job_id = job_of(store, row.id)
+    sign_in(browser, key)
+    del browser.headers["Origin"]
+    for path in (f"/v1/jobs/{job_id}/cancel", f"/v1/jobs/{job_id}/retry"):
+        refused_method = browser.get(path)
+        assert (refused_method.status_code, refused_method.json()["code"]) == (405, "method-not-allowed")
+    for path in ("/v1/jobs", f"/v1/jobs/{job_id}", f"/v1/jobs/{job_id}/progress", "/v1/session"):
+        answer = browser.get(path)
+        assert answer.status_code == 200
+        assert "set-cookie" not in answer.headers
+        assert not [name for name in answer.headers if name.startswith("access-control")]
+    assert store.jobs.get(job_id, row.id).status == "queued"
+    assert "set-cookie" not in browser.get("/v1/session?key=" + key).headers
+
+
+def test_other_sites_sign_nobody_in(service: Service, key: str) -> None:
+    """Else they could make somebody work under a key of theirs."""
+    with service.client() as browser:
+        for headers in ELSEWHERE[:-1]:
+            sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}
+            answer = sign_in(browser, key, **sent)
+            refused(answer, 403, "cross-origin")
+            assert "set-cookie" not in answer.headers
+
+
+# --- what is wrong, and too often ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status", "code"),
+    [
+        (b"{}", "application/json", 422, "invalid-request"),
+        (b'{"key": ""}', "application/json", 422, "invalid-request"),
+        (b'{"key": 5}', "application/json", 422, "invalid-request"),
+        (b'{"key": "x", "more": 1}', "application/json", 422, "invalid-request"),
+        (b"[" * 4000, "application/json", 422, "invalid-request"),
+        (b"key=x", "application/json", 422, "invalid-request"),
+        (b"\xff", "application/json", 400, "malformed-body"),
+        (b'{"key": "x"}', "text/plain", 415, "unsupported-media-type"),
+        (b'{"key": "' + b"x" * 5000 + b'"}', "application/json", 413, "too-large"),
+    ],
+)
+def test_what_is_no_sign_in(browser: httpx.Client, body: bytes, kind: str, status: int, code: str) -> None:
+    answer = browser.post("/v1/session", content=body, headers={"Content-Type": kind})
+    refused(answer, status, code)
+    assert "set-cookie" not in answer.headers
+
+
+def test_wrong_keys_are_refused_and_not_for_ever(tmp_path: Path) -> None:
+    with Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service, service.client() as browser:
+        store = open_store(ServiceSettings(data=service.data))
+        key = store.keys.create("ida")[1]
+        for _ in range(MOST_FAILURES):
+            refused(sign_in(browser, "sgsst_wrong"), 401, "unauthorized")
+        answer = sign_in(browser, key)
+        refused(answer, 429, "too-many-tries")
+        assert 0 < int(answer.headers["retry-after"]) <= WITHIN_SECONDS + 1
+        # who has a key elsewhere is not kept out by it
+        assert browser.get("/v1/jobs", headers={"Authorization": f"Bearer {key}"}).status_code == 200
+        store.close()
+
+
+def test_failures_are_forgotten_with_time_and_by_success() -> None:
+    now = 0.0
+    tries = SignIns(lambda: now)
+    for _ in range(MOST_FAILURES):
+        tries.check("a")
+        tries.failed("a")
+    with pytest.raises(TooManyTriesError):
+        tries.check("a")
+    tries.check("b")
+    now = WITHIN_SECONDS
+    tries.check("a")
+    tries.succeeded("a")
+    for _ in range(MOST_FAILURES):
+        tries.check("a")
+        tries.failed("a")
+
+
+def test_a_session_ends_with_its_time(tmp_path: Path) -> None:
+    now = 1000.0
+    store = open_store(ServiceSettings(data=tmp_path, session_days=1), lambda: now)
+    row, _ = store.keys.create("jan")
+    text = store.sessions.create(row.id)
+    now += 86_399
+    found = store.sessions.find(text)
+    assert found is not None
+    assert found.id == row.id
+    now += 1
+    assert store.sessions.find(text) is None
+    store.sessions.create(row.id)
+    with sqlite3.connect(tmp_path / "sgsst.db") as connection:
+        assert connection.execute("SELECT count(*) FROM sessions").fetchone() == (1,), "the old one is forgotten"
+    store.close()
+
+
+def test_sessions_of_a_key_are_bounded(tmp_path: Path) -> None:
+    now = 1000.0
+    store = open_store(ServiceSettings(data=tmp_path), lambda: now)
+    row, _ = store.keys.create("kim")
+    texts = []
+    for _ in range(MOST_SESSIONS + 3):
+        now += 1
+        texts.append(store.sessions.create(row.id))
+    alive = [store.sessions.find(text) is not None for text in texts]
+    assert alive == [False] * 3 + [True] * MOST_SESSIONS
+    store.close()
+
+
+def test_where_no_key_is_needed_a_cookie_that_is_no_good_does_no_harm(tmp_path: Path) -> None:
+    with Service(tmp_path / "data", alone=True) as service, service.client() as browser:
+        browser.cookies.set(COOKIE, "old")
+        assert browser.get("/v1/session").json() == {"keys_needed": False, "signed_in": False}
+        assert browser.get("/v1/jobs").status_code == 200
+        refused(browser.get("/v1/jobs", headers={"Origin": "https://evil.example"}), 403, "foreign-site")
+
+
+def test_streams_and_files_come_with_the_cookie(browser: httpx.Client, store: Store) -> None:
+    """`EventSource`, pictures and downloads can send no key of their own."""
+    row, key = store.keys.create("lea")
+    job_id = job_of(store, row.id)
+    sign_in(browser, key)
+    del browser.headers["Origin"]
+    started = time.monotonic()
+    with browser.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
+        assert answer.status_code == 200
+        lines: Iterator[Any] = answer.iter_lines()
+        assert any("queued" in line for line in lines)
+        assert time.monotonic() - started < 60
+    assert browser.get(f"/v1/jobs/{job_id}/artifacts").json() == {"artifacts": []}
