@@ -85,7 +85,7 @@ export class JobsView {
     const name = job.name || words.job.unnamed, style = job.inputs.filter((/** @type {any} */ input) => input.role === "style").map((/** @type {any} */ input) => input.name).join(", ");
     const running = UNFINISHED.includes(job.status), done = job.status === "succeeded";
     const picture = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", loading: "lazy", decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
-    const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) })) : null;
+    const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) }), h("small", { "aria-hidden": "true" }, say.choose)) : null;
     const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", name), h("small", [style, time(job.created_at)].filter(Boolean).join(" · "))),
       h("div.row", badge(job.status), running && job.progress?.total ? h("small", percent(job.progress.fraction)) : null, h("span.grow"), choose, running ? null : this.deleter(job, name)),
       running && job.progress?.total ? h("progress", { max: 1, value: job.progress.fraction, "aria-label": words.job.progress }) : null);

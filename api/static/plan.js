@@ -22,5 +22,5 @@ export function costCard(view) {
 /** @param {{item: string, decision: string, reason: string}[]} list */
 export function decisions(list) {
   if (!list.length) return h("p.quiet", say.none);
-  return h("ul.decisions", list.map(({ item, decision, reason }) => h("li", h("strong", item), h("span", decision), h("small", reason))));
+  return h("ul.decisions", { tabIndex: 0, "aria-label": say.decided }, list.map(({ item, decision, reason }) => h("li", h("strong", item), h("span", decision), h("small", reason))));
 }

@@ -1,6 +1,6 @@
 // @ts-check
 /** Runs of one scene in 3D: the original and each run's colours, two of them on the sides of the wipe. */
-import { artifactPath, ask, Problem } from "./api.js";
+import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
 import { Stage } from "./stage.js";
@@ -52,13 +52,11 @@ export class ResultStage {
   }
 
   async loadCameras() {
-    const { inputs } = this.jobs[0], files = inputs.filter((/** @type {any} */ input) => input.role === "cameras");
-    if (!files.length) return;
+    const here = `/v1/jobs/${this.jobs[0].id}/inputs`;
     try {
-      const blobs = await Promise.all(files.map(async (/** @type {any} */ file, /** @type {number} */ n) => {
-        const role = files.length > 1 ? `cameras:${n}` : "cameras";
-        return { name: file.name, blob: await (await ask("GET", `/v1/jobs/${this.jobs[0].id}/inputs/${role}`, { signal: this.signal })).blob() };
-      }));
+      const { inputs } = await get(here, this.signal), files = inputs.filter((/** @type {any} */ input) => /^cameras(:|$)/.test(input.role));
+      if (!files.length) return;
+      const blobs = await Promise.all(files.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${here}/${file.role}`, { signal: this.signal })).blob() })));
       this.stage.setCameras(await readCameras(blobs), { stand: true });
     } catch {
       // without cameras there is the free view

@@ -95,7 +95,8 @@ export class Stage {
     this.viewer.show(left, right ?? left);
     for (const part of [this.wipe, this.divider, this.leftName, this.rightName]) part.hidden = !this.names;
     if (names) [this.leftName.textContent, this.rightName.textContent] = names;
-    this.setWipe(this.names ? (this.share ?? 0.5) : 0);
+    if (this.names) this.setWipe(this.share ?? 0.5);
+    else this.viewer.wipe(0);
   }
 
   /** @param {number} share of the width that shows the left side */

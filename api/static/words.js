@@ -4,6 +4,7 @@
 const number = new Intl.NumberFormat("en");
 const one = new Intl.NumberFormat("en", { maximumFractionDigits: 1 });
 const three = new Intl.NumberFormat("en", { maximumSignificantDigits: 3 });
+const hundredths = new Intl.NumberFormat("en", { maximumFractionDigits: 2 });
 const moment = new Intl.DateTimeFormat("en", { dateStyle: "medium", timeStyle: "short" });
 
 /** @param {number} value */
@@ -95,7 +96,7 @@ export const words = {
   },
   plan: {
     title: "What it would cost", decided: "What was decided", seconds: "Time of the steps", memory: "Memory", gpuMemory: "GPU memory", workers: "Workers", gaussians: "Gaussians", views: "Views",
-    unknown: "not known", byService: "chosen at the start", dropped: (/** @type {number} */ n) => `${count(n)} left out`, pixels: (/** @type {number} */ n) => `${rough(n / 1e6)} megapixels`,
+    unknown: "not known", byService: "automatic", dropped: (/** @type {number} */ n) => `${count(n)} left out`, pixels: (/** @type {number} */ n) => `${hundredths.format(n / 1e6)} megapixels`,
     item: "What", decision: "Decision", reason: "Because", none: "Nothing was left out.",
   },
   job: {
@@ -117,7 +118,7 @@ export const words = {
     told: (/** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ s) => `Loss against seconds: from ${three.format(from)} to ${three.format(to)} in ${seconds(s)}`,
   },
   jobs: {
-    title: "Jobs", filter: "Filter", name: "Name", status: "Status", any: "Any status", empty: "No jobs yet", emptyLead: "Your jobs will stand here, each with its newest picture.", noMatch: "No job matches.", more: "Show more", select: (/** @type {string} */ name) => `Choose ${name} for a comparison`, compare: "Compare the two", chooseTwo: "Choose two finished runs of one scene to compare them.", remove: (/** @type {string} */ name) => `Delete ${name}`, removed: "Deleted.", otherScenes: "These two are of different scenes.",
+    title: "Jobs", filter: "Filter", name: "Name", status: "Status", any: "Any status", empty: "No jobs yet", emptyLead: "Your jobs will stand here, each with its newest picture.", noMatch: "No job matches.", more: "Show more", choose: "Compare", select: (/** @type {string} */ name) => `Compare ${name}`, compare: "Compare the two", chooseTwo: "Choose two finished runs of one scene to compare them.", remove: (/** @type {string} */ name) => `Delete ${name}`, removed: "Deleted.", otherScenes: "These two are of different scenes.",
   },
   compare: { title: "Compare", heading: (/** @type {string} */ a, /** @type {string} */ b) => `${a} and ${b}`, notThere: "One of these runs is not there, or has no result." },
   signIn: { title: "Sign in", heading: "A key, please", lead: "This service lets in who has an API key. Its operator gives them out (sgsst keys create).", key: "API key", go: "Sign in", wrong: "The service does not know this key.", out: "Signed out." },
