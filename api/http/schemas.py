@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,8 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.files.artifacts import media_type
 from service.parameters import JobParameters
+from service.store.history import Point
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
-from service.store.tables import ArtifactRow, AttemptRow, JobRow, ProgressPointRow, UploadRow
+from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 
 if TYPE_CHECKING:
     StatusName = str
@@ -444,11 +446,11 @@ def input_views(job: JobRow) -> list[InputFileView]:
     return found
 
 
-def progress_history(rows: list[ProgressPointRow]) -> ProgressHistory:
+def progress_history(points: list[Point]) -> ProgressHistory:
     """The course of a job's loss as the API shows it."""
-    names = ("attempt", "stage", "step", "total", "seconds", "loss", "scales")
-    shown = [{name: getattr(row, name) for name in names} | {"updated_at": utc(row.updated_at)} for row in rows]
-    return ProgressHistory(points=[ProgressPoint(**point) for point in shown])
+    return ProgressHistory(
+        points=[ProgressPoint(**{**asdict(point), "updated_at": utc(point.updated_at)}) for point in points]
+    )
 
 
 def poll_seconds(job: JobRow) -> int | None:

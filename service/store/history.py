@@ -8,9 +8,10 @@ together is halved.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
-from sqlalchemy import bindparam, delete, func, select
+from sqlalchemy import Connection, bindparam, delete, func, select
 from sqlalchemy.orm import Session
 
 from service.store.database import upsert
@@ -21,11 +22,40 @@ GROWTH = 1.01
 #: Of a job, when an attempt begins; more are halved then.
 MOST_POINTS = 2000
 
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A point of a job's course.
+
+    Attributes:
+        attempt, step: where it stands; later ones are greater.
+        total: steps at most.
+        stage: of the job.
+        seconds: of all steps so far.
+        loss: of the step.
+        scales: the loss of each scale, full size first; None for scales that the step has left out.
+        updated_at: when it was reported, seconds since 1970.
+    """
+
+    attempt: int
+    step: int
+    total: int
+    stage: str
+    seconds: float
+    loss: float
+    scales: list[float | None] | None
+    updated_at: float
+
+
 _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
 _OF_JOB = _POINTS.c.job_id == bindparam("job_id")
 _OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
 _LAST = select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
-_ALL = select(_POINTS).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
+_ALL = (
+    select(*(_POINTS.c[field.name] for field in fields(Point)))
+    .where(_OF_JOB)
+    .order_by(_POINTS.c.attempt, _POINTS.c.step)
+)
 _PLACES = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 _COUNT = select(func.count()).where(_OF_JOB)
 
@@ -58,25 +88,18 @@ def _halve(session: Session, job_id: str) -> None:
     session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in places[1::2]])
 
 
-def points(session: Session, job_id: str, present: dict[str, Any] | None, most: int) -> list[ProgressPointRow]:
+def points(connection: Connection, job_id: str, present: dict[str, Any] | None, most: int) -> list[Point]:
     """A job's course: its points and, as the last of them, its present progress.
 
     Args:
         present: the job's progress; None, or one without a loss, is no point.
-        most: points; of more, so many are taken evenly, the first and the last among them.
+        most: points, 2 or more; of more, so many are taken evenly, the first and the last among them.
     """
-    found = [ProgressPointRow(**row._mapping) for row in session.execute(_ALL, {"job_id": job_id})]
+    found: list[Sequence[Any]] = list(connection.execute(_ALL, {"job_id": job_id}))
     if present and present.get("loss") is not None and present.get("seconds") is not None:
-        last = found[-1] if found else None
-        if last is None or (present["attempt"], present["step"]) > (last.attempt, last.step):
-            names = ("attempt", "step", "total", "stage", "seconds", "loss", "updated_at")
-            row = {name: present[name] for name in names} | {"scales": present.get("scales")}
-            found.append(ProgressPointRow(job_id=job_id, **row))
-    return thinned(found, most)
-
-
-def thinned(found: Sequence[ProgressPointRow], most: int) -> list[ProgressPointRow]:
-    """So many of some points at most, evenly, the first and the last among them; `most` is 2 or more."""
-    if len(found) <= most:
-        return list(found)
-    return [found[number * (len(found) - 1) // (most - 1)] for number in range(most)]
+        now = [present.get(field.name) for field in fields(Point)]
+        if not found or now[:2] > list(found[-1][:2]):
+            found.append(now)
+    if len(found) > most:
+        found = [found[number * (len(found) - 1) // (most - 1)] for number in range(most)]
+    return [Point(*values) for values in found]

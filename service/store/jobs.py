@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from service.errors import ConflictError, NotFoundError, QueueFullError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
-from service.store.history import points
+from service.store.history import Point, points
 from service.store.leases import Published
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
-from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow, ProgressPointRow
+from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
 _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
     Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
@@ -25,7 +25,7 @@ _JOB = select(_JOBS).where(_JOBS.c.id == bindparam("job_id"))
 _ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
 # Names of previews sort by their steps.
 _NEWEST_PREVIEWS = (
-    select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name))
+    select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name).label("newest"))
     .where(_ARTIFACTS.c.job_id.in_(bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
     .group_by(_ARTIFACTS.c.job_id)
 )
@@ -251,10 +251,10 @@ class Jobs:
                 session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **made))
         return unused
 
-    def course(self, job: JobRow, most: int) -> list[ProgressPointRow]:
+    def course(self, job: JobRow, most: int) -> list[Point]:
         """The course of a job's loss from its first step to its present one, in `most` points or fewer."""
-        with self._database.reading() as session:
-            return points(session, job.id, job.progress, most)
+        with self._database.reading_rows() as connection:
+            return points(connection, job.id, job.progress, most)
 
     def previews(self, job_ids: Sequence[str]) -> dict[str, str]:
         """The name of the newest picture of each job; jobs without one are left out."""
@@ -303,7 +303,7 @@ def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: boo
 
 def _newest_previews(connection: Connection, job_ids: Sequence[str]) -> dict[str, str]:
     rows = connection.execute(_NEWEST_PREVIEWS, {"ids": list(job_ids)}) if job_ids else ()
-    return {job_id: name for job_id, name in rows}
+    return {row.job_id: row.newest for row in rows}
 
 
 def _queue_position(connection: Connection, job: JobRow) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import signal
@@ -15,9 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import psutil
 import pytest
 import torch
+from plyfile import PlyData
 
 from api.client import AsyncClient, Client
 from sgsst_core.files.ply import SceneFile, read_scene, write_packed
@@ -104,6 +107,27 @@ def result(client: httpx.Client, job_id: str) -> bytes:
     return client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
 
 
+def check_colours(client: httpx.Client, job_id: str, scene: Path) -> None:
+    """The stylized colours alone are those of the PLY, as float16."""
+    found = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colours.f16").content, "<f2").reshape(-1, 3)
+    stylized = PlyData.read(io.BytesIO(result(client, job_id)))["vertex"]
+    exact = np.stack([stylized[f"f_dc_{channel}"] for channel in range(3)], 1).astype(np.float64)
+    assert np.abs(found - exact).max() <= max(2.0**-11 * np.abs(exact).max(), 2.0**-25)
+    assert len(found) == len(read_scene(scene).scene), "each belongs to a row of what was sent"
+
+
+def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
+    """The whole run is told after its end, from the first step that was reported to the last."""
+    points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
+    assert {point["step"] for point in points} <= set(steps)
+    assert points[0]["step"] == next(step for step in steps if step > 0)
+    assert points[-1]["step"] == STEPS
+    assert points[-1]["loss"] < points[0]["loss"]
+    for point in points:
+        seen = [loss for loss in point["scales"] if loss is not None]
+        assert np.isclose(np.mean(seen), point["loss"]), "all scales count alike"
+
+
 def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files, name="my wall")
@@ -136,6 +160,9 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         names = {entry["name"] for entry in listed}
         assert {"stylized.ply", "plan.json", "report.json", "report.html", "log.txt"} <= names
         assert not any(name.startswith(".") for name in names)
+        assert found["preview"] == max(name for name in names if name.startswith("previews/"))
+        check_colours(client, job_id, files["scene"])
+        check_course(client, job_id, steps)
         for entry in listed:
             content = client.get(entry["url"])
             assert hashlib.sha256(content.content).hexdigest() == entry["sha256"] == content.headers["etag"].strip('"')

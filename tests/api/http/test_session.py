@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-import time
 from collections.abc import Iterator
 from http.cookies import Morsel, SimpleCookie
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -362,10 +360,7 @@ def test_streams_and_files_come_with_the_cookie(browser: httpx.Client, store: St
     job_id = job_of(store, row.id)
     sign_in(browser, key)
     del browser.headers["Origin"]
-    started = time.monotonic()
     with browser.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
         assert answer.status_code == 200
-        lines: Iterator[Any] = answer.iter_lines()
-        assert any("queued" in line for line in lines)
-        assert time.monotonic() - started < 60
+        assert any("queued" in line for line in answer.iter_lines())
     assert browser.get(f"/v1/jobs/{job_id}/artifacts").json() == {"artifacts": []}

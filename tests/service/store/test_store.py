@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import socket
@@ -16,17 +17,18 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from sqlalchemy import inspect
+from sqlalchemy import func, inspect, select
 
 from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.database import MIGRATIONS
+from service.store.history import GROWTH, keep_point
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency, NewJob
 from service.store.leases import KEPT_PROGRESS, Lease, Published
 from service.store.states import ACTIVE, FINISHED
-from service.store.tables import Base
+from service.store.tables import Base, ProgressPointRow
 
 SHA = "a" * 64
 LEASE, RETRY, ATTEMPTS = 30.0, 5.0, 3
@@ -453,6 +455,86 @@ def test_old_progress_is_forgotten_but_no_status(store: Store) -> None:
     events = store.jobs.events(held.job_id, 0, limit=1000)
     assert [event.data["step"] for event in events if event.kind == "progress"] == list(range(20, KEPT_PROGRESS + 20))
     assert [event.data["status"] for event in events if event.kind == "status"] == ["queued", "starting"]
+
+
+def step_of(job: Lease, step: int, seconds: float, **more: Any) -> dict[str, Any]:
+    """Progress as the dispatcher reports it."""
+    known = {"stage": "sos", "total": 10_000, "fraction": 0.5, "eta_s": 1.0, "scales": [1.0, None]}
+    return {**known, "step": step, "seconds": seconds, "loss": 1e6 / step, "attempt": job.job.attempt, **more}
+
+
+def test_the_course_of_a_loss_is_kept_from_its_beginning(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    held = lease(store)
+    store.leases.report_progress(held, {"stage": "planning", "step": 1, "total": 3, "attempt": 1})
+    assert store.jobs.course(store.jobs.get(job_id, None), 10) == []
+    with store.database.writing() as session:  # as `report_progress`, without a transaction for each
+        for step in range(1, 5000):
+            keep_point(session, job_id, {**step_of(held, step, 0.9 * step), "updated_at": clock.now + step})
+    clock.now += 5000
+    store.leases.report_progress(held, step_of(held, 5000, 4500.0, stage="measuring"))
+    job = store.jobs.get(job_id, None)
+    found = store.jobs.course(job, 10_000)
+    assert [point.step for point in found[:5]] == [1, 2, 3, 4, 5]
+    assert (found[-1].step, found[-1].stage, found[-1].updated_at) == (5000, "measuring", clock.now)
+    assert (found[9].loss, found[9].scales, found[9].seconds) == (1e5, [1.0, None], 9.0)
+    ratios = [later.seconds / point.seconds for point, later in itertools.pairwise(found[:-1])]
+    assert all(ratio >= GROWTH for ratio in ratios)
+    assert all(ratio < GROWTH + 0.01 for ratio in ratios[100:]), "no gaps"
+    assert len(found) < 550
+    few = store.jobs.course(job, 64)
+    assert len(few) == 64
+    assert (few[0].step, few[-1].step) == (1, 5000)
+    assert [point.step for point in few] == sorted({point.step for point in few})
+
+
+def test_the_course_goes_on_over_attempts_and_goes_with_its_job(store: Store, clock: Clock) -> None:
+    job_id = queue(store)
+    held = lease(store)
+    for step in (1, 2, 3, 4):
+        store.leases.report_progress(held, step_of(held, step, float(step)))
+    store.leases.release(held)
+    again = lease(store)
+    for step, seconds in ((3, 3.0), (3, 3.0), (2, 2.0), (5, 5.0)):  # from a checkpoint of step 2; ranks were lost once
+        store.leases.report_progress(again, step_of(again, step, seconds))
+    found = [(point.attempt, point.step) for point in store.jobs.course(store.jobs.get(job_id, None), 100)]
+    assert found == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 3), (2, 5)]
+    store.leases.fail(again, {"code": "x", "message": "x"}, permanent=True)
+    store.jobs.retry(job_id, None, limit=10)
+    job = store.jobs.get(job_id, None)
+    assert job.progress is None
+    assert len(store.jobs.course(job, 100)) == 6
+    store.jobs.cancel(job_id, None)
+    store.jobs.delete(job_id, None)
+    with store.database.reading_rows() as connection:
+        assert connection.execute(select(func.count()).select_from(ProgressPointRow)).scalar() == 0
+
+
+def test_the_course_of_many_attempts_is_halved(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.store.history.MOST_POINTS", 40)
+    job_id = queue(store)
+    for _ in range(12):
+        held = lease(store)
+        for step in range(1, 21):
+            store.leases.report_progress(held, step_of(held, step, float(step)))
+        store.leases.release(held)
+    found = store.jobs.course(store.jobs.get(job_id, None), 1000)
+    assert len(found) <= 40 + 20
+    assert (found[0].attempt, found[0].step) == (1, 1)
+    assert (found[-1].attempt, found[-1].step) == (12, 20)
+
+
+def test_the_newest_picture_of_each_job(store: Store) -> None:
+    jobs = sorted(queue(store) for _ in range(3))  # of the same moment: their ids say which comes first
+    for number in range(2):
+        held = lease(store)
+        names = ["previews/step_0000009.jpg", "previews/step_0000100.jpg", "views.jpg", "previewsx.jpg"]
+        store.leases.publish(held, [Published(name, f"{number}/{name}", 1, SHA) for name in names[number:]])
+    newest = "previews/step_0000100.jpg"
+    assert store.jobs.previews(jobs) == {jobs[0]: newest, jobs[1]: newest}
+    assert store.jobs.detail(jobs[0], None)[3] == newest
+    assert store.jobs.detail(jobs[2], None)[3] is None
+    assert store.jobs.previews([]) == {}
 
 
 def test_blobs_go_when_nothing_needs_them(store: Store, clock: Clock) -> None:

@@ -1,0 +1,234 @@
+"""Files as answers: a job's inputs, its pictures and the course of its loss; names that need care."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from email.message import Message
+from pathlib import Path
+from urllib.parse import unquote
+
+import httpx
+import pytest
+
+from api.http.schemas import MOST_POINTS
+from api.http.sending import disposition
+from service.files.artifacts import Artifacts
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from tests.api.service import Service, check_documented
+from tests.small_scenes import wall, write_files
+
+#: Names that files are sent with.
+HOSTILE = [
+    "../../etc/passwd",
+    'a"; filename="evil.html',
+    "a\r\nSet-Cookie: x=y",
+    "\u202egpj.exe",
+    "caf\u00e9 \u65e5\u672c.png",
+    "<script>alert(1)</script>.png",
+    "a;b=c,d.png",
+    "%0d%0aX: y.png",
+    "..",
+    "." * 300,
+    "x" * 1000 + ".png",
+    "C:\\Windows\\win.ini",
+    "\x00\x1f\x7f.png",
+    "con*:?|.png",
+    "\U0001f3a8.png",
+    "",
+    " ",
+    "'quoted' \\",
+    "\ud800.png",
+]
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("inputs") / "data", alone=True) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[Store]:
+    opened = open_store(ServiceSettings(data=service.data))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def client(service: Service) -> Iterator[httpx.Client]:
+    with service.client() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("files"), wall())
+    return {"scene": ply, "cameras": cameras, "style": style}
+
+
+def submit(client: httpx.Client, files: dict[str, Path], styles: list[str]) -> str:
+    parts = [(role, (files[role].name, files[role].read_bytes())) for role in ("scene", "cameras")]
+    # other bytes behind the picture make it another file
+    parts += [("style", (name, files["style"].read_bytes() + bytes(place))) for place, name in enumerate(styles)]
+    answer = client.post("/v1/jobs", files=parts)
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+@pytest.fixture(scope="module")
+def job_id(client: httpx.Client, files: dict[str, Path]) -> str:
+    return submit(client, files, ["first.png", "second.PNG"])
+
+
+def refused(answer: httpx.Response, status: int, code: str) -> None:
+    assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
+    check_documented(answer)
+
+
+def test_inputs_come_back_as_they_were_sent(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
+    listed = client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]
+    style = files["style"].read_bytes()
+    sent = [
+        ("scene", "scene", files["scene"].read_bytes(), "application/octet-stream"),
+        ("cameras", "cameras", files["cameras"].read_bytes(), "application/json"),
+        ("style", "style", style, "image/png"),
+        ("style", "style:1", style + b"\0", "image/png"),
+    ]
+    for entry, (role, address, content, kind) in zip(listed, sent, strict=True):
+        assert (entry["role"], entry["size"]) == (role, len(content))
+        assert entry["url"] == f"/v1/jobs/{job_id}/inputs/{address}"
+        answer = client.get(entry["url"])
+        assert answer.content == content
+        assert entry["sha256"] == hashlib.sha256(content).hexdigest()
+        assert answer.headers["etag"] == f'"{entry["sha256"]}"'
+        assert answer.headers["content-type"] == kind
+        assert answer.headers["content-disposition"].startswith("attachment; filename=")
+        assert answer.headers["content-security-policy"] == "sandbox; default-src 'none'"
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert "private" in answer.headers["cache-control"]
+    assert client.get(f"/v1/jobs/{job_id}/inputs/style:0").content == style
+
+
+def test_parts_of_inputs(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
+    url, whole = f"/v1/jobs/{job_id}/inputs/scene", files["scene"].read_bytes()
+    size = len(whole)
+    for asked, start, stop in (("0-99", 0, 100), ("100-", 100, size), ("-7", size - 7, size), ("5-999999999", 5, size)):
+        answer = client.get(url, headers={"Range": f"bytes={asked}"})
+        assert (answer.status_code, answer.content) == (206, whole[start:stop])
+        assert answer.headers["content-range"] == f"bytes {start}-{stop - 1}/{size}"
+    tag = client.head(url).headers["etag"]
+    assert client.head(url).headers["content-length"] == str(size)
+    assert client.get(url, headers={"If-None-Match": tag}).status_code == 304
+    assert client.get(url, headers={"Range": "bytes=0-4", "If-Range": '"other"'}).content == whole
+    assert client.get(url, headers={"Range": "bytes=0-4", "If-Range": tag}).content == whole[:5]
+    refused(client.get(url, headers={"Range": f"bytes={size}-"}), 416, "range-not-satisfiable")
+
+
+@pytest.mark.parametrize(
+    "role",
+    [
+        "photos",
+        "style:2",
+        "style:-1",
+        "style:x",
+        "style:",
+        "scene.ply",
+        "style:1e0",
+        "%2e%2e",
+        "\u0663",
+        "style:\u0661",
+    ],
+)
+def test_inputs_that_are_not_there(client: httpx.Client, job_id: str, role: str) -> None:
+    refused(client.get(f"/v1/jobs/{job_id}/inputs/{role}"), 404, "not-found")
+
+
+def test_inputs_of_a_job_that_is_gone(client: httpx.Client, files: dict[str, Path], store: Store) -> None:
+    job_id = submit(client, files, ["style.png"])
+    client.post(f"/v1/jobs/{job_id}/cancel")
+    assert client.get(f"/v1/jobs/{job_id}/inputs/scene").status_code == 200
+    later = open_store(ServiceSettings(data=Path(store.database.url.database or "").parent), lambda: 1e11)
+    later.retention.expire()
+    later.close()
+    assert client.get(f"/v1/jobs/{job_id}").json()["status"] == "expired"
+    assert len(client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]) == 3, "what they were is still known"
+    refused(client.get(f"/v1/jobs/{job_id}/inputs/scene"), 404, "not-found")
+    client.delete(f"/v1/jobs/{job_id}")
+    refused(client.get(f"/v1/jobs/{job_id}/inputs"), 404, "not-found")
+
+
+@pytest.mark.parametrize("name", HOSTILE, ids=ascii)
+def test_suggested_names_need_no_care(name: str) -> None:
+    for inline in (True, False):
+        header = disposition(name, inline=inline)
+        assert header.isascii()
+        assert header.isprintable()
+        match = re.fullmatch(
+            r"(inline|attachment); filename=\"([A-Za-z0-9._-]+)\"(?:; filename\*=UTF-8''([A-Za-z0-9._~%-]+))?", header
+        )
+        assert match, header
+        assert (match[1] == "inline") is inline
+        for suggested in (match[2], unquote(match[3] or "x")):
+            assert suggested not in (".", "..")
+            assert not set(suggested) & set('/\\\r\n\0"\u202e')
+            assert len(suggested) <= 120
+        # as another program reads it
+        message = Message()
+        message["Content-Disposition"] = header
+        assert message.get_content_disposition() == match[1]
+
+
+def test_names_that_need_no_care_stay() -> None:
+    assert disposition("a/b/scene 1.ply", inline=False) == 'attachment; filename="scene_1.ply"'
+    assert disposition("caf\u00e9.png", inline=True) == "inline; filename=\"caf_.png\"; filename*=UTF-8''caf%C3%A9.png"
+
+
+def test_hostile_names_on_their_way_through_the_service(client: httpx.Client, files: dict[str, Path]) -> None:
+    names = [name for name in HOSTILE if name.strip() and "\ud800" not in name][:14]
+    job_id = submit(client, files, names)
+    for entry in client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]:
+        answer = client.get(entry["url"])
+        assert answer.status_code == 200
+        assert "set-cookie" not in answer.headers
+        assert "x" not in answer.headers
+        assert re.match(r'attachment; filename="[A-Za-z0-9._-]+"(;|$)', answer.headers["content-disposition"])
+        assert answer.headers["content-type"].partition(";")[0] in (
+            "image/png",
+            "application/octet-stream",
+            "application/json",
+        )
+
+
+def test_pictures_and_the_course_of_the_loss(
+    client: httpx.Client, files: dict[str, Path], store: Store, tmp_path: Path
+) -> None:
+    job_id = submit(client, files, ["style.png"])
+    assert client.get(f"/v1/jobs/{job_id}/progress").json() == {"points": []}
+    picture = tmp_path / "p.jpg"
+    picture.write_bytes(b"\xff\xd8\xff")
+    while (held := store.leases.take("test")) is not None and held.job_id != job_id:
+        store.leases.succeed(held, [], {})
+    assert held is not None
+    artifacts = Artifacts(ServiceSettings(data=Path(store.database.url.database or "").parent).artifacts_url)
+    names = ["previews/step_0000000.jpg", "previews/step_0000020.jpg"]
+    store.leases.publish(held, [artifacts.put(job_id, held.epoch, name, picture) for name in names])
+    for step in range(1, 31):
+        known = {"stage": "sos", "total": 600, "fraction": step / 600, "eta_s": None, "attempt": held.job.attempt}
+        known |= {"step": step, "seconds": float(step), "loss": 100.0 / step, "scales": [None, 100.0 / step]}
+        store.leases.report_progress(held, known)
+
+    (listed,) = [job for job in client.get("/v1/jobs").json()["jobs"] if job["id"] == job_id]
+    shown = client.get(f"/v1/jobs/{job_id}").json()
+    assert listed["preview"] == shown["preview"] == names[1]
+    assert client.get(f"/v1/jobs/{job_id}/artifacts/{listed['preview']}").content == picture.read_bytes()
+    assert shown["progress"]["scales"] == [None, 100.0 / 30]
+    points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
+    assert len(points) <= MOST_POINTS
+    assert [point["step"] for point in points] == list(range(1, 31))
+    last = points[-1]
+    assert last["updated_at"] == shown["progress"]["updated_at"]
+    assert (last["attempt"], last["stage"], last["total"], last["seconds"]) == (1, "sos", 600, 30.0)
+    assert (last["loss"], last["scales"]) == (100.0 / 30, [None, 100.0 / 30])
