@@ -15,6 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sgsst_core.files.ply import read_scene
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+
 #: Where WebGL is computed by the processor: the same pixels on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
 #: Milliseconds that a test waits for anything.
@@ -22,7 +27,9 @@ PATIENCE = 180_000
 #: Runs in the page before anything of its own: what its policy refuses is counted.
 _COUNT_VIOLATIONS = """
 window.violations = [];
-document.addEventListener("securitypolicyviolation", (event) => window.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
+document.addEventListener("securitypolicyviolation", ({ violatedDirective, blockedURI }) => {
+  window.violations.push(`${violatedDirective} ${blockedURI}`);
+});
 """
 
 
@@ -62,7 +69,7 @@ class Watched:
         wrong: errors of the console, exceptions, and requests to other origins.
     """
 
-    def __init__(self, browser: Any, url: str, *, width: int = 900, height: int = 640, **context: Any) -> None:
+    def __init__(self, browser: Any, url: str, *, width: int = 600, height: int = 500, **context: Any) -> None:
         self.url = url
         self.context = browser.new_context(viewport={"width": width, "height": height}, **context)
         self.context.set_default_timeout(PATIENCE)
@@ -93,17 +100,20 @@ class Watched:
         self.page.locator("canvas[data-state=settled]").wait_for()
 
     def pixels(self) -> NDArray[np.float64]:
-        """The 3D view [h, w, 3], 0 to 255, without what stands before it."""
+        """The 3D view [h, w, 3], 0 to 255, as the page saves it."""
         self.settled()
-        self.page.evaluate(_HIDE, "hidden")
-        shot = self.page.locator("canvas").screenshot()
-        self.page.evaluate(_HIDE, "visible")
-        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=np.float64)
+        with self.page.expect_download() as download:
+            self.page.get_by_role("button", name="Save a picture").click()
+        with Image.open(download.value.path()) as picture:
+            return np.asarray(picture.convert("RGB"), dtype=np.float64)
 
 
-_HIDE = """(visibility) => {
-  for (const part of document.querySelectorAll(".frame > :not(canvas)")) part.style.visibility = visibility;
-}"""
+def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
+    """What `sgsst render` makes of a scene's file, [h, w, 3] of 0 to 255."""
+    found = read_scene(scene).scene
+    colours = view_colours(found.sh_dc, rest_colours(found.sh_rest, found.means, camera))
+    image = make_rasterizer("cpu", found).render(colours, camera)
+    return (image.double().clamp(0, 1) * 255).round().numpy()
 
 
 def psnr(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
@@ -116,7 +126,8 @@ def psnr(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
 VIEW = """async ([base, scene, cameras, name, width, height]) => {
   const { Viewer } = await import(`${base}/viewer/viewer.js`), { readCameras } = await import(`${base}/cameras.js`);
   const canvas = document.createElement("canvas");
-  Object.assign(canvas.style, { width: `${width}px`, height: `${height}px`, position: "fixed", left: 0, top: 0, zIndex: 9 });
+  const size = { width: `${width}px`, height: `${height}px` };
+  Object.assign(canvas.style, { ...size, position: "fixed", left: 0, top: 0, zIndex: 9 });
   document.body.append(canvas);
   const viewer = new Viewer(canvas), blob = await (await fetch(cameras)).blob();
   const camera = (await readCameras([{ name: "cameras.json", blob }])).find((each) => each.name === name);
@@ -125,7 +136,8 @@ VIEW = """async ([base, scene, cameras, name, width, height]) => {
   await source.ready;
   viewer.camera.stand(camera, source.middle);
   viewer.draw();
-  const settled = async () => { while (canvas.dataset.state !== "settled") await new Promise((go) => setTimeout(go, 20)); };
+  const pause = () => new Promise((go) => setTimeout(go, 20));
+  const settled = async () => { while (canvas.dataset.state !== "settled") await pause(); };
   const picture = async () => {
     await settled();
     const bytes = new Uint8Array(await (await viewer.picturePng()).arrayBuffer());
