@@ -99,6 +99,13 @@ class Watched:
         """Wait until the 3D view shows all of its scene, sorted for its camera."""
         self.page.locator("canvas[data-state=settled]").wait_for()
 
+    def wipe(self, key: str) -> None:
+        """Press a key on the slider: Home shows the right side alone, End the left one."""
+        slider = self.page.get_by_label("Wipe", exact=True)
+        slider.wait_for()
+        slider.focus()
+        self.page.keyboard.press(key)
+
     def pixels(self) -> NDArray[np.float64]:
         """The 3D view [h, w, 3], 0 to 255, as the page saves it."""
         self.settled()

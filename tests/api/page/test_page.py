@@ -115,8 +115,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.locator(".badge", has_text="Done").wait_for()
     page.get_by_role("img", name="Loss against seconds").wait_for()
     page.get_by_role("heading", name="What was decided").wait_for()
-    wipe = page.get_by_label("Wipe", exact=True)
-    wipe.wait_for()
+    page.get_by_label("Wipe", exact=True).wait_for()
     job_id = page.url.rsplit("/", 1)[1]
 
     page.get_by_label("Camera", exact=True).select_option("1")
@@ -124,10 +123,9 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     result = tmp_path / "stylized.ply"
     result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     original, stylized = rendered(files["scene"], camera), rendered(result, camera)
-    wipe.focus()
-    page.keyboard.press("End")
+    watched.wipe("End")
     before = frame_of(watched, original)
-    page.keyboard.press("Home")
+    watched.wipe("Home")
     after = frame_of(watched, stylized)
     assert psnr(before, original) > 38  # the view is larger than the rendered picture
     assert psnr(after, stylized) > 38
@@ -297,11 +295,9 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     page.get_by_role("button", name="Compare the two").click()
     page.get_by_label("Left").wait_for()
     watched.settled()
-    wipe = page.get_by_label("Wipe", exact=True)
-    wipe.focus()
-    page.keyboard.press("Home")
+    watched.wipe("Home")
     right = watched.pixels()
-    page.keyboard.press("End")
+    watched.wipe("End")
     left = watched.pixels()
     assert np.abs(left - right).mean() > 0.1  # runs of different seeds differ a little
     page.get_by_label("Left").select_option("original")
@@ -322,11 +318,9 @@ def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service
     path.write_bytes(stylized)
     assert len(read_scene(path).scene) > 616
     watched = visit(f"/#/jobs/{job_id}")
-    wipe = watched.page.get_by_label("Wipe", exact=True)
-    wipe.focus()
-    watched.page.keyboard.press("Home")
+    watched.wipe("Home")
     right = watched.pixels()
-    watched.page.keyboard.press("End")
+    watched.wipe("End")
     assert np.abs(watched.pixels() - right).mean() > 5
     watched.check("status of 404")  # that there are no colours alone is asked first
 
@@ -342,10 +336,10 @@ def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) 
     page.get_by_label("Wipe", exact=True).wait_for()
     watched.settled()
     reach(page, lambda: page.evaluate("() => document.activeElement.tagName") == "CANVAS")
-    start = watched.pixels()
+    frames = int(page.locator(".stage").get_attribute("data-frames"))
     page.keyboard.press("ArrowRight")
     page.keyboard.press("w")
-    assert np.abs(watched.pixels() - start).mean() > 1
+    wait_for(lambda: int(page.locator(".stage").get_attribute("data-frames")) > frames, "the view to move")
     page.keyboard.press(" ")
     page.locator("#said", has_text="Stylized").or_(page.locator("#said", has_text="Original")).wait_for()
     page.keyboard.press(".")
