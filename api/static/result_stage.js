@@ -40,7 +40,9 @@ export class ResultStage {
   async load() {
     const { viewer } = this.stage, [first] = this.jobs;
     if (!viewer) return;
+    for (const { side } of this.choices.values()) side.scene.worker.terminate(); // of a device that went away
     this.choices.clear();
+    this.original = undefined;
     viewer.background = first.parameters.background ?? [0, 0, 0];
     viewer.camera.near = first.parameters.near ?? 0.2;
     this.stage.message(words.page.loading);

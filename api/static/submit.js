@@ -321,6 +321,7 @@ export class SubmitView {
     this.clearWrong();
     if (this.missing()) return;
     this.setBusy(true, dry);
+    this.planningText = "";
     try {
       const body = await this.send();
       if (dry) await this.plan(body);
