@@ -95,6 +95,7 @@ BOUNDS = settings(
 JOBS = ("get_job", "cancel_job", "delete_job", "watch_job")
 ENDS = ("cancel_job", "retry_job")
 ARTIFACTS = ("list_artifacts", "get_artifact")
+INPUTS = ("get_progress", "list_inputs", "get_input")
 UPLOADS = ("get_upload", "head_upload", "append_upload", "delete_upload")
 #: Parameters that are not only of the right form, but right, so that something is made that links lead to.
 RIGHT: dict[str, dict[str, Any]] = {
@@ -158,10 +159,11 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
 @pytest.mark.parametrize(
     ("path", "behind"),
     [
-        ("/v1/jobs(?!.*artifacts)", JOBS),
+        ("/v1/jobs(?!.*(artifacts|inputs|progress))", JOBS),
         # by themselves once more: among all others, chance seldom cancels and then retries, or lists and then takes
         ("/v1/jobs($|/{job_id}/(cancel|retry))", ENDS),
         ("/v1/jobs($|/{job_id}/artifacts)", ARTIFACTS),
+        ("/v1/jobs($|/{job_id}/(inputs|progress))", INPUTS),
         ("/v1/uploads", UPLOADS),
     ],
 )
