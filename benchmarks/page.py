@@ -131,7 +131,7 @@ def measure_scene(url: str, path: Path, frames: int, size: tuple[int, int]) -> d
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", type=Path)
+    parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--frames", type=int, default=5)
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
@@ -144,8 +144,7 @@ def main() -> None:
         for path in arguments.scenes:
             found = measure_scene(service.url, path, arguments.frames, size)
             figures["scenes"].append(found)
-            print(found, flush=True)
-    print(write_result("page", figures))
+            print(found, write_result("page", figures), flush=True)
 
 
 if __name__ == "__main__":
