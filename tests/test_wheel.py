@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from api.http.static import static_files
 from sgsst_core.features.network_weights import BackboneWeights
 from tests.small_scenes import wall, write_files
 
@@ -75,6 +76,13 @@ def test_the_installed_packages_are_those_of_the_wheel(installed: Path, tmp_path
     files = run([installed / "python", "-c", code], tmp_path).split()
     assert all(Path(file).is_relative_to(installed.parent) for file in files), files
     assert run([installed / "sgsst", "--version"], tmp_path).strip()
+
+
+def test_the_page_and_what_it_loads_are_installed(installed: Path, tmp_path: Path) -> None:
+    code = "from api.http.static import static_files as found; print(found().digest, *found().pages, *found().files)"
+    digest, *names = run([installed / "python", "-c", code], tmp_path).split()
+    assert digest == static_files().digest, "another byte"
+    assert {"index.html", "docs.html", "vendor/swagger-ui/swagger-ui-bundle.js"} <= set(names)
 
 
 def test_a_scene_is_stylized_and_reported(installed: Path, vgg16_weights: BackboneWeights, tmp_path: Path) -> None:

@@ -6,16 +6,20 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.ply import read_scene, write_packed, write_scene
 from sgsst_core.files.scene_headers import PackedForm
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
 from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
 from tests.sgsst_core.stylizing.test_refining import large_wall
+from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
@@ -217,3 +221,37 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
     assert report["workers"]["used"] == report["workers"]["asked"] == 1
     assert report["workers"]["attempts"] == []
     assert report["seconds_by_part"]["reading"] > 0
+
+
+def with_scene(request: StylizeRequest, scene: Scene, **options: object) -> StylizeRequest:
+    """The same job of another scene, with its colours alone as well."""
+    write_scene(request.source.scene, scene)
+    return replace(request, source=request.source.model_copy(update=options), colours=True)
+
+
+def test_colours_alone_are_those_of_the_result(request_: StylizeRequest, tmp_path: Path) -> None:
+    for request in (with_scene(request_, wall(sh_degree=1)), small_request(tmp_path / "not", 1)):
+        go_on(prepare(request))
+        alone = request.out.with_name("s.colours.f16")
+        assert alone.exists() == request.colours
+        if request.colours:
+            exact = read_scene(request.out).scene.sh_dc
+            found = np.fromfile(alone, "<f2").reshape(-1, 3)
+            assert found.shape == exact.shape
+            assert np.array_equal(found, exact.numpy().astype(np.float16))
+
+
+@pytest.mark.parametrize("why", ["cut", "dropped", "faded"])
+def test_colours_alone_are_not_written_where_more_than_colours_changes(tmp_path: Path, why: str) -> None:
+    if why == "cut":
+        request = with_scene(small_request(tmp_path, 1, refine=3.0), large_wall())
+    elif why == "dropped":
+        scene = wall(sh_degree=1)
+        scene.opacities[5] = torch.nan
+        request = with_scene(small_request(tmp_path, 1), scene, drop_invalid=True)
+    else:
+        request = with_scene(small_request(tmp_path, 1, sh_fade=0.5), wall(sh_degree=1))
+    result = go_on(prepare(request))
+    assert result.report_error is None
+    assert request.out.exists()
+    assert not request.out.with_name("s.colours.f16").exists()

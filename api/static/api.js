@@ -1,0 +1,88 @@
+// @ts-check
+/** Requests to the service. */
+import { words } from "./words.js";
+
+/** A refusal, in the service's words. */
+export class Problem extends Error {
+  /**
+   * @param {number} status
+   * @param {any} body of the answer
+   */
+  constructor(status, body) {
+    super(typeof body?.detail === "string" ? body.detail : words.api.status(status));
+    this.status = status;
+    this.code = String(body?.code ?? "");
+    /** @type {string | undefined} */
+    this.input = body?.input;
+    /** @type {{at: string, message: string}[]} */
+    this.errors = body?.errors ?? [];
+    this.body = body ?? {};
+  }
+}
+
+/** The service cannot be reached. */
+export class Unreachable extends Error {
+  constructor() {
+    super(words.api.unreachable);
+  }
+}
+
+/** Called when a key is needed. @type {() => void} */
+let onSignIn = () => {};
+/** @param {() => void} act */
+export const whenKeyIsNeeded = (act) => void (onSignIn = act);
+
+/**
+ * An answer that is no refusal.
+ *
+ * @param {string} method
+ * @param {string} path
+ * @param {{body?: BodyInit, json?: any, headers?: Record<string, string>, signal?: AbortSignal}} [more]
+ * @throws {Problem | Unreachable | DOMException}
+ */
+export async function ask(method, path, { body, json, headers = {}, signal } = {}) {
+  let answer;
+  const sent = json === undefined ? body : JSON.stringify(json);
+  const kind = json === undefined ? {} : { "Content-Type": "application/json" };
+  try {
+    answer = await fetch(path, { method, body: sent, headers: { ...kind, ...headers }, signal, credentials: "same-origin" });
+  } catch (error) {
+    if (signal?.aborted) throw error;
+    throw new Unreachable();
+  }
+  if (answer.ok) return answer;
+  const told = await answer.json().catch(() => null);
+  if (answer.status === 401 && path !== "/v1/session") onSignIn();
+  throw new Problem(answer.status, told);
+}
+
+/**
+ * @param {string} path
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<any>}
+ */
+export const get = async (path, signal) => (await ask("GET", path, { signal })).json();
+
+/** Events of an answer that is a stream of them. @param {Response} answer @returns {AsyncGenerator<{event: string, data: any}>} */
+export async function* eventsOf(answer) {
+  const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).pipeThrough(/** @type {any} */ (new TextDecoderStream())).getReader();
+  let kept = "";
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done) return;
+    kept += value;
+    const parts = kept.split("\n\n");
+    kept = parts.pop() ?? "";
+    for (const part of parts) {
+      const line = (/** @type {string} */ name) => part.split("\n").find((each) => each.startsWith(`${name}: `))?.slice(name.length + 2);
+      const data = line("data");
+      if (data) yield { event: line("event") ?? "message", data: JSON.parse(data) };
+    }
+  }
+}
+
+/** Of a job. @param {string} id @param {string} name */
+export const artifactPath = (id, name) => `/v1/jobs/${encodeURIComponent(id)}/artifacts/${name.split("/").map(encodeURIComponent).join("/")}`;
+
+/** A random key, also where the page has no secure context. */
+export const randomKey = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");

@@ -1,0 +1,158 @@
+// @ts-check
+/** Cameras of a job, as files have them, and the ring around an object; drawn as small frames. */
+import { cross, difference, dot, sum, times, unit } from "./viewer/vectors.js";
+import { words } from "./words.js";
+
+/** @typedef {import("./viewer/vectors.js").Vector} Vector */
+/**
+ * @typedef {{name: string, position: Vector, axes: Vector[], fx: number, fy: number, width: number, height: number}} JobCamera
+ *   `axes`: right, down and forward in the world
+ */
+
+/**
+ * What the page can read of camera files; the service reads more, and has the last word.
+ *
+ * @param {{name: string, blob: Blob}[]} files
+ * @returns {Promise<JobCamera[]>}
+ */
+export async function readCameras(files) {
+  const named = (/** @type {string} */ name) => files.find((file) => file.name.toLowerCase().endsWith(name))?.blob;
+  const images = named("images.bin"), intrinsics = named("cameras.bin");
+  if (images && intrinsics) return colmapCameras(await images.arrayBuffer(), await intrinsics.arrayBuffer());
+  for (const file of files.filter((each) => each.name.toLowerCase().endsWith(".json"))) {
+    const content = JSON.parse(await file.blob.text());
+    if (Array.isArray(content)) return content.map(inriaCamera);
+    if (Array.isArray(content?.frames)) return content.frames.map((/** @type {any} */ frame) => transformsCamera({ ...content, ...frame }));
+  }
+  throw new Error(words.cameras.notReadHere);
+}
+
+/** @param {any} entry */
+function inriaCamera(entry) {
+  const { rotation, position, fx, fy, width, height } = entry;
+  return checked({
+    name: String(entry.img_name ?? entry.id ?? ""), position: position.map(Number),
+    axes: [0, 1, 2].map((column) => [0, 1, 2].map((row) => Number(rotation[row][column]))), fx, fy, width, height,
+  });
+}
+
+/** @param {any} values */
+function transformsCamera(values) {
+  const m = values.transform_matrix, column = (/** @type {number} */ k, sign = 1) => [0, 1, 2].map((row) => sign * Number(m[row][k]));
+  const width = values.w ?? 800, height = values.h ?? 800;
+  const fx = values.fl_x ?? width / 2 / Math.tan((values.camera_angle_x ?? 0.8) / 2);
+  return checked({
+    name: String(values.file_path ?? ""), position: column(3), axes: [column(0), column(1, -1), column(2, -1)], fx, fy: values.fl_y ?? fx, width, height,
+  });
+}
+
+/**
+ * @param {ArrayBuffer} images
+ * @param {ArrayBuffer} intrinsics
+ */
+function colmapCameras(images, intrinsics) {
+  /** @type {Map<number, number[]>} */
+  const models = new Map();
+  let view = new DataView(intrinsics), at = 8;
+  for (let left = Number(view.getBigUint64(0, true)); left > 0; left--) {
+    const id = view.getUint32(at, true), model = view.getInt32(at + 4, true);
+    if (model > 1) throw new Error(words.cameras.notReadHere);
+    const values = [8, 16, 24, 32].map((offset) => view.getFloat64(at + offset + 16, true));
+    const size = [Number(view.getBigUint64(at + 8, true)), Number(view.getBigUint64(at + 16, true))];
+    models.set(id, [...size, values[0], model ? values[1] : values[0]]);
+    at += 24 + (model ? 32 : 24);
+  }
+  view = new DataView(images);
+  at = 8;
+  const found = [];
+  for (let left = Number(view.getBigUint64(0, true)); left > 0; left--) {
+    const [w, x, y, z, ...t] = Array.from({ length: 7 }, (_, i) => view.getFloat64(at + 4 + 8 * i, true));
+    const [width, height, fx, fy] = models.get(view.getUint32(at + 60, true)) ?? [0, 0, 0, 0];
+    let end = at + 64;
+    while (view.getUint8(end)) end++;
+    const name = new TextDecoder().decode(new Uint8Array(images, at + 64, end - at - 64));
+    at = end + 9 + 24 * Number(view.getBigUint64(end + 1, true));
+    const axes = [
+      [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ];
+    found.push(checked({ name, position: axes.map((axis, i) => times(axis, -t[i])).reduce(sum), axes, fx, fy, width, height }));
+  }
+  return found.sort((a, b) => (a.name < b.name ? -1 : 1));
+}
+
+/**
+ * @param {JobCamera} camera
+ * @returns {JobCamera}
+ */
+function checked(camera) {
+  const { position, axes, fx, fy, width, height } = camera;
+  const numbers = [...position, ...axes.flat(), fx, fy, width, height];
+  if (numbers.length !== 16 || !numbers.every(Number.isFinite) || !(fx > 0 && fy > 0 && width > 0 && height > 0)) throw new Error(words.cameras.notReadHere);
+  return camera;
+}
+
+/**
+ * About the ring that the service chooses for `orbit`: it knows the subject better.
+ *
+ * @param {{centre: Vector, radius: number, low: Vector, high: Vector}} middle
+ * @param {{count: number, up: Vector, elevation: number, radius?: number}} ring elevation in degrees
+ * @returns {JobCamera[]}
+ */
+export function ringCameras(middle, { count, up, elevation, radius }) {
+  const centre = middle.low.map((low, i) => (low + middle.high[i]) / 2), half = Math.hypot(...difference(middle.high, centre));
+  const distance = radius ?? 3.1 * half, slant = (elevation * Math.PI) / 180, axis = unit(up);
+  const aside = unit(cross(axis, Math.abs(axis[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1])), front = cross(aside, axis);
+  return Array.from({ length: count }, (_, i) => {
+    const turn = (2 * Math.PI * i) / count;
+    const level = sum(times(aside, Math.sin(turn)), times(front, -Math.cos(turn)));
+    const out = sum(times(level, Math.cos(slant)), times(axis, Math.sin(slant)));
+    const position = sum(centre, times(out, distance)), forward = times(out, -1), right = unit(cross(forward, axis));
+    return { name: `${i + 1}`, position, axes: [right, cross(forward, right), forward], fx: 1.5, fy: 1.5, width: 1, height: 1 };
+  });
+}
+
+/**
+ * Small frames as pairs of points.
+ *
+ * @param {JobCamera[]} cameras
+ * @param {number} size of a frame, world units
+ */
+export function cameraLines(cameras, size) {
+  const points = new Float32Array(cameras.length * 8 * 2 * 3);
+  let at = 0;
+  const line = (/** @type {Vector} */ a, /** @type {Vector} */ b) => {
+    points.set(a, at);
+    points.set(b, at + 3);
+    at += 6;
+  };
+  for (const { position, axes: [right, down, forward], fx, fy, width, height } of cameras) {
+    const x = (size * width) / 2 / fx, y = (size * height) / 2 / fy;
+    const corner = (/** @type {number} */ i, /** @type {number} */ j) => [times(right, i * x), times(down, j * y), times(forward, size)].reduce(sum, position);
+    const corners = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
+    corners.forEach((place, i) => {
+      line(position, place);
+      line(place, corners[(i + 1) % 4]);
+    });
+  }
+  return points;
+}
+
+/**
+ * How large frames are drawn that stand about a scene.
+ *
+ * @param {JobCamera[]} cameras
+ * @param {{centre: Vector, radius: number} | null} middle
+ */
+export function frameSize(cameras, middle) {
+  if (!cameras.length) return 1;
+  const away = cameras.map(({ position }) => Math.hypot(...difference(position, middle?.centre ?? [0, 0, 0]))).sort((a, b) => a - b);
+  return 0.08 * (away[away.length >> 1] || 1);
+}
+
+/** The direction that the cameras take for up. @param {JobCamera[]} cameras @returns {Vector} */
+export function upOf(cameras) {
+  const total = cameras.map(({ axes }) => times(axes[1], -1)).reduce(sum, [0, 0, 0]);
+  return dot(total, total) > 1e-6 ? unit(total) : [0, -1, 0];
+}

@@ -1,0 +1,120 @@
+// @ts-check
+/** Loss against seconds, on logarithmic axes. */
+import { h, put, svg } from "./dom.js";
+import { rough, words } from "./words.js";
+
+/** @typedef {{attempt: number, stage: string, step: number, seconds: number | null, loss: number | null, scales?: number[] | null}} Point */
+
+const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 12, BOTTOM = 34;
+
+/**
+ * Values of a logarithmic axis: 1, 2 and 5 of each decade where there are few decades.
+ *
+ * @param {number} low
+ * @param {number} high
+ */
+export function ticks(low, high) {
+  const decades = Math.log10(high / low), digits = decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];
+  const found = [], every = Math.max(1, Math.ceil(decades / 8));
+  for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power++) {
+    if (power % every) continue;
+    for (const digit of digits) {
+      const value = Number(`${digit}e${power}`);
+      if (value >= low * 0.999 && value <= high * 1.001) found.push(value);
+    }
+  }
+  return found;
+}
+
+export class LossChart {
+  constructor() {
+    this.picture = h("div.plot");
+    this.legend = h("p.legend");
+    this.empty = h("p.quiet", words.job.noLoss);
+    this.element = h("div.chart", this.empty, this.picture, this.legend);
+    /** @type {Map<string, Point>} */
+    this.points = new Map();
+    this.requested = false;
+    this.resized = new ResizeObserver(() => this.later());
+    this.resized.observe(this.picture);
+  }
+
+  /** @param {Point[]} points */
+  add(points) {
+    for (const point of points) {
+      if ((point.stage !== "coarse" && point.stage !== "sos") || !((point.seconds ?? 0) > 0) || !((point.loss ?? 0) > 0)) continue;
+      this.points.set(`${point.stage}/${point.step}`, { ...this.points.get(`${point.stage}/${point.step}`), ...point });
+    }
+    this.later();
+  }
+
+  later() {
+    if (this.requested) return;
+    this.requested = true;
+    requestAnimationFrame(() => {
+      this.requested = false;
+      this.draw();
+    });
+  }
+
+  /** @returns {{name: string, kind: string, line: [number, number][]}[]} */
+  lines() {
+    const all = [...this.points.values()].sort((a, b) => Number(a.seconds) - Number(b.seconds));
+    const of = (/** @type {string} */ stage) => all.filter((point) => point.stage === stage), sos = of("sos");
+    const line = (/** @type {Point[]} */ points, /** @type {(p: Point) => number | null | undefined} */ value) =>
+      /** @type {[number, number][]} */ (points.filter((p) => (value(p) ?? 0) > 0).map((p) => [p.seconds, value(p)]));
+    const scales = Math.max(0, ...sos.map((point) => point.scales?.length ?? 0));
+    return [
+      { name: words.chart.coarse, kind: "coarse", line: line(of("coarse"), (p) => p.loss) },
+      ...(scales > 1 ? Array.from({ length: scales }, (_, n) => ({ name: words.chart.scale(n), kind: `scale scale${n % 5}`, line: line(sos, (p) => p.scales?.[n]) })) : []),
+      { name: words.chart.all, kind: "all", line: line(sos, (p) => p.loss) },
+    ].filter((each) => each.line.length);
+  }
+
+  draw() {
+    const lines = this.lines(), width = this.picture.clientWidth;
+    this.empty.hidden = lines.length > 0;
+    this.element.classList.toggle("nothing", !lines.length);
+    if (!lines.length || !width) return;
+    const xs = lines.flatMap((each) => each.line.map(([x]) => x)), ys = lines.flatMap((each) => each.line.map(([, y]) => y));
+    const range = (/** @type {number[]} */ values) => {
+      const low = Math.min(...values), high = Math.max(...values);
+      return high > low * 1.2 ? [low, high] : [low / 1.2, high * 1.2];
+    };
+    const [x0, x1] = range(xs), [y0, y1] = range(ys);
+    const x = (/** @type {number} */ value) => LEFT + ((width - LEFT - RIGHT) * Math.log(value / x0)) / Math.log(x1 / x0);
+    const y = (/** @type {number} */ value) => TOP + ((HEIGHT - TOP - BOTTOM) * Math.log(y1 / value)) / Math.log(y1 / y0);
+    const main = lines[lines.length - 1].line;
+    put(this.picture, svg("svg", { width, height: HEIGHT, role: "img", "aria-label": words.chart.told(main[0][1], main[main.length - 1][1], main[main.length - 1][0]) },
+      this.axes(x0, x1, y0, y1, x, y, width),
+      lines.map(({ kind, line }) => (line.length > 1
+        ? svg("path", { class: `line ${kind}`, d: line.map(([px, py], i) => `${i ? "L" : "M"}${x(px).toFixed(1)} ${y(py).toFixed(1)}`).join("") })
+        : svg("circle", { class: `dot ${kind}`, cx: x(line[0][0]), cy: y(line[0][1]), r: 3 })))));
+    put(this.legend, lines.map(({ name, kind }) => h("span", svg("svg.key", { viewBox: "0 0 18 4", "aria-hidden": "true" }, svg("path", { class: `line ${kind}`, d: "M0 2h18" })), name)));
+  }
+
+  /**
+   * @param {number} x0 @param {number} x1 @param {number} y0 @param {number} y1
+   * @param {(value: number) => number} x
+   * @param {(value: number) => number} y
+   * @param {number} width
+   */
+  axes(x0, x1, y0, y1, x, y, width) {
+    let lastX = -99;
+    const across = ticks(x0, x1).filter((value) => x(value) - lastX > 36 && ((lastX = x(value)), true));
+    let lastY = 1e9;
+    const upward = ticks(y0, y1).filter((value) => lastY - y(value) > 18 && ((lastY = y(value)), true));
+    return [
+      ...upward.flatMap((value) => [svg("path.grid", { d: `M${LEFT} ${y(value).toFixed(1)}H${width - RIGHT}` }), svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, short(value))]),
+      ...across.map((value) => svg("text", { x: x(value), y: HEIGHT - BOTTOM + 18, "text-anchor": "middle" }, short(value))),
+      svg("text.axis", { x: width - RIGHT, y: HEIGHT - 2, "text-anchor": "end" }, words.chart.seconds),
+    ];
+  }
+
+  end() {
+    this.resized.disconnect();
+  }
+}
+
+/** @param {number} value */
+const short = (value) => (value >= 1e6 || value < 1e-3 ? value.toExponential(0).replace("e+", "e") : rough(value));

@@ -1,0 +1,312 @@
+// @ts-check
+/** One job: how far it is, how the loss falls, what was decided; and when it is done, before and after in 3D. */
+import { artifactPath, ask, get, Problem } from "./api.js";
+import { LossChart } from "./chart.js";
+import { announce, h, icon, put } from "./dom.js";
+import { decisions } from "./plan.js";
+import { ResultStage } from "./result_stage.js";
+import { size, time, words } from "./words.js";
+
+const say = words.job;
+const UNFINISHED = new Set(["queued", "starting", "running", "canceling"]), RETRIED = new Set(["failed", "canceled"]);
+/** Milliseconds after which a lost stream is begun anew by hand. */
+const AGAIN = 3000;
+
+/** @param {string} status */
+export const badge = (status) => h(`span.badge.${status}`, say.statuses[status] ?? status);
+
+export class JobView {
+  /** @param {string} id */
+  constructor(id) {
+    this.id = id;
+    this.title = words.page.jobs;
+    this.leaving = new AbortController();
+    /** @type {any} */
+    this.job = null;
+    this.chart = new LossChart();
+    this.lastEvent = "";
+    this.heading = h("h1.name", say.unnamed);
+    this.badge = h("span");
+    this.meta = h("p.meta");
+    this.actions = h("div.row.actions-inline");
+    this.stateText = h("span");
+    this.leftText = h("span.left");
+    this.bar = h("progress", { max: 1, value: 0, "aria-label": say.progress });
+    this.state = h("div.state", h("div.row", this.stateText, this.leftText), this.bar);
+    this.connection = h("p.connection", { hidden: true, role: "status" }, say.lost);
+    this.error = h("div.failure", { hidden: true, role: "alert" });
+    this.picture = h("figure.preview");
+    this.show = h("div.show", this.picture);
+    this.plan = h("section.card", { hidden: true });
+    this.files = h("section.card");
+    this.facts = h("section.card");
+    this.curve = h("section.card", h("h2", say.loss), this.chart.element);
+    this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.badge), this.meta), this.actions),
+      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.curve, this.plan, this.files, this.facts)));
+    this.element = h("div", h("p.quiet.pending", words.page.loading));
+    this.begin();
+  }
+
+  async begin() {
+    try {
+      await this.refresh();
+    } catch (error) {
+      if (this.leaving.signal.aborted) return;
+      const retry = h("button.quiet", { type: "button", onclick: () => this.begin() }, words.page.retry);
+      return void put(this.element, h("div.empty", h("h1", words.page.error), h("p", error instanceof Error ? error.message : ""), retry));
+    }
+    put(this.element, this.body);
+    await Promise.all([this.loadHistory(), this.loadFiles()]);
+    if (!this.leaving.signal.aborted && UNFINISHED.has(this.job.status)) this.watch();
+  }
+
+  async refresh() {
+    this.job = await get(`/v1/jobs/${this.id}`, this.leaving.signal);
+    this.update();
+  }
+
+  async loadHistory() {
+    try {
+      this.chart.add((await get(`/v1/jobs/${this.id}/progress`, this.leaving.signal)).points);
+    } catch (error) {
+      if (!(error instanceof Problem) || error.status !== 404) return;
+    }
+  }
+
+  /** Events as they come. The browser comes back by itself, and says which one was its last. */
+  watch() {
+    if (this.leaving.signal.aborted) return;
+    const source = (this.source = new EventSource(`/v1/jobs/${this.id}/events`));
+    this.leaving.signal.addEventListener("abort", () => source.close());
+    source.onopen = () => this.setConnected(true);
+    source.onerror = () => {
+      if (this.leaving.signal.aborted) return;
+      this.setConnected(!UNFINISHED.has(this.job.status));
+      if (source.readyState === EventSource.CLOSED && UNFINISHED.has(this.job.status)) setTimeout(() => this.watchAgain(), AGAIN);
+    };
+    source.addEventListener("progress", (event) => this.onProgress(JSON.parse(event.data)));
+    source.addEventListener("artifact", (event) => this.onArtifact(JSON.parse(event.data)));
+    source.addEventListener("status", (event) => this.onStatus(JSON.parse(event.data)));
+  }
+
+  /** A stream that the server refused is not begun by the browser again. */
+  async watchAgain() {
+    try {
+      await this.refresh();
+      this.setConnected(true);
+      if (UNFINISHED.has(this.job.status)) this.watch();
+      else await this.loadFiles();
+    } catch {
+      if (!this.leaving.signal.aborted) setTimeout(() => this.watchAgain(), AGAIN);
+    }
+  }
+
+  /** @param {boolean} connected */
+  setConnected(connected) {
+    if (!this.connection.hidden && connected) announce(say.back);
+    this.connection.hidden = connected;
+  }
+
+  /** @param {any} progress */
+  onProgress(progress) {
+    this.chart.add([progress]);
+    const known = this.job.progress?.updated_at;
+    if (known && progress.updated_at < known) return; // told again after a reload
+    this.job.progress = progress;
+    this.updateState();
+  }
+
+  /** @param {{name: string}} artifact */
+  onArtifact({ name }) {
+    if (name.startsWith("previews/")) this.showPreview(name);
+    else this.filesLater();
+  }
+
+  filesLater() {
+    clearTimeout(this.waiting);
+    this.waiting = setTimeout(() => this.loadFiles(), 400);
+  }
+
+  /** @param {{status: string}} told */
+  async onStatus({ status }) {
+    await this.refresh().catch(() => {});
+    announce(say.statuses[status] ?? status);
+    if (!UNFINISHED.has(this.job.status)) {
+      this.source?.close();
+      this.setConnected(true);
+      await Promise.all([this.loadFiles(), this.loadHistory()]);
+    }
+  }
+
+  update() {
+    const { job } = this;
+    this.title = job.name || say.unnamed;
+    document.title = words.page.title(this.title);
+    this.heading.textContent = this.title;
+    put(this.badge, badge(job.status));
+    const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
+    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
+    this.error.hidden = !job.error;
+    if (job.error) put(this.error, h("strong", say.failed), h("p", job.error.message));
+    this.showActions();
+    this.updateState();
+    this.showFacts();
+  }
+
+  updateState() {
+    const { job } = this, running = UNFINISHED.has(job.status), { progress } = job;
+    this.state.hidden = !running;
+    if (!running) return;
+    if (job.status === "queued" || !progress) {
+      this.stateText.textContent = job.status !== "queued" ? say.statuses[job.status] : job.queue_position === 1 ? say.next : job.queue_position ? say.queue(job.queue_position) : say.statuses.queued;
+      this.leftText.textContent = "";
+      this.bar.removeAttribute("value");
+      return;
+    }
+    const { stage, step, total, fraction, eta_s } = progress;
+    this.stateText.textContent = [say.stages[stage] ?? stage, total ? (stage === "planning" || stage === "measuring" ? say.view : say.step)(step, total) : ""].filter(Boolean).join(" · ");
+    this.leftText.textContent = eta_s === null || eta_s === undefined ? "" : say.left(eta_s);
+    if (total) this.bar.value = fraction;
+    else this.bar.removeAttribute("value");
+  }
+
+  showActions() {
+    const { job } = this;
+    const button = (/** @type {string} */ name, /** @type {() => any} */ act, kind = "quiet") => h(`button.${kind}`, { type: "button", onclick: () => this.act(act) }, name);
+    if (this.shownFor === job.status) return;
+    this.shownFor = job.status;
+    put(this.actions,
+      UNFINISHED.has(job.status) && job.status !== "canceling" ? button(say.cancel, () => ask("POST", `/v1/jobs/${this.id}/cancel`)) : null,
+      RETRIED.has(job.status) ? button(say.retry, () => ask("POST", `/v1/jobs/${this.id}/retry`), "primary") : null,
+      UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
+        await ask("DELETE", `/v1/jobs/${this.id}`);
+        location.hash = "#/jobs";
+      }, (error) => this.tellError(error)));
+  }
+
+  /** @param {() => any} act */
+  async act(act) {
+    try {
+      await act();
+      await this.refresh();
+      if (UNFINISHED.has(this.job.status) && this.source?.readyState !== EventSource.OPEN) this.watch();
+    } catch (error) {
+      this.tellError(error);
+    }
+  }
+
+  /** @param {unknown} error */
+  tellError(error) {
+    this.error.hidden = false;
+    put(this.error, h("p", error instanceof Error ? error.message : String(error)));
+  }
+
+  /** @param {string} name of a preview */
+  showPreview(name) {
+    if (this.result || (this.preview && name <= this.preview)) return;
+    this.preview = name;
+    const picture = h("img", { alt: say.preview, decoding: "async" });
+    picture.onload = () => {
+      if (this.preview === name && !this.result) put(this.picture, picture);
+    };
+    picture.src = artifactPath(this.id, name);
+  }
+
+  async loadFiles() {
+    /** @type {any[]} */
+    let found;
+    try {
+      found = (await get(`/v1/jobs/${this.id}/artifacts`, this.leaving.signal)).artifacts;
+    } catch {
+      return;
+    }
+    const names = new Set(found.map(({ name }) => name));
+    const previews = found.map(({ name }) => name).filter((name) => name.startsWith("previews/")).sort();
+    if (previews.length) this.showPreview(previews[previews.length - 1]);
+    else if (!this.preview && !this.result) put(this.picture, h("p.quiet", UNFINISHED.has(this.job.status) ? say.noPreview : ""));
+    this.showFiles(found.filter(({ name }) => !name.startsWith("previews/")), names);
+    if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
+    if (this.job.status === "succeeded" && names.has("stylized.ply") && !this.result) this.showResult(names);
+  }
+
+  async loadPlan() {
+    try {
+      const plan = await get(artifactPath(this.id, "plan.json"), this.leaving.signal);
+      this.plan.hidden = false;
+      put(this.plan, h("h2", words.plan.decided), decisions(plan.decisions ?? []));
+    } catch {
+      // the plan is an extra
+    }
+  }
+
+  /**
+   * @param {any[]} list
+   * @param {Set<string>} names
+   */
+  showFiles(list, names) {
+    put(this.files, h("h2", say.files), names.has("report.html") ? h("p", h("a.button.quiet", { href: artifactPath(this.id, "report.html"), target: "_blank", rel: "noopener" }, say.openReport)) : null,
+      list.length ? h("ul.files", list.map(({ name, size: bytes }) => h("li", h("a", { href: artifactPath(this.id, name), download: name }, icon("down"), h("span", name)), h("small", size(bytes))))) : h("p.quiet", say.noFiles));
+  }
+
+  showFacts() {
+    const { job } = this, told = Object.entries(job.parameters).filter(([name, value]) => value !== null && value !== "" && name !== "name" && value !== false);
+    const fact = (/** @type {string} */ name, /** @type {string} */ value) => h("div", h("dt", name), h("dd", value));
+    put(this.facts, h("h2", say.inputs), h("dl.facts", job.inputs.slice(0, 12).map((/** @type {any} */ input) => fact(input.role, `${input.name} · ${size(input.size)}`)), job.inputs.length > 12 ? fact("", words.submit.nFiles(job.inputs.length)) : null),
+      h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(name.replaceAll("_", " "), typeof value === "object" ? JSON.stringify(value) : String(value))))));
+  }
+
+  /** @param {Set<string>} names of artifacts */
+  showResult(names) {
+    this.result = new ResultStage([this.job], { signal: this.leaving.signal });
+    const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
+    /** @type {[string, HTMLElement][]} */
+    const tabs = [[say.threeD, stage]];
+    if (names.has("before_after.jpg")) tabs.push([say.sheet, sheet]);
+    const open = (/** @type {number} */ at) => {
+      tabs.forEach(([, body], i) => (body.hidden = i !== at));
+      if (tabs[at][1] === sheet && !sheet.firstChild) put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
+    };
+    const picker = h("fieldset.segments", h("legend.away", say.view3d), tabs.map(([name], i) => h("label", h("input", { type: "radio", name: `tab${this.id}`, checked: !i, onchange: () => open(i) }), h("span", name))));
+    put(this.show, h("div.row.tabs", picker, this.compareLink()), tabs.map(([, body]) => body));
+  }
+
+  /** Other finished runs of the same scene. */
+  compareLink() {
+    const chooser = h("select", { "aria-label": say.compareWith, hidden: true, onchange: () => chooser.value && (location.hash = `#/compare/${this.id}/${chooser.value}`) });
+    const scene = this.job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256;
+    get("/v1/jobs?status=succeeded&limit=100", this.leaving.signal).then(({ jobs }) => {
+      const others = jobs.filter((/** @type {any} */ job) => job.id !== this.id && job.inputs.some((/** @type {any} */ input) => input.role === "scene" && input.sha256 === scene));
+      chooser.hidden = !others.length;
+      put(chooser, h("option", { value: "" }, `${say.compare}…`), others.map((/** @type {any} */ job) => h("option", { value: job.id }, `${job.name || say.unnamed}, ${time(job.created_at)}`)));
+    }).catch(() => {});
+    return chooser;
+  }
+
+  end() {
+    this.leaving.abort();
+    clearTimeout(this.waiting);
+    this.chart.end();
+    this.result?.end();
+  }
+}
+
+/**
+ * A button that asks once more.
+ *
+ * @param {string} name
+ * @param {() => Promise<void>} act
+ * @param {(error: unknown) => void} failed
+ * @param {string} [label]
+ */
+export function deleteButton(name, act, failed, label) {
+  const holder = h("span.sure");
+  const first = h("button.quiet.danger", { type: "button", onclick: () => ask_(), "aria-label": label ?? name }, label ? icon("bin") : name);
+  const ask_ = () => {
+    const yes = h("button.danger", { type: "button", onclick: () => act().catch(failed) }, say.remove);
+    put(holder, h("span", say.removeSure), yes, h("button.quiet", { type: "button", onclick: () => (put(holder, first), first.focus()) }, say.keep));
+    yes.focus();
+  };
+  put(holder, first);
+  return holder;
+}
+

@@ -1,0 +1,131 @@
+// @ts-check
+/** All jobs: pictures, names, what became of them. */
+import { artifactPath, ask, get } from "./api.js";
+import { announce, h, put } from "./dom.js";
+import { badge, deleteButton } from "./job.js";
+import { sceneOf } from "./result_stage.js";
+import { percent, time, words } from "./words.js";
+
+const say = words.jobs;
+const UNFINISHED = ["queued", "starting", "running", "canceling"];
+/** Milliseconds between two looks while something runs, and else. */
+const OFTEN = 3000, SELDOM = 20000;
+const PAGE = 60;
+
+export class JobsView {
+  constructor() {
+    this.title = say.title;
+    this.leaving = new AbortController();
+    /** @type {any[]} */
+    this.jobs = [];
+    /** @type {string | null} */
+    this.cursor = null;
+    /** @type {Set<string>} */
+    this.chosen = new Set();
+    /** @type {Map<string, {element: HTMLElement, told: string}>} */
+    this.cards = new Map();
+    this.name = h("input", { type: "search", "aria-label": say.filter, placeholder: say.filter, oninput: () => this.show() });
+    this.status = h("select", { "aria-label": say.status, onchange: () => this.show() }, h("option", { value: "" }, say.any),
+      Object.entries(words.job.statuses).map(([value, text]) => h("option", { value }, text)));
+    this.compare = h("button.quiet", { type: "button", disabled: true, title: say.chooseTwo, onclick: () => this.compareChosen() }, say.compare);
+    this.problem = h("p.wrong.block", { hidden: true, role: "alert" });
+    this.list = h("ul.grid");
+    this.more = h("button.quiet", { type: "button", hidden: true, onclick: () => this.load(true) }, say.more);
+    this.body = h("div", h("header.head", h("h1", say.title), h("div.row", this.name, this.status, this.compare)), this.problem, this.list, h("p.center", this.more));
+    this.element = h("div.jobs", h("p.quiet.pending", words.page.loading));
+    this.load(false);
+  }
+
+  /** @param {boolean} more */
+  async load(more) {
+    clearTimeout(this.timer);
+    try {
+      const found = await get(`/v1/jobs?limit=${PAGE}${more && this.cursor ? `&cursor=${this.cursor}` : ""}`, this.leaving.signal);
+      const known = new Map(this.jobs.map((job) => [job.id, job]));
+      for (const job of found.jobs) known.set(job.id, job);
+      const newest = new Set(found.jobs.map((/** @type {any} */ job) => job.id)), last = found.jobs.at(-1)?.id ?? "";
+      // what should be on this page and is not was deleted
+      this.jobs = [...known.values()].filter((job) => more || newest.has(job.id) || (found.next_cursor && job.id < last)).sort((a, b) => (a.id < b.id ? 1 : -1));
+      if (more || !this.cursor) this.cursor = found.next_cursor;
+      this.problem.hidden = true;
+      this.show();
+    } catch (error) {
+      if (this.leaving.signal.aborted) return;
+      this.problem.hidden = false;
+      this.problem.textContent = error instanceof Error ? error.message : String(error);
+      put(this.element, this.body);
+    }
+    const running = this.jobs.some((job) => UNFINISHED.includes(job.status));
+    this.timer = setTimeout(() => (document.hidden ? this.later() : this.load(false)), running ? OFTEN : SELDOM);
+  }
+
+  later() {
+    document.addEventListener("visibilitychange", () => this.load(false), { once: true, signal: this.leaving.signal });
+  }
+
+  show() {
+    if (!this.jobs.length && this.problem.hidden) {
+      return void put(this.element, h("div.empty", h("h1", say.empty), h("p", say.emptyLead), h("a.button.primary", { href: "#/" }, words.page.toNew)));
+    }
+    if (this.body.parentElement !== this.element) put(this.element, this.body);
+    const wanted = this.name.value.trim().toLowerCase(), status = this.status.value;
+    const shown = this.jobs.filter((job) => (!status || job.status === status) && (!wanted || `${job.name} ${job.inputs.map((/** @type {any} */ input) => input.name).join(" ")}`.toLowerCase().includes(wanted)));
+    const elements = shown.map((job) => this.card(job));
+    if (!shown.length) elements.push(h("li.none", h("p.quiet", say.noMatch)));
+    const before = [...this.list.children];
+    if (before.length !== elements.length || before.some((each, i) => each !== elements[i])) put(this.list, elements);
+    this.more.hidden = !this.cursor;
+    this.compare.disabled = this.chosen.size !== 2;
+  }
+
+  /** A card is made anew only when its job has changed. @param {any} job */
+  card(job) {
+    const told = JSON.stringify([job.status, job.preview, job.progress?.fraction, job.queue_position, job.name]), known = this.cards.get(job.id);
+    if (known?.told === told || known?.element.contains(document.activeElement)) return known.element;
+    const name = job.name || words.job.unnamed, style = job.inputs.filter((/** @type {any} */ input) => input.role === "style").map((/** @type {any} */ input) => input.name).join(", ");
+    const running = UNFINISHED.includes(job.status), done = job.status === "succeeded";
+    const picture = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", loading: "lazy", decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
+    const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) }), h("small", { "aria-hidden": "true" }, say.choose)) : null;
+    const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", name), h("small", [style, time(job.created_at)].filter(Boolean).join(" · "))),
+      h("div.row", badge(job.status), running && job.progress?.total ? h("small", percent(job.progress.fraction)) : null, h("span.grow"), choose, running ? null : this.deleter(job, name)),
+      running && job.progress?.total ? h("progress", { max: 1, value: job.progress.fraction, "aria-label": words.job.progress }) : null);
+    this.cards.set(job.id, { element, told });
+    return element;
+  }
+
+  /** @param {any} job @param {string} name */
+  deleter(job, name) {
+    return deleteButton(words.job.remove, async () => {
+      await ask("DELETE", `/v1/jobs/${job.id}`);
+      this.jobs = this.jobs.filter((each) => each.id !== job.id);
+      this.chosen.delete(job.id);
+      announce(say.removed);
+      this.show();
+    }, (error) => {
+      this.problem.hidden = false;
+      this.problem.textContent = error instanceof Error ? error.message : String(error);
+    }, say.remove(name));
+  }
+
+  /** @param {string} id @param {boolean} on */
+  choose(id, on) {
+    if (on) this.chosen.add(id);
+    else this.chosen.delete(id);
+    this.compare.disabled = this.chosen.size !== 2;
+  }
+
+  compareChosen() {
+    const [a, b] = [...this.chosen], [first, second] = [a, b].map((id) => this.jobs.find((job) => job.id === id));
+    if (sceneOf(first) !== sceneOf(second)) {
+      this.problem.hidden = false;
+      this.problem.textContent = say.otherScenes;
+      return;
+    }
+    location.hash = `#/compare/${a}/${b}`;
+  }
+
+  end() {
+    this.leaving.abort();
+    clearTimeout(this.timer);
+  }
+}

@@ -1,0 +1,81 @@
+// @ts-check
+/** The page: its frame, its views by address, and who is signed in. */
+import { ask, get, whenKeyIsNeeded } from "./api.js";
+import { CompareView } from "./compare.js";
+import { announce, h, icon, put } from "./dom.js";
+import { JobView } from "./job.js";
+import { JobsView } from "./jobs.js";
+import { SignInView } from "./signin.js";
+import { SubmitView } from "./submit.js";
+import { words } from "./words.js";
+
+/** @typedef {{title: string, element: HTMLElement, end: () => void}} View */
+
+const say = words.page;
+const main = h("main", { id: "main", tabIndex: -1 });
+const links = [["#/", say.new], ["#/jobs", say.jobs]].map(([href, text]) => h("a", { href }, text));
+const out = h("button.tool.wide", { type: "button", hidden: true, onclick: signOut }, icon("out"), h("span", say.signOut));
+/** @type {View | null} */
+let view = null;
+
+document.body.append(
+  h("a.skip", { href: "#main", onclick: (/** @type {Event} */ event) => (event.preventDefault(), main.focus()) }, say.skip),
+  h("header.top", h("a.brand", { href: "#/" }, h("span.mark", { "aria-hidden": "true" }), say.name), h("nav", { "aria-label": say.main }, links), h("span.grow"), h("a.faint", { href: "/docs" }, say.api), out),
+  main,
+  h("div.away", { id: "said", "aria-live": "polite" }),
+);
+
+/** @returns {View} */
+function viewOf() {
+  const [, name = "", ...ids] = location.hash.split("/");
+  const known = ids.length > 0 && ids.every((id) => /^job_[0-9a-f]+$/.test(id));
+  if (name === "") return new SubmitView();
+  if (name === "jobs" && !ids.length) return new JobsView();
+  if (name === "jobs" && known && ids.length === 1) return new JobView(ids[0]);
+  if (name === "compare" && known && ids.length === 2) return new CompareView(ids);
+  return { title: "", element: h("div.empty", h("h1", say.missing), h("a.button.primary", { href: "#/" }, say.toNew)), end: () => {} };
+}
+
+/** @param {View} next */
+function show(next) {
+  view?.end();
+  view = next;
+  put(main, next.element);
+  document.title = say.title(next.title);
+  const here = location.hash.startsWith("#/jobs") || location.hash.startsWith("#/compare") ? "#/jobs" : "#/";
+  for (const link of links) link.toggleAttribute("aria-current", link.getAttribute("href") === here);
+  for (const link of links) if (link.hasAttribute("aria-current")) link.setAttribute("aria-current", "page");
+}
+
+function enter() {
+  show(viewOf());
+  scrollTo(0, 0);
+}
+
+async function signOut() {
+  await ask("DELETE", "/v1/session").catch(() => {});
+  announce(words.signIn.out);
+  begin();
+}
+
+function signIn() {
+  if (view instanceof SignInView) return;
+  out.hidden = true;
+  show(new SignInView(begin));
+}
+
+async function begin() {
+  const session = await get("/v1/session").catch(() => ({ keys_needed: false, signed_in: false }));
+  out.hidden = !session.signed_in;
+  if (session.keys_needed && !session.signed_in) signIn();
+  else enter();
+}
+
+whenKeyIsNeeded(signIn);
+addEventListener("hashchange", () => {
+  if (view instanceof SignInView) return;
+  enter();
+  main.focus({ preventScroll: true });
+  announce(view?.title ?? "");
+});
+begin();

@@ -1,0 +1,143 @@
+// @ts-check
+/** Runs of one scene in 3D: the original and each run's colours, two of them on the sides of the wipe. */
+import { artifactPath, ask, get, Problem } from "./api.js";
+import { readCameras } from "./cameras.js";
+import { h, put } from "./dom.js";
+import { Stage } from "./stage.js";
+import { words } from "./words.js";
+
+/** @typedef {import("./viewer/viewer.js").Side} Side */
+
+const say = words.viewer;
+
+export class ResultStage {
+  /**
+   * @param {any[]} jobs finished runs; the scene is the first one's
+   * @param {{signal: AbortSignal}} how
+   */
+  constructor(jobs, { signal }) {
+    this.jobs = jobs;
+    this.signal = signal;
+    this.stage = new Stage();
+    this.left = this.chooser(say.left);
+    this.right = this.chooser(say.right);
+    this.pickers = h("div.row.sides", { hidden: jobs.length < 2 }, this.left.element, this.right.element);
+    this.element = h("div.result-stage", this.pickers, this.stage.element);
+    /** What can stand on a side. @type {Map<string, {name: string, side: Side}>} */
+    this.choices = new Map();
+    if (this.stage.viewer) {
+      this.stage.viewer.onReload = () => this.load();
+      this.load();
+    }
+  }
+
+  /** @param {string} name */
+  chooser(name) {
+    const select = h("select", { "aria-label": name, onchange: () => this.showSides() });
+    return { select, element: h("label.option.inline", h("span", name), select) };
+  }
+
+  async load() {
+    const { viewer } = this.stage, [first] = this.jobs;
+    if (!viewer) return;
+    for (const { side } of this.choices.values()) side.scene.worker.terminate(); // of a device that went away
+    this.choices.clear();
+    this.original = undefined;
+    viewer.background = first.parameters.background ?? [0, 0, 0];
+    viewer.camera.near = first.parameters.near ?? 0.2;
+    this.stage.message(words.page.loading);
+    await this.loadCameras();
+    await this.openOriginal(first);
+    for (const job of this.jobs) await this.openRun(job).catch((error) => this.tell(error));
+    if (this.signal.aborted) return;
+    this.offer();
+  }
+
+  async loadCameras() {
+    const here = `/v1/jobs/${this.jobs[0].id}/inputs`;
+    try {
+      const { inputs } = await get(here, this.signal), files = inputs.filter((/** @type {any} */ input) => /^cameras(:|$)/.test(input.role));
+      if (!files.length) return;
+      const blobs = await Promise.all(files.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${here}/${file.role}`, { signal: this.signal })).blob() })));
+      this.stage.setCameras(await readCameras(blobs), { stand: true });
+    } catch {
+      // without cameras there is the free view
+    }
+  }
+
+  /** @param {any} job */
+  async openOriginal(job) {
+    const { viewer } = this.stage;
+    if (!viewer || this.signal.aborted) return;
+    const scene = viewer.open(new URL(`/v1/jobs/${job.id}/inputs/scene`, location.href).href);
+    this.stage.show({ scene, colours: "own" });
+    try {
+      await scene.headerRead;
+      scene.ready.then(() => this.standFirst(), (error) => this.tell(error));
+      this.original = scene;
+      this.choices.set("original", { name: say.original, side: { scene, colours: "own" } });
+    } catch {
+      scene.end(); // compressed: what came out of it is shown alone
+      viewer.sides = null;
+    }
+  }
+
+  /** The camera stands rightly once the scene's middle is known. */
+  standFirst() {
+    const { viewer, stood } = this.stage;
+    if (viewer && stood >= 0 && !viewer.touched) this.stage.stand(stood, false);
+  }
+
+  /** @param {any} job */
+  async openRun(job) {
+    const { viewer } = this.stage, name = this.jobs.length > 1 ? job.name || job.id.slice(-6) : say.stylized;
+    if (!viewer || this.signal.aborted) return;
+    const fade = job.parameters.sh_fade ?? 0;
+    if (this.original && sceneOf(job) === sceneOf(this.jobs[0])) {
+      try {
+        const answer = await ask("GET", artifactPath(job.id, "colours.f16"), { signal: this.signal });
+        await this.original.addColours(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
+        this.choices.set(job.id, { name, side: { scene: this.original, colours: job.id, fade } });
+        return;
+      } catch (error) {
+        if (!(error instanceof Problem) || error.status !== 404) throw error;
+      }
+    }
+    const scene = viewer.open(new URL(artifactPath(job.id, "stylized.ply"), location.href).href);
+    this.choices.set(job.id, { name, side: { scene, colours: "own" } });
+    if (!this.original) this.stage.show({ scene, colours: "own" });
+    await scene.headerRead;
+  }
+
+  offer() {
+    const all = [...this.choices];
+    if (!all.length) return this.stage.message(words.job.noScene);
+    const options = () => all.map(([key, { name }]) => h("option", { value: key }, name));
+    put(this.left.select, options());
+    put(this.right.select, options());
+    this.left.select.value = this.jobs.length > 1 ? (all.at(-2)?.[0] ?? all[0][0]) : all[0][0];
+    this.right.select.value = all[all.length - 1][0];
+    this.showSides();
+  }
+
+  showSides() {
+    const left = this.choices.get(this.left.select.value), right = this.choices.get(this.right.select.value);
+    if (!left || !right) return;
+    if (left === right) this.stage.show(left.side);
+    else this.stage.show(left.side, right.side, [left.name, right.name]);
+  }
+
+  /** @param {unknown} error */
+  tell(error) {
+    if (!this.signal.aborted) this.stage.message(error instanceof Error ? error.message : String(error));
+  }
+
+  end() {
+    for (const { side } of this.choices.values()) side.scene.end();
+    this.stage.end();
+  }
+}
+
+/** @param {any} job @returns {string} digest of its scene */
+export const sceneOf = (job) => job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256 ?? job.id;
+

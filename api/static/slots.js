@@ -1,0 +1,125 @@
+// @ts-check
+/** Places for files: chosen, dropped, shown by name, taken out again. */
+import { h, icon, newId, put } from "./dom.js";
+import { showWrong } from "./options.js";
+import { size, words } from "./words.js";
+
+const say = words.submit;
+
+export class Slot {
+  /**
+   * @param {string} name
+   * @param {string} hint
+   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, changed: () => void}} how
+   */
+  constructor(name, hint, { accept = "", multiple = false, pictures = false, changed }) {
+    this.hint = hint;
+    this.multiple = multiple;
+    this.pictures = pictures;
+    this.changed = changed;
+    /** @type {File[]} */
+    this.files = [];
+    /** @type {string[]} */
+    this.urls = [];
+    const id = newId();
+    this.input = h("input", { type: "file", id, accept, multiple, "aria-describedby": `${id}d ${id}e`, onchange: () => this.add([...this.input.files]) });
+    this.detail = h("p.detail", { id: `${id}d` }, hint);
+    this.error = h("p.wrong", { id: `${id}e`, hidden: true });
+    this.thumbs = h("div.thumbs");
+    this.action = h("span.choose", { "aria-hidden": "true" }, say.choose);
+    this.pick = h("div.pick", this.input, h("div.text", h("label", { htmlFor: id }, name), this.detail), this.action);
+    this.element = h("div.slot", this.pick, this.thumbs, this.error);
+  }
+
+  /** @param {File[]} files */
+  add(files) {
+    if (!files.length) return;
+    const known = new Set(this.files.map((file) => file.name + file.size));
+    this.files = this.multiple ? [...this.files, ...files.filter((file) => !known.has(file.name + file.size))] : [files[0]];
+    this.input.value = "";
+    this.show();
+    this.changed();
+  }
+
+  /** @param {File} file */
+  remove(file) {
+    this.files = this.files.filter((each) => each !== file);
+    this.show();
+    this.changed();
+    this.input.focus();
+  }
+
+  show() {
+    this.wrong("");
+    this.urls.forEach((url) => URL.revokeObjectURL(url));
+    this.urls = [];
+    const { files } = this;
+    this.element.classList.toggle("filled", files.length > 0);
+    this.action.textContent = files.length && !this.multiple ? say.change : say.choose;
+    const total = files.reduce((sum, file) => sum + file.size, 0);
+    this.say(!files.length ? this.hint : files.length === 1 ? `${files[0].name} · ${size(total)}` : `${say.nFiles(files.length)} · ${size(total)}`);
+    put(this.thumbs, files.slice(0, 12).map((file) => this.thumb(file)));
+  }
+
+  /** @param {File} file */
+  thumb(file) {
+    const remove = h("button.tool", { type: "button", "aria-label": say.remove(file.name), title: say.remove(file.name), onclick: () => this.remove(file) }, icon("close"));
+    if (!this.pictures) return h("div.thumb.plain", h("span", file.name), remove);
+    const url = URL.createObjectURL(file);
+    this.urls.push(url);
+    return h("div.thumb", h("img", { src: url, alt: file.name }), remove);
+  }
+
+  /** @param {string} text */
+  say(text) {
+    this.detail.textContent = text;
+  }
+
+  /** @param {string} text */
+  wrong(text) {
+    showWrong(this.input, this.error, text);
+  }
+
+  end() {
+    this.urls.forEach((url) => URL.revokeObjectURL(url));
+  }
+}
+
+const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, SCENE = /\.(ply|spz|splat)$/i, CAMERAS = /\.(json|bin|txt)$/i;
+
+/**
+ * Which slot dropped files belong to. One or two pictures are paintings; more are photos.
+ *
+ * @param {File[]} files
+ * @returns {{scene: File[], style: File[], cameras: File[], photos: File[], unknown: File[]}}
+ */
+export function sorted(files) {
+  const pictures = files.filter((file) => PICTURE.test(file.name)), many = pictures.length > 4;
+  return {
+    scene: files.filter((file) => SCENE.test(file.name)), cameras: files.filter((file) => CAMERAS.test(file.name)),
+    style: many ? [] : pictures, photos: many ? pictures : [],
+    unknown: files.filter((file) => ![PICTURE, SCENE, CAMERAS].some((form) => form.test(file.name))),
+  };
+}
+
+/** Files of a drop, those in folders too. @param {DataTransfer} data @returns {Promise<File[]>} */
+export async function droppedFiles(data) {
+  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter((entry) => entry);
+  if (!entries.some((entry) => entry?.isDirectory)) return [...data.files];
+  /** @type {File[]} */
+  const found = [];
+  const walk = async (/** @type {any} */ entry) => {
+    if (found.length > 10000) return;
+    if (entry.isFile) found.push(await new Promise((done, wrong) => entry.file(done, wrong)));
+    else {
+      const reader = entry.createReader();
+      for (;;) {
+        const part = await new Promise((done, wrong) => reader.readEntries(done, wrong));
+        if (!part.length) break;
+        for (const each of part) await walk(each);
+      }
+    }
+  };
+  for (const entry of entries) await walk(entry);
+  return found;
+}

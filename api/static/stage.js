@@ -1,0 +1,197 @@
+// @ts-check
+/** The 3D view with everything that belongs to it: wipe, cameras, pictures, messages. */
+import { announce, h, icon, newId, put } from "./dom.js";
+import { cameraLines, frameSize, upOf } from "./cameras.js";
+import { Controls } from "./viewer/controls.js";
+import { Viewer } from "./viewer/viewer.js";
+import { words } from "./words.js";
+
+/** @typedef {import("./cameras.js").JobCamera} JobCamera */
+/** @typedef {import("./viewer/viewer.js").Side} Side */
+/** @typedef {import("./viewer/splat_scene.js").SplatScene} SplatScene */
+
+const say = words.viewer;
+
+export class Stage {
+  constructor() {
+    this.canvas = h("canvas.view", { tabIndex: 0, role: "application", "aria-label": say.name, "aria-description": say.instructions });
+    this.overlay = h("div.overlay");
+    this.note = h("p.note", { hidden: true });
+    this.bar = h("div.loading", { hidden: true }, h("span"));
+    this.divider = h("div.divider", { hidden: true, "aria-hidden": "true" }, h("span"));
+    this.leftName = h("span.side.left", { hidden: true });
+    this.rightName = h("span.side.right", { hidden: true });
+    this.tools = h("div.tools", { role: "toolbar", "aria-label": say.name });
+    this.frame = h("div.frame", this.canvas, this.leftName, this.rightName, this.divider, this.overlay, this.note, this.bar);
+    this.element = h("section.stage", { "aria-label": say.name }, this.frame, this.tools);
+    /** @type {JobCamera[]} */
+    this.cameras = [];
+    this.stood = -1;
+    /** @type {[string, string] | null} */
+    this.names = null;
+    /** @type {Viewer | null} */
+    this.viewer = null;
+    this.showFrames = false;
+    this.up = [0, -1, 0];
+    try {
+      this.viewer = new Viewer(this.canvas, () => this.told());
+    } catch (error) {
+      this.message(error instanceof Error ? error.message : String(error));
+      return;
+    }
+    this.controls = new Controls(this.viewer, { toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home() });
+    this.makeTools();
+    this.canvas.addEventListener("pointerdown", () => this.leaveCamera());
+    this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => event.buttons && this.wipeTo(event.clientX));
+    this.divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.divider.setPointerCapture(event.pointerId));
+  }
+
+  makeTools() {
+    const button = (/** @type {any} */ picture, /** @type {string} */ name, /** @type {() => void} */ onclick) => h("button.tool", { type: "button", title: name, "aria-label": name, onclick }, icon(picture));
+    const wipeId = newId();
+    this.slider = h("input", { type: "range", id: wipeId, min: 0, max: 1000, step: 1, value: 500, oninput: () => this.setWipe(Number(this.slider.value) / 1000) });
+    this.wipe = h("div.wipe", { hidden: true }, h("label", { htmlFor: wipeId }, say.wipe), this.slider, button("swap", say.toggle, () => this.toggle()));
+    const group = newId(), mode = (/** @type {string} */ name, /** @type {boolean} */ orbit) =>
+      h("label", h("input", { type: "radio", name: group, checked: orbit, onchange: () => this.controls && (this.controls.orbit = orbit) }), h("span", name));
+    this.chooser = h("select", { "aria-label": say.camera, onchange: () => this.stand(Number(this.chooser.value)) });
+    this.cameraTools = h("div.cameras", { hidden: true },
+      button("left", say.previous, () => this.stand(this.stood - 1)), this.chooser, button("right", say.next, () => this.stand(this.stood + 1)));
+    const help = h("details.help", h("summary", { title: say.keys, "aria-label": say.keys }, icon("help")),
+      h("dl", say.help.map(([keys, what]) => h("div", h("dt", keys), h("dd", what)))));
+    help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && (help.open = false));
+    put(this.tools, this.wipe, this.cameraTools, h("fieldset.segments", h("legend.away", say.movement), mode(say.orbit, true), mode(say.fly, false)),
+      h("div.buttons", button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
+  }
+
+  /** The viewer has news. */
+  told() {
+    const { viewer } = this;
+    if (!viewer) return;
+    this.element.dataset.frames = String(viewer.frames);
+    const scene = viewer.sides?.left.scene;
+    if (viewer.lost) return this.message(say.lost);
+    if (!scene?.header) return;
+    const { header, loaded, degree } = scene, share = loaded / header.count;
+    this.bar.hidden = scene.whole;
+    this.bar.firstChild.style.width = `${100 * share}%`;
+    this.message(!scene.whole ? words.scene.loading(loaded, header.count) : degree < header.degree ? words.scene.dropped(degree, header.degree) : "");
+  }
+
+  /** @param {string} text */
+  message(text) {
+    this.note.hidden = !text;
+    if (this.note.textContent !== text) this.note.textContent = text;
+  }
+
+  /**
+   * @param {Side} left
+   * @param {Side} [right]
+   * @param {[string, string]} [names]
+   */
+  show(left, right, names) {
+    if (!this.viewer) return;
+    this.names = right && names ? names : null;
+    this.viewer.camera.up = this.up;
+    this.viewer.show(left, right ?? left);
+    for (const part of [this.wipe, this.divider, this.leftName, this.rightName]) part.hidden = !this.names;
+    if (names) [this.leftName.textContent, this.rightName.textContent] = names;
+    if (this.names) this.setWipe(this.share ?? 0.5);
+    else this.viewer.wipe(0);
+  }
+
+  /** @param {number} share of the width that shows the left side */
+  setWipe(share) {
+    this.share = share;
+    this.viewer?.wipe(share);
+    this.slider.value = String(Math.round(share * 1000));
+    if (this.names) this.slider.setAttribute("aria-valuetext", say.wipeAt(this.names[0], this.names[1], share));
+    this.divider.style.left = `${share * 100}%`;
+    this.leftName.classList.toggle("gone", share < 0.08);
+    this.rightName.classList.toggle("gone", share > 0.92);
+  }
+
+  /** @param {number} x of the pointer in the window */
+  wipeTo(x) {
+    const { left, width } = this.canvas.getBoundingClientRect();
+    this.setWipe(Math.max(0, Math.min(1, (x - left) / width)));
+  }
+
+  toggle() {
+    if (!this.names) return;
+    this.setWipe((this.share ?? 0) >= 0.5 ? 0 : 1);
+    announce(this.names[this.share ? 0 : 1]);
+  }
+
+  /**
+   * @param {JobCamera[]} cameras
+   * @param {{frames?: boolean, stand?: boolean}} [how] draw them in the scene, go to the first
+   */
+  setCameras(cameras, { frames = false, stand = false } = {}) {
+    this.cameras = cameras;
+    this.showFrames = frames;
+    if (!this.viewer) return;
+    if (cameras.length > 1) this.up = upOf(cameras);
+    this.cameraTools.hidden = !cameras.length;
+    put(this.chooser, h("option", { value: "-1" }, say.free), cameras.map((camera, i) => h("option", { value: String(i) }, say.cameraOf(i + 1, cameras.length, camera.name.slice(-40)))));
+    this.stood = -1;
+    if (stand && cameras.length) this.stand(0, false);
+    this.drawFrames();
+  }
+
+  drawFrames() {
+    const { viewer } = this;
+    if (!viewer) return;
+    const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
+    const shown = this.showFrames ? this.cameras.filter((_, i) => i !== this.stood) : [];
+    viewer.lines = cameraLines(shown, length);
+    viewer.draw();
+  }
+
+  /**
+   * @param {number} index of a camera; others come after the last one
+   * @param {boolean} [aloud]
+   */
+  stand(index, aloud = true) {
+    const { viewer, cameras } = this;
+    if (!viewer || !cameras.length) return;
+    this.stood = index === -1 && this.stood === -1 ? cameras.length - 1 : Math.max(-1, index >= cameras.length ? 0 : index);
+    this.chooser.value = String(this.stood);
+    if (this.stood < 0) return;
+    viewer.camera.up = this.up;
+    viewer.camera.stand(cameras[this.stood], viewer.sides?.left.scene.middle ?? null);
+    if (aloud) viewer.moved();
+    this.drawFrames();
+    if (aloud) announce(say.cameraOf(this.stood + 1, cameras.length, cameras[this.stood].name));
+  }
+
+  leaveCamera() {
+    if (this.stood < 0) return;
+    this.stood = -1;
+    this.chooser.value = "-1";
+    this.drawFrames();
+  }
+
+  home() {
+    const middle = this.viewer?.sides?.left.scene.middle;
+    if (!middle || !this.viewer) return;
+    this.leaveCamera();
+    this.viewer.camera.frame(middle, this.up);
+    this.viewer.moved();
+  }
+
+  async save() {
+    if (!this.viewer) return;
+    const url = URL.createObjectURL(await this.viewer.picturePng());
+    h("a", { href: url, download: "view.png" }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 10000);
+  }
+
+  full() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else this.element.requestFullscreen?.();
+  }
+
+  end() {
+    this.viewer?.end();
+  }
+}

@@ -1,0 +1,464 @@
+// @ts-check
+/** A new job: files, what it looks like, what it would cost, and off it goes. */
+import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
+import { readCameras, ringCameras } from "./cameras.js";
+import { announce, h, icon, newId, put } from "./dom.js";
+import { optionControl } from "./options.js";
+import { costCard } from "./plan.js";
+import { RegionList } from "./regions.js";
+import { droppedFiles, Slot, sorted } from "./slots.js";
+import { Stage } from "./stage.js";
+import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
+import { percent, words } from "./words.js";
+
+/** @typedef {import("./options.js").Control} Control */
+
+const say = words.submit;
+/** Options that stand in the open, and those that have a place of their own. */
+const MAIN = ["resolution", "views", "content_weight", "max_seconds"], PLACED = new Set(["preset", "orbit", "up", "elevation", "radius", "style_weights", "regions", ...MAIN]);
+const DRAFT = "sgsst.draft";
+const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
+
+/** Uploads that go on while other views are shown would need a place to be seen: a view that ends stops its own. */
+export class SubmitView {
+  constructor() {
+    this.title = say.title;
+    const changed = (/** @type {() => void} */ act) => ({ changed: act });
+    this.slots = {
+      scene: new Slot(say.scene, say.sceneHint, { accept: ".ply,.spz,.splat", ...changed(() => this.sceneChanged()) }),
+      style: new Slot(say.style, say.styleHint, { accept: "image/*", multiple: true, pictures: true, ...changed(() => this.styleChanged()) }),
+      cameras: new Slot(say.cameras, say.camerasHint, { accept: ".json,.bin,.txt", multiple: true, ...changed(() => this.camerasChanged()) }),
+      photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, ...changed(() => this.refresh()) }),
+    };
+    this.stage = new Stage();
+    /** @type {Map<string, Control>} */
+    this.controls = new Map();
+    this.leaving = new AbortController();
+    /** @type {Map<File, Upload>} */
+    this.uploads = new Map();
+    /** @type {any[]} */
+    this.weights = [];
+    this.regions = new RegionList();
+    this.build();
+    this.loadOptions();
+    this.listenToDrops();
+  }
+
+  build() {
+    this.invite = h("label.invite", { htmlFor: this.slots.scene.input.id }, h("span.plus", icon("plus")), h("strong", say.drop), h("span", say.dropMore));
+    this.stage.overlay.append(this.invite);
+    this.presets = h("fieldset.presets", h("legend", "Preset"));
+    this.main = h("div.options");
+    this.ring = h("div.options");
+    this.around = this.choice("views", say.around, false);
+    this.fromFiles = this.choice("views", say.fromFiles, true);
+    this.viewsBody = h("div.views-body");
+    this.found = h("p.quiet");
+    this.shares = h("div.options", { hidden: true });
+    this.all = h("div.options");
+    this.search = h("input", { type: "search", "aria-label": say.find, placeholder: say.find, oninput: () => this.filter() });
+    this.none = h("p.quiet", { hidden: true }, say.noOptions);
+    this.more = h("details.fold", h("summary", say.more), this.search, this.none, this.all);
+    this.regionFold = h("details.fold", h("summary", say.regions), h("p.help", say.regionsHint), this.regions.element);
+    this.problem = h("p.wrong.block", { hidden: true, role: "alert" });
+    this.costButton = h("button.quiet", { type: "button", onclick: () => this.act(true) }, say.cost);
+    this.startButton = h("button.primary", { type: "submit" }, say.start);
+    this.progress = h("div.sending", { hidden: true });
+    this.result = h("div.result", { "aria-live": "polite" });
+    this.notice = h("div.notice", { hidden: true });
+    this.form = h("form.panel", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.act(false)) },
+      h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice,
+      h("section", h("h2", say.files), this.slots.scene.element, this.slots.style.element, this.shares),
+      h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.viewsBody, this.found),
+      h("section", h("h2", say.look), this.presets, this.main, this.regionFold, this.more),
+      h("div.actions", this.problem, this.progress, h("div.row", this.costButton, this.startButton)), this.result);
+    this.element = h("div.split", h("div.pinned", this.stage.element), this.form);
+    this.showViews();
+    this.showUnfinished();
+  }
+
+  /**
+   * @param {string} group
+   * @param {string} name
+   * @param {boolean} checked
+   */
+  choice(group, name, checked) {
+    const input = h("input", { type: "radio", name: group, checked, onchange: () => this.showViews() });
+    return { input, element: h("label", input, h("span", name)) };
+  }
+
+  get orbiting() {
+    return this.around?.input.checked ?? false;
+  }
+
+  showViews() {
+    put(/** @type {Element} */ (this.viewsBody), this.orbiting ? this.ring : [this.slots.cameras.element, this.slots.photos.element]);
+    this.camerasChanged();
+  }
+
+  showUnfinished() {
+    const [first] = unfinished();
+    /** @type {any} */ (this.notice).hidden = !first;
+    if (!first) return;
+    put(/** @type {Element} */ (this.notice), h("p", say.resumable(first.name, percent(first.sent / first.size))),
+      h("button.quiet", { type: "button", onclick: () => (forgetUnfinished(), this.showUnfinished()) }, say.forget));
+  }
+
+  async loadOptions() {
+    let schema;
+    try {
+      const document = await get("/openapi.json", this.leaving.signal);
+      schema = document.components.schemas.JobParameters.properties;
+    } catch {
+      if (!this.leaving.signal.aborted) put(this.main, h("p.quiet", say.optionsAway));
+      return;
+    }
+    for (const [name, each] of Object.entries(schema)) {
+      if (["style_weights", "regions", "preset"].includes(name)) continue;
+      this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
+    }
+    this.makePresets(schema.preset);
+    const elements = (/** @type {string[]} */ names) => names.map((name) => this.controls.get(name)?.element).filter(Boolean);
+    put(this.main, ...elements(MAIN));
+    put(this.ring, ...elements(["orbit", "up", "elevation", "radius"]));
+    put(this.all, ...elements([...this.controls.keys()].filter((name) => !PLACED.has(name))));
+    this.ring.addEventListener("input", () => this.camerasChanged());
+    this.restoreDraft();
+    this.form.addEventListener("input", () => this.saveDraft());
+  }
+
+  /** @param {any} schema */
+  makePresets(schema) {
+    const name = newId();
+    this.preset = schema.default;
+    put(this.presets, h("legend", "Preset"), schema.enum.map((/** @type {string} */ value) => h("label",
+      h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => (this.preset = value) }),
+      h("span", h("strong", value), h("small", say.presets[value] ?? "")))));
+  }
+
+  filter() {
+    const wanted = this.search.value.trim().toLowerCase();
+    let shown = 0;
+    for (const { name, help, element } of this.controls.values()) {
+      if (PLACED.has(name)) continue;
+      element.hidden = !!wanted && !`${name.replaceAll("_", " ")} ${name} ${help}`.toLowerCase().includes(wanted);
+      shown += element.hidden ? 0 : 1;
+    }
+    this.none.hidden = shown > 0;
+  }
+
+  saveDraft() {
+    const values = Object.fromEntries([...this.controls].map(([name, control]) => [name, control.value()]).filter(([, value]) => value !== undefined));
+    try {
+      sessionStorage.setItem(DRAFT, JSON.stringify({ values, preset: this.preset, orbiting: this.orbiting }));
+    } catch {
+      // a private window may keep nothing
+    }
+  }
+
+  restoreDraft() {
+    let draft;
+    try {
+      draft = JSON.parse(sessionStorage.getItem(DRAFT) ?? "null");
+    } catch {
+      draft = null;
+    }
+    if (!draft) return;
+    for (const [name, value] of Object.entries(draft.values ?? {})) this.controls.get(name)?.set(Array.isArray(value) ? value.join(", ") : value);
+    const preset = [...this.presets.querySelectorAll("input")].find((/** @type {any} */ input) => input.value === draft.preset);
+    if (preset) {
+      /** @type {any} */ (preset).checked = true;
+      this.preset = draft.preset;
+    }
+    if (draft.orbiting && this.around) this.around.input.checked = true;
+    this.showViews();
+  }
+
+  listenToDrops() {
+    const hint = h("div.dropping", { "aria-hidden": "true" }, say.dropNow);
+    const signal = this.leaving.signal;
+    let depth = 0;
+    document.addEventListener("dragenter", (event) => {
+      if (!event.dataTransfer?.types.includes("Files")) return;
+      if (!depth++) document.body.append(hint);
+    }, { signal });
+    document.addEventListener("dragleave", () => !--depth && hint.remove(), { signal });
+    document.addEventListener("dragover", (event) => event.preventDefault(), { signal });
+    document.addEventListener("drop", async (event) => {
+      event.preventDefault();
+      depth = 0;
+      hint.remove();
+      if (event.dataTransfer) this.take(await droppedFiles(event.dataTransfer));
+    }, { signal });
+  }
+
+  /** @param {File[]} files */
+  take(files) {
+    const found = sorted(files);
+    if (found.cameras.length && this.fromFiles) {
+      this.fromFiles.input.checked = true;
+      this.showViews();
+    }
+    for (const role of /** @type {const} */ (["cameras", "photos", "style", "scene"])) this.slots[role].add(found[role]);
+  }
+
+  async sceneChanged() {
+    const [file] = this.slots.scene.files;
+    this.refresh();
+    this.opened?.end();
+    this.opened = null;
+    if (this.invite) this.invite.hidden = !!file;
+    const { viewer } = this.stage;
+    if (!viewer) return;
+    viewer.touched = false;
+    viewer.sides = null;
+    if (!file) {
+      this.stage.bar.hidden = true;
+      this.stage.message("");
+      return viewer.draw();
+    }
+    const scene = (this.opened = viewer.open(file));
+    viewer.onReload = () => this.sceneChanged();
+    this.stage.show({ scene, colours: "own" });
+    try {
+      const header = await scene.headerRead;
+      this.slots.scene.say(`${file.name} · ${words.scene.header(header)}`);
+      await scene.ready;
+      this.camerasChanged();
+    } catch (error) {
+      if (this.opened !== scene) return;
+      this.stage.bar.hidden = true;
+      viewer.sides = null;
+      viewer.draw();
+      this.stage.message(error instanceof Error ? error.message : String(error));
+    }
+  }
+
+  styleChanged() {
+    const { files } = this.slots.style;
+    this.refresh();
+    this.regions.setStyles(files.map((file) => file.name));
+    this.weights = files.length > 1 ? files.map((file, i) => {
+      const input = h("input", { type: "number", min: 0, step: "any", value: this.weights[i]?.value ?? "1", "aria-label": file.name });
+      return input;
+    }) : [];
+    this.shares.hidden = files.length < 2;
+    put(this.shares, h("p.help", say.weights), files.length > 1 ? files.map((file, i) => h("div.option.inline", h("span", file.name), this.weights[i])) : null);
+  }
+
+  async camerasChanged() {
+    const { cameras: slot } = this.slots, turn = (this.camerasTurn = (this.camerasTurn ?? 0) + 1);
+    slot.wrong("");
+    let cameras = /** @type {import("./cameras.js").JobCamera[]} */ ([]), told = "";
+    if (this.orbiting) [cameras, told] = this.ringNow();
+    else if (slot.files.length) {
+      try {
+        cameras = await readCameras(slot.files.map((file) => ({ name: file.name, blob: file })));
+        told = words.cameras.found(cameras.length);
+      } catch {
+        told = words.cameras.notReadHere;
+      }
+    }
+    if (turn !== this.camerasTurn) return;
+    /** @type {any} */ (this.found).textContent = told;
+    if (this.stage.viewer) this.stage.setCameras(cameras, { frames: true, stand: !this.orbiting && !this.stage.viewer.touched });
+    this.refresh();
+  }
+
+  /** @returns {[import("./cameras.js").JobCamera[], string]} */
+  ringNow() {
+    const middle = this.opened?.middle, count = this.controls.get("orbit")?.value(), number = typeof count === "number" && count >= 1 ? Math.min(count, 400) : 0;
+    const told = number ? words.cameras.ring(number) : words.cameras.ringAuto;
+    if (!middle) return [[], told];
+    const up = UPS[this.controls.get("up")?.value()] ?? [0, -1, 0];
+    return [ringCameras(middle, { count: number || 24, up, elevation: this.controls.get("elevation")?.value() ?? 10, radius: this.controls.get("radius")?.value() }), told];
+  }
+
+  /** What was planned is of other files. */
+  refresh() {
+    if (this.result && !this.busy) put(this.result);
+    this.clearWrong();
+  }
+
+  clearWrong() {
+    for (const slot of Object.values(this.slots)) slot.wrong("");
+    for (const control of this.controls.values()) control.wrong("");
+    if (this.problem) this.problem.hidden = true;
+  }
+
+  parameters() {
+    /** @type {Record<string, any>} */
+    const values = {};
+    for (const [name, control] of this.controls) {
+      if (!this.orbiting && ["orbit", "up", "elevation", "radius"].includes(name)) continue;
+      const value = control.value();
+      if (value !== undefined) values[name] = value;
+    }
+    if (this.orbiting) values.orbit ??= "auto";
+    if (this.preset) values.preset = this.preset;
+    values.name ??= this.slots.scene.files[0]?.name.replace(/\.(compressed\.)?(ply|spz|splat)$/i, "").replace(/[\u0000-\u001f\u007f-\u009f]/g, "").slice(0, 200);
+    const regions = this.regions.value(), taken = new Set(regions.flatMap((region) => region.style ?? []));
+    if (regions.length) values.regions = regions;
+    const own = this.weights.filter((_, i) => !taken.has(this.slots.style.files[i]?.name)).map((input) => Number(input.value));
+    if (own.length > 1 && own.some((weight) => weight !== own[0])) values.style_weights = own;
+    return values;
+  }
+
+  /** What can be told without the service. */
+  missing() {
+    const { scene, style, cameras } = this.slots;
+    /** @type {[Slot, string, boolean][]} */
+    const needed = [[scene, say.needScene, !scene.files.length], [style, say.needStyle, !style.files.length], [cameras, say.needCameras, !this.orbiting && !cameras.files.length]];
+    const wrong = needed.filter(([, , absent]) => absent);
+    wrong.forEach(([slot, text]) => slot.wrong(text));
+    wrong[0]?.[0].input.focus();
+    return wrong.length > 0;
+  }
+
+  /** @param {boolean} dry ask only what it would cost */
+  async act(dry) {
+    if (this.busy) return;
+    this.clearWrong();
+    if (this.missing()) return;
+    this.setBusy(true, dry);
+    this.planningText = "";
+    try {
+      const body = await this.send();
+      if (dry) await this.plan(body);
+      else await this.create(body);
+    } catch (error) {
+      if (!this.leaving.signal.aborted && !this.stopped) this.refuse(error);
+    } finally {
+      this.setBusy(false, dry);
+    }
+  }
+
+  /** @param {boolean} busy @param {boolean} dry */
+  setBusy(busy, dry) {
+    this.busy = busy;
+    this.stopped = false;
+    for (const button of [this.costButton, this.startButton]) button.disabled = busy;
+    this.startButton.textContent = busy && !dry ? say.starting : say.start;
+    this.progress.hidden = !busy;
+    if (busy) put(this.result);
+  }
+
+  /** Upload what the service has not; the body of `POST /v1/jobs`. */
+  async send() {
+    const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files];
+    const all = [scene.files, style.files, ...files].flat();
+    for (const file of all) if (!this.uploads.has(file)) this.uploads.set(file, new Upload(file, () => this.showSending(all)));
+    this.showSending(all);
+    this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
+    for (const upload of this.sending) upload.over = false;
+    const ids = await sendAll(this.sending);
+    let at = 0;
+    const take = (/** @type {number} */ n) => ids.slice(at, (at += n));
+    const [sceneId] = take(1), styles = take(style.files.length);
+    return {
+      scene: sceneId, style: styles.length === 1 ? styles[0] : styles, cameras: this.orbiting ? [] : take(cameras.files.length),
+      photos: this.orbiting ? [] : take(photos.files.length), parameters: this.parameters(),
+    };
+  }
+
+  /** @param {File[]} files */
+  showSending(files) {
+    const uploads = files.map((file) => this.uploads.get(file)).filter((upload) => upload !== undefined);
+    const total = files.reduce((sum, file) => sum + file.size, 0), sent = uploads.reduce((sum, upload) => sum + upload.sent, 0);
+    if (!this.sendingBar) {
+      this.sendingBar = h("progress", { max: 1, value: 0, "aria-label": words.uploads.title });
+      this.sendingText = h("span");
+      this.pauseButton = h("button.quiet.small", { type: "button", onclick: () => this.pause() }, words.uploads.pause);
+      put(this.progress, h("div.row", h("strong", words.uploads.title), this.sendingText, this.pauseButton), this.sendingBar);
+    }
+    const now = uploads.find((upload) => upload.state !== "done") ?? uploads[0], through = uploads.length === files.length && uploads.every((upload) => upload.state === "done");
+    this.sendingBar.value = sent / Math.max(total, 1);
+    this.sendingText.textContent = through ? this.planningText ?? "" : now ? `${now.file.name}: ${uploadText(now)}` : "";
+    this.pauseButton.hidden = through;
+    this.pauseButton.textContent = now?.state === "paused" ? words.uploads.resume : words.uploads.pause;
+  }
+
+  pause() {
+    const paused = this.sending?.some((upload) => upload.state === "paused");
+    for (const upload of this.sending ?? []) {
+      if (paused) upload.resume();
+      else upload.pause();
+    }
+  }
+
+  /** @param {any} body */
+  async plan(body) {
+    this.tellPlanning(say.planning);
+    const answer = await ask("POST", "/v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: this.leaving.signal });
+    if (!answer.headers.get("content-type")?.includes("event-stream")) return void put(this.result, costCard(await answer.json()));
+    for await (const { event, data } of eventsOf(answer)) {
+      if (event === "planning") this.tellPlanning(say.planned(data.step, data.total), data.fraction);
+      else if (event === "problem") throw new Problem(data.status, data);
+      else if (event === "plan") {
+        put(this.result, costCard(data));
+        this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
+      }
+    }
+    this.planningText = "";
+  }
+
+  /** @param {string} text @param {number} [share] */
+  tellPlanning(text, share) {
+    this.planningText = text;
+    this.sendingText.textContent = text;
+    if (share !== undefined) this.sendingBar.value = share;
+    else this.sendingBar.removeAttribute("value");
+  }
+
+  /** @param {any} body */
+  async create(body) {
+    this.tellPlanning(say.starting);
+    const key = (this.key ??= [randomKey(), JSON.stringify(body)]);
+    if (key[1] !== JSON.stringify(body)) this.key = [randomKey(), JSON.stringify(body)];
+    const job = await (await ask("POST", "/v1/jobs", { json: body, headers: { "Idempotency-Key": (this.key ?? key)[0] } })).json();
+    sessionStorage.removeItem(DRAFT);
+    location.hash = `#/jobs/${job.id}`;
+  }
+
+  /** Say it beside what it is about. @param {unknown} error */
+  refuse(error) {
+    const text = error instanceof Error ? error.message : String(error);
+    if (error instanceof Problem) {
+      if (error.code === "unknown-upload") this.uploads.clear();
+      const at = this.placeOf(error);
+      if (at) return this.tell(at, text);
+    }
+    this.problem.hidden = false;
+    this.problem.textContent = text;
+    this.problem.scrollIntoView({ block: "nearest" });
+  }
+
+  /** @param {Problem} problem @returns {Slot | Control | undefined} */
+  placeOf({ input, errors, message }) {
+    if (input && input in this.slots) return this.slots[/** @type {keyof typeof this.slots} */ (input)];
+    const names = [input, ...(errors[0]?.at ?? "").split(".").reverse(), ...(/^Settings? (\w+)/.exec(message)?.slice(1) ?? [])];
+    return names.map((name) => this.controls.get(name ?? "")).find((control) => control);
+  }
+
+  /**
+   * @param {Slot | Control} place
+   * @param {string} text
+   */
+  tell(place, text) {
+    place.wrong(text);
+    const fold = place.element.closest("details");
+    if (fold) fold.open = true;
+    place.element.hidden = false;
+    const input = place.element.querySelector("input, select");
+    if (input instanceof HTMLElement) input.focus();
+    announce(text);
+  }
+
+  end() {
+    this.leaving.abort();
+    for (const upload of this.uploads.values()) upload.stop();
+    for (const slot of Object.values(this.slots)) slot.end();
+    this.stage.end();
+    this.opened?.end();
+  }
+}

@@ -1,0 +1,223 @@
+// @ts-check
+/** Files sent in parts (tus 1.0): what has arrived is not sent again, after a pause, a lost connection or a reload. */
+import { ask, Problem, Unreachable } from "./api.js";
+import { words } from "./words.js";
+
+const TUS = { "Tus-Resumable": "1.0.0" };
+const KEPT = "sgsst.uploads", MOST_KEPT = 60;
+const SMALLEST = 1 << 20, LARGEST = 1 << 26;
+/** A part should take about so many milliseconds. */
+const PART = 1500;
+const SAMPLES = 64, SAMPLE = 4096;
+
+/** @typedef {"waiting" | "sending" | "paused" | "offline" | "done"} State */
+/** @typedef {{id: string, name: string, size: number, sent: number}} Kept */
+
+/** @returns {Record<string, Kept>} */
+function kept() {
+  try {
+    return JSON.parse(localStorage.getItem(KEPT) ?? "{}");
+  } catch {
+    return {};
+  }
+}
+
+/**
+ * @param {string} print
+ * @param {Kept | null} upload null to forget it
+ */
+function keep(print, upload) {
+  const all = kept();
+  delete all[print];
+  if (upload) all[print] = upload;
+  try {
+    localStorage.setItem(KEPT, JSON.stringify(Object.fromEntries(Object.entries(all).slice(-MOST_KEPT))));
+  } catch {
+    // without a place to keep it, a reload begins anew
+  }
+}
+
+/** What was begun and not finished. @returns {Kept[]} */
+export const unfinished = () => Object.values(kept()).filter(({ sent, size }) => sent > 0 && sent < size);
+
+/** Forget what was begun. */
+export const forgetUnfinished = () => {
+  for (const [print, { sent, size }] of Object.entries(kept())) if (sent < size) keep(print, null);
+};
+
+/**
+ * By what a file is known again: name, size, when it was changed, and samples of what is in it.
+ *
+ * @param {File} file
+ */
+export async function fingerprint(file) {
+  const pieces = file.size <= SAMPLES * SAMPLE ? [file] : Array.from({ length: SAMPLES }, (_, i) => {
+    const at = Math.floor(((file.size - SAMPLE) * i) / (SAMPLES - 1));
+    return file.slice(at, at + SAMPLE);
+  });
+  let a = 0x811c9dc5, b = 0x1b873593;
+  for (const piece of pieces) {
+    for (const byte of new Uint8Array(await piece.arrayBuffer())) {
+      a = Math.imul(a ^ byte, 0x01000193);
+      b = Math.imul(b + byte, 0x85ebca6b) ^ (b >>> 13);
+    }
+  }
+  return [file.name, file.size, file.lastModified, (a >>> 0).toString(16), (b >>> 0).toString(16)].join("|");
+}
+
+export class Upload {
+  /**
+   * @param {File} file
+   * @param {() => void} told the state has changed
+   */
+  constructor(file, told) {
+    this.file = file;
+    this.told = told;
+    this.sent = 0;
+    /** @type {State} */
+    this.state = "waiting";
+    this.id = "";
+    /** Nothing had to be sent: the service has it. */
+    this.known = false;
+    this.part = SMALLEST;
+    /** @type {AbortController | null} */
+    this.sending = null;
+    /** @type {(() => void) | null} */
+    this.goOn = null;
+    this.over = false;
+  }
+
+  /** @param {State} state */
+  enter(state) {
+    this.state = state;
+    this.told();
+  }
+
+  pause() {
+    if (this.state === "done") return;
+    this.enter("paused");
+    this.sending?.abort();
+  }
+
+  resume() {
+    if (this.state !== "paused") return;
+    this.enter("waiting");
+    this.goOn?.();
+  }
+
+  /** Give it up; what has arrived stays for a later attempt. */
+  stop() {
+    this.over = true;
+    this.sending?.abort();
+    this.goOn?.();
+  }
+
+  /**
+   * Send what is missing.
+   *
+   * @returns {Promise<string>} the upload's id
+   */
+  async run() {
+    this.print = await fingerprint(this.file);
+    const before = kept()[this.print];
+    if (before) this.id = before.id;
+    let wait = 1000;
+    for (;;) {
+      try {
+        if (this.over) throw new DOMException("", "AbortError");
+        await this.unpaused();
+        await this.findOffset();
+        this.known = this.sent === this.file.size && this.part === SMALLEST && !this.sending;
+        while (this.sent < this.file.size && this.state !== "paused") {
+          await this.sendPart();
+          wait = 1000;
+        }
+        if (this.state === "paused") continue;
+        this.enter("done");
+        return this.id;
+      } catch (error) {
+        if (!this.canGoOn(error)) throw error;
+        if (/** @type {State} */ (this.state) === "paused") continue;
+        this.enter("offline");
+        await new Promise((done) => setTimeout(done, wait));
+        wait = Math.min(wait * 2, 15000);
+      }
+    }
+  }
+
+  /** @param {unknown} error */
+  canGoOn(error) {
+    if (this.over) return false;
+    if (error instanceof Unreachable || this.state === "paused") return true;
+    if (!(error instanceof Problem)) return false;
+    if (error.status === 404) this.forget();
+    return [404, 408, 409, 423, 429, 460, 500, 502, 503, 504].includes(error.status);
+  }
+
+  forget() {
+    if (this.print) keep(this.print, null);
+    this.id = "";
+    this.sent = 0;
+  }
+
+  async unpaused() {
+    while (this.state === "paused" && !this.over) await new Promise((done) => (this.goOn = () => done(null)));
+  }
+
+  /** Where to go on; begins an upload where there is none. */
+  async findOffset() {
+    const { file } = this;
+    if (this.id) {
+      try {
+        const answer = await ask("HEAD", `/v1/uploads/${this.id}`, { headers: TUS });
+        if (Number(answer.headers.get("Upload-Length")) !== file.size) throw new Problem(404, null);
+        this.arrived(Number(answer.headers.get("Upload-Offset")));
+        return;
+      } catch (error) {
+        if (!(error instanceof Problem) || error.status !== 404) throw error;
+        this.forget();
+      }
+    }
+    const name = btoa(String.fromCharCode(...new TextEncoder().encode(file.name.slice(-180))));
+    const headers = { ...TUS, "Upload-Length": String(file.size), "Upload-Metadata": `filename ${name}` };
+    this.id = (await (await ask("POST", "/v1/uploads", { headers })).json()).id;
+    this.arrived(0);
+  }
+
+  /** @param {number} sent */
+  arrived(sent) {
+    this.sent = sent;
+    if (this.print) keep(this.print, { id: this.id, name: this.file.name, size: this.file.size, sent });
+    if (this.state !== "paused") this.enter("sending");
+    else this.told();
+  }
+
+  async sendPart() {
+    const begun = performance.now(), size = Math.min(this.part, this.file.size - this.sent);
+    this.sending = new AbortController();
+    const body = this.file.slice(this.sent, this.sent + size);
+    const headers = { ...TUS, "Upload-Offset": String(this.sent), "Content-Type": "application/offset+octet-stream" };
+    const answer = await ask("PATCH", `/v1/uploads/${this.id}`, { body, headers, signal: this.sending.signal });
+    this.arrived(Number(answer.headers.get("Upload-Offset")));
+    const took = performance.now() - begun;
+    this.part = Math.round(Math.min(LARGEST, Math.max(SMALLEST, (size * PART) / Math.max(took, 1), this.part / 2), this.part * 2));
+  }
+}
+
+/**
+ * Send files, some side by side.
+ *
+ * @param {Upload[]} uploads
+ * @returns {Promise<string[]>} ids, in their order
+ */
+export async function sendAll(uploads, together = 3) {
+  const ids = /** @type {string[]} */ (new Array(uploads.length)), waiting = uploads.map((_, i) => i);
+  const work = async () => {
+    for (let next = waiting.shift(); next !== undefined; next = waiting.shift()) ids[next] = await uploads[next].run();
+  };
+  await Promise.all(Array.from({ length: Math.min(together, uploads.length) }, work));
+  return ids;
+}
+
+/** @param {Upload} upload */
+export const uploadText = (upload) => words.uploads[upload.state](upload.sent / Math.max(upload.file.size, 1), upload.known);

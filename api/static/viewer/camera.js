@@ -1,0 +1,128 @@
+// @ts-check
+/** Where the viewer looks from, and how that is changed. */
+import { cross, difference, dot, rotated, sum, times, unit } from "./vectors.js";
+
+/** @typedef {import("./vectors.js").Vector} Vector */
+/** @typedef {import("../cameras.js").JobCamera} JobCamera */
+
+/** Focal length of a free view, in heights: 50 degrees. */
+const FOCAL = 1.07;
+
+export class ViewCamera {
+  constructor() {
+    /** Right, down, forward. @type {Vector[]} */
+    this.axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+    /** @type {Vector} */
+    this.eye = [0, 0, -3];
+    /** @type {Vector} */
+    this.target = [0, 0, 0];
+    /** @type {Vector} */
+    this.up = [0, -1, 0];
+    /** A unit of movement, world units. */
+    this.size = 1;
+    /** In heights of the frame, and the frame's shape (width over height); no shape: the canvas. */
+    this.focal = [FOCAL, FOCAL];
+    this.shape = 0;
+    this.near = 0.2;
+    /** Of the last change. */
+    this.number = 0;
+  }
+
+  /**
+   * Look at a scene as a whole.
+   *
+   * @param {{centre: Vector, radius: number}} middle
+   * @param {Vector} up
+   */
+  frame({ centre, radius }, up = [0, -1, 0]) {
+    this.up = unit(up);
+    const aside = Math.abs(this.up[2]) > 0.9 ? [0, -1, 0] : [0, 0, -1];
+    const level = unit(difference(aside, times(this.up, dot(aside, this.up))));
+    const from = unit(sum(level, times(this.up, 0.18)));
+    this.size = radius;
+    this.target = centre;
+    this.eye = sum(centre, times(from, 2.6 * radius));
+    this.focal = [FOCAL, FOCAL];
+    this.shape = 0;
+    this.lookAt(centre);
+  }
+
+  /** @param {Vector} target */
+  lookAt(target) {
+    const forward = unit(difference(target, this.eye));
+    const right = unit(cross(forward, this.up));
+    this.axes = [right, cross(forward, right), forward];
+    this.number++;
+  }
+
+  /**
+   * Stand where a camera of the job stood.
+   *
+   * @param {JobCamera} camera
+   * @param {{centre: Vector, radius: number} | null} middle
+   */
+  stand(camera, middle) {
+    this.eye = [...camera.position];
+    this.axes = camera.axes.map((axis) => [...axis]);
+    this.focal = [camera.fx / camera.height, camera.fy / camera.height];
+    this.shape = camera.width / camera.height;
+    const depth = middle ? dot(difference(middle.centre, this.eye), this.axes[2]) : 3 * this.size;
+    if (middle) this.size = middle.radius;
+    this.target = sum(this.eye, times(this.axes[2], Math.max(depth, 0.3 * this.size)));
+    this.number++;
+  }
+
+  /**
+   * Pixels of a canvas for slopes of 1; a job's camera shows its whole frame.
+   *
+   * @param {number} width
+   * @param {number} height
+   */
+  pixels(width, height) {
+    const frame = this.shape ? Math.min(height, width / this.shape) : Math.min(height, width * 1.2);
+    return [this.focal[0] * frame, this.focal[1] * frame];
+  }
+
+  /**
+   * @param {number} aside radians to the right, as a hand moves the scene
+   * @param {number} over radians; positive looks further down
+   * @param {boolean} about the target; else about the eye
+   */
+  turn(aside, over, about) {
+    const up = this.up, [right, , forward] = this.axes;
+    const slant = Math.asin(Math.max(-1, Math.min(1, dot(forward, up))));
+    const most = Math.max(1.5, Math.abs(slant)); // never over the pole
+    const tilt = Math.max(-most, Math.min(most, slant - over)) - slant;
+    const turned = (/** @type {Vector} */ v) => rotated(rotated(v, right, tilt), up, -aside);
+    this.axes = this.axes.map(turned);
+    if (about) this.eye = sum(this.target, turned(difference(this.eye, this.target)));
+    else this.target = sum(this.eye, turned(difference(this.target, this.eye)));
+    const f = unit(this.axes[2]), r = unit(difference(this.axes[0], times(f, dot(this.axes[0], f)))); // no rounding piles up
+    this.axes = [r, cross(f, r), f];
+    this.number++;
+  }
+
+  /** @param {number} factor of the distance to the target */
+  approach(factor) {
+    const away = difference(this.eye, this.target);
+    if (Math.hypot(...away) * factor < 1e-3 * this.size || Math.hypot(...away) * factor > 1e3 * this.size) return;
+    this.eye = sum(this.target, times(away, factor));
+    this.number++;
+  }
+
+  /**
+   * Move eye and target.
+   *
+   * @param {number[]} by along right, down and forward, world units
+   */
+  move(by) {
+    const step = this.axes.map((axis, i) => times(axis, by[i])).reduce(sum);
+    this.eye = sum(this.eye, step);
+    this.target = sum(this.target, step);
+    this.number++;
+  }
+
+  get distance() {
+    return Math.hypot(...difference(this.eye, this.target));
+  }
+}

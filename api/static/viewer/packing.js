@@ -1,0 +1,93 @@
+// @ts-check
+/**
+ * Gaussians as the textures hold them.
+ *
+ * Geometry, 2 texels of 4 uint32: x, y, z as float32, then opacity (low half, of 65535) and the first scale; the
+ * quaternion as four signed 16-bit fractions, the other two scales, nothing. Scales are natural logarithms in steps of
+ * 32 / 65535 from -20 (0.025 % each). Colours: three halves. Harmonics: 8 halves in each texel, coefficient by
+ * coefficient.
+ */
+import { halfOf } from "./half.js";
+
+/** Gaussians of a batch: whole rows of every texture. */
+export const BATCH = 1 << 16;
+export const SCALE_LOW = -20, SCALE_RANGE = 32;
+
+/**
+ * @typedef {{geometry: Uint32Array, colours: Uint16Array, harmonics: Uint16Array, centres: Float32Array,
+ *   reach: Float32Array}} Packed `centres` [n * 3]; `reach` [n]: three of the longest standard deviations, world units
+ */
+
+/** @param {number} degree of spherical harmonics */
+export const harmonicTexels = (degree) => Math.ceil((((degree + 1) ** 2 - 1) * 3) / 8);
+
+/**
+ * @param {Float32Array} values rows of `width` values
+ * @param {number} width
+ * @param {Record<string, number>} at place of each value in a row
+ * @param {number} stored degree of the file
+ * @param {number} degree that is kept
+ * @returns {Packed}
+ */
+export function pack(values, width, at, stored, degree) {
+  const count = values.length / width, texels = harmonicTexels(degree);
+  const packed = {
+    geometry: new Uint32Array(count * 8), colours: new Uint16Array(count * 3),
+    harmonics: new Uint16Array(count * texels * 8), centres: new Float32Array(count * 3), reach: new Float32Array(count),
+  };
+  packGeometry(packed, values, width, at, count);
+  const bits = new Uint32Array(values.buffer, values.byteOffset, values.length);
+  for (let i = 0, o = 0; i < count; i++, o += width) {
+    packed.colours[3 * i] = halfOf(bits[o + at.f_dc_0]);
+    packed.colours[3 * i + 1] = halfOf(bits[o + at.f_dc_1]);
+    packed.colours[3 * i + 2] = halfOf(bits[o + at.f_dc_2]);
+  }
+  if (degree) packHarmonics(packed.harmonics, bits, width, at, count, stored, degree);
+  return packed;
+}
+
+/**
+ * @param {Packed} packed
+ * @param {Float32Array} values
+ * @param {number} width
+ * @param {Record<string, number>} at
+ * @param {number} count
+ */
+function packGeometry({ geometry, centres, reach }, values, width, at, count) {
+  const floats = new Float32Array(geometry.buffer), { x, y, z, opacity, scale_0, scale_1, scale_2, rot_0, rot_1, rot_2, rot_3 } = at;
+  const step = 65535 / SCALE_RANGE;
+  const scale = (/** @type {number} */ value) => Math.min(65535, Math.max(0, Math.round((value - SCALE_LOW) * step)));
+  const part = (/** @type {number} */ value) => Math.round(value * 32767) & 0xffff;
+  for (let i = 0, o = 0, g = 0; i < count; i++, o += width, g += 8) {
+    const a = values[o + rot_0], b = values[o + rot_1], c = values[o + rot_2], d = values[o + rot_3];
+    const s0 = values[o + scale_0], s1 = values[o + scale_1], s2 = values[o + scale_2], length = Math.sqrt(a * a + b * b + c * c + d * d);
+    const px = values[o + x], py = values[o + y], pz = values[o + z];
+    let alpha = 65535 / (1 + Math.exp(-values[o + opacity]));
+    const sum = px + py + pz + s0 + s1 + s2 + length;
+    if (!(sum - sum === 0) || !(length > 0) || !(alpha >= 0)) alpha = 0; // a value that is no number shows nothing
+    floats[g] = px; floats[g + 1] = py; floats[g + 2] = pz;
+    geometry[g + 3] = Math.round(alpha) | (scale(s0) << 16);
+    geometry[g + 4] = part(a / length) | (part(b / length) << 16);
+    geometry[g + 5] = part(c / length) | (part(d / length) << 16);
+    geometry[g + 6] = scale(s1) | (scale(s2) << 16);
+    centres[3 * i] = px; centres[3 * i + 1] = py; centres[3 * i + 2] = pz;
+    reach[i] = alpha < 257 ? -1 : 3.4 * Math.exp(Math.max(s0, s1, s2)); // below 1/255 nothing is drawn; sqrt(2 ln 255) = 3.33
+  }
+}
+
+/**
+ * @param {Uint16Array} harmonics
+ * @param {Uint32Array} bits
+ * @param {number} width
+ * @param {Record<string, number>} at
+ * @param {number} count
+ * @param {number} stored
+ * @param {number} degree
+ */
+function packHarmonics(harmonics, bits, width, at, count, stored, degree) {
+  const kept = (degree + 1) ** 2 - 1, all = (stored + 1) ** 2 - 1, each = harmonicTexels(degree) * 8;
+  const places = Array.from({ length: kept * 3 }, (_, n) => at[`f_rest_${(n % 3) * all + Math.floor(n / 3)}`]);
+  for (let i = 0, o = 0, h = 0; i < count; i++, o += width, h += each) {
+    for (let n = 0; n < places.length; n++) harmonics[h + n] = halfOf(bits[o + places[n]]);
+  }
+}

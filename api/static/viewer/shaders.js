@@ -1,0 +1,136 @@
+// @ts-check
+/**
+ * What the GPU computes: EWA splatting as `sgsst render` does it (blur of 0.3 square pixels, alpha between 1/255 and 0.99,
+ * slopes clamped at 1.3 half fields of view), once with two colours. The determinant is a sum of squares (Cauchy-Binet),
+ * which needles cannot cancel.
+ */
+import { harmonicTexels, SCALE_LOW, SCALE_RANGE } from "./packing.js";
+
+/** Products of the direction, in the order and with the signs of 3DGS files. */
+const BASIS = [
+  "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
+  "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2. * z * z - x * x - y * y)",
+  "-1.0925484305920792 * x * z", "0.5462742152960396 * (x * x - y * y)",
+  "-0.5900435899266435 * y * (3. * x * x - y * y)", "2.890611442640554 * x * y * z",
+  "-0.4570457994644658 * y * (4. * z * z - x * x - y * y)", "0.3731763325901154 * z * (2. * z * z - 3. * x * x - 3. * y * y)",
+  "-0.4570457994644658 * x * (4. * z * z - x * x - y * y)", "1.445305721320277 * z * (x * x - y * y)",
+  "-0.5900435899266435 * x * (x * x - 3. * y * y)",
+];
+
+/** @param {number} degree */
+function directional(degree) {
+  const texels = harmonicTexels(degree), kept = (degree + 1) ** 2 - 1, lines = [];
+  if (!degree) return "vec3 directional(int i, vec3 d) { return vec3(0); }";
+  for (let t = 0; t < texels; t++) {
+    lines.push(`uvec4 t${t} = texelFetch(harmonics, place(i * ${texels} + ${t}), 0);`);
+    for (let c = 0; c < 4; c++) lines.push(`vec2 h${4 * t + c} = unpackHalf2x16(t${t}[${c}]);`);
+  }
+  const value = (/** @type {number} */ n) => `h${n >> 1}.${"xy"[n & 1]}`;
+  const terms = BASIS.slice(0, kept).map((product, k) => `(${product}) * vec3(${[0, 1, 2].map((c) => value(3 * k + c)).join(", ")})`);
+  return `vec3 directional(int i, vec3 d) {
+  float x = d.x, y = d.y, z = d.z;
+  ${lines.join("\n  ")}
+  return ${terms.join("\n    + ")};
+}`;
+}
+
+/**
+ * @param {number} degree of spherical harmonics
+ * @param {number} bits texels of a row are 2 to this
+ */
+export const splatVertex = (degree, bits) => `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
+layout(location = 0) in vec2 corner;
+layout(location = 1) in uint index;
+uniform usampler2D geometry, harmonics;
+uniform sampler2D leftColours, rightColours;
+uniform mat3 axes;          // columns: right, down, forward
+uniform vec3 eye;
+uniform vec2 focal, size, fade;
+uniform float near;
+out vec3 leftColour, rightColour;
+out vec2 at;
+flat out float opacity;
+ivec2 place(int texel) { return ivec2(texel & ${(1 << bits) - 1}, texel >> ${bits}); }
+vec2 fractions(uint both) { return max(vec2(ivec2(int(both << 16) >> 16, int(both) >> 16)) / 32767., -1.); }
+${directional(degree)}
+float deviation(uint stored) { return exp(${SCALE_LOW}. + float(stored) * ${SCALE_RANGE / 65535}); }
+void main() {
+  gl_Position = vec4(2, 2, 2, 1);
+  int i = int(index);
+  uvec4 g = texelFetch(geometry, place(2 * i), 0), h = texelFetch(geometry, place(2 * i + 1), 0);
+  vec3 away = uintBitsToFloat(g.xyz) - eye, centre = away * axes;
+  opacity = float(g.w & 0xffffu) / 65535.;
+  if (!(centre.z >= near) || opacity * 255. < 1.) return;
+  vec4 q = normalize(vec4(fractions(h.x), fractions(h.y)));
+  vec3 s = vec3(deviation(g.w >> 16), deviation(h.z & 0xffffu), deviation(h.z >> 16));
+  mat3 turned = mat3(
+    1. - 2. * (q.z * q.z + q.w * q.w), 2. * (q.y * q.z + q.x * q.w), 2. * (q.y * q.w - q.x * q.z),
+    2. * (q.y * q.z - q.x * q.w), 1. - 2. * (q.y * q.y + q.w * q.w), 2. * (q.z * q.w + q.x * q.y),
+    2. * (q.y * q.w + q.x * q.z), 2. * (q.z * q.w - q.x * q.y), 1. - 2. * (q.y * q.y + q.z * q.z));
+  vec3 along = (axes[0] * turned) * s, across = (axes[1] * turned) * s, ahead = (axes[2] * turned) * s;
+  vec2 most = 0.65 * size / focal, slope = clamp(centre.xy / centre.z, -most, most);
+  vec3 m = focal.x / centre.z * (along - slope.x * ahead), n = focal.y / centre.z * (across - slope.y * ahead);
+  float A = dot(m, m) + 0.3, B = dot(m, n), C = dot(n, n) + 0.3;
+  vec3 minors = cross(m, n);
+  float determinant = dot(minors, minors) + 0.3 * (A + C - 0.3);
+  float longer = 0.5 * (A + C) + sqrt(0.25 * (A - C) * (A - C) + B * B), shorter = determinant / longer;
+  vec2 d = A >= C ? vec2(longer - C, B) : vec2(B, longer - A);
+  d = dot(d, d) > 1e-20 ? normalize(d) : vec2(1, 0);
+  float reach = sqrt(2. * log(255. * opacity));   // to where alpha is 1/255
+  vec2 offset = reach * (corner.x * sqrt(longer) * d + corner.y * sqrt(shorter) * vec2(-d.y, d.x));
+  vec2 pixel = focal * centre.xy / centre.z + offset;
+  gl_Position = vec4(2. * pixel.x / size.x, -2. * pixel.y / size.y, 0, 1);
+  at = corner * reach;
+  vec3 rest = directional(i, normalize(away));
+  ivec2 where = place(i);
+  leftColour = max(0.5 + fade.x * rest + 0.28209479177387814 * texelFetch(leftColours, where, 0).rgb, 0.);
+  rightColour = max(0.5 + fade.y * rest + 0.28209479177387814 * texelFetch(rightColours, where, 0).rgb, 0.);
+}`;
+
+export const splatFragment = `#version 300 es
+precision highp float;
+in vec3 leftColour, rightColour;
+in vec2 at;
+flat in float opacity;
+uniform float cut;          // pixels; what is left of it has the left colours
+out vec4 colour;
+void main() {
+  float alpha = min(opacity * exp(-0.5 * dot(at, at)), 0.99);
+  if (alpha < 1. / 255.) discard;
+  colour = vec4((gl_FragCoord.x < cut ? leftColour : rightColour) * alpha, alpha);
+}`;
+
+/** A triangle over everything. */
+export const wholeVertex = `#version 300 es
+void main() { gl_Position = vec4(gl_VertexID == 1 ? 3. : -1., gl_VertexID == 2 ? 3. : -1., 0, 1); }`;
+
+export const overBackground = `#version 300 es
+precision highp float;
+uniform highp sampler2D picture;
+uniform vec3 background;
+uniform vec2 scale;         // texels of the picture for a pixel
+out vec4 colour;
+void main() {
+  vec4 found = scale.x == 1. ? texelFetch(picture, ivec2(gl_FragCoord.xy), 0)
+    : texture(picture, gl_FragCoord.xy * scale / vec2(textureSize(picture, 0)));
+  colour = vec4(found.rgb + (1. - found.a) * background, 1);
+}`;
+
+export const lineVertex = `#version 300 es
+precision highp float;
+layout(location = 0) in vec3 point;
+uniform mat3 axes;
+uniform vec3 eye;
+uniform vec2 focal, size;
+uniform float near;
+void main() {
+  vec3 c = (point - eye) * axes;
+  gl_Position = vec4(2. * focal.x * c.x / size.x, -2. * focal.y * c.y / size.y, c.z - near, c.z);
+}`;
+
+export const lineFragment = `#version 300 es
+precision highp float;
+uniform vec4 ink;
+out vec4 colour;
+void main() { colour = ink; }`;

@@ -1,0 +1,199 @@
+// @ts-check
+/** A scene on the GPU: geometry and harmonics once, and any number of colour sets. */
+import { BATCH, harmonicTexels } from "./packing.js";
+import { words } from "../words.js";
+
+/** @typedef {{centre: number[], radius: number, low: number[], high: number[]}} Middle */
+/** @typedef {import("./depth_order.js").Pose} Pose */
+/** @typedef {{count: number, degree: number, size: number}} Shown of a file's header */
+
+/** Bytes of textures, at most; telephones get a quarter. */
+const MEMORY = (/** @type {any} */ (navigator).deviceMemory ?? 8) >= 8 ? 1.5e9 : 4e8;
+
+export class SplatScene {
+  /**
+   * @param {WebGL2RenderingContext} gl
+   * @param {File | string} source
+   * @param {() => void} changed there is more to draw
+   * @param {number} memory bytes, at most
+   */
+  constructor(gl, source, changed, memory = MEMORY) {
+    this.gl = gl;
+    this.source = source;
+    this.changed = changed;
+    /** @type {Shown | null} */
+    this.header = null;
+    this.degree = 0;
+    this.loaded = 0;
+    /** @type {Middle | null} */
+    this.middle = null;
+    this.whole = false;
+    /** How many Gaussians the last order knew of, and how many it draws. */
+    this.sortedOf = 0;
+    this.drawn = 0;
+    /** @type {Map<string, WebGLTexture>} */
+    this.colours = new Map();
+    this.order = gl.createBuffer();
+    this.room = 0;
+    this.busy = false;
+    /** @type {Promise<Shown>} */
+    this.headerRead = new Promise((found, wrong) => { this.tellHeader = found; this.tellWrong = wrong; });
+    /** @type {Promise<void>} */
+    this.ready = new Promise((done, wrong) => { this.tellReady = done; this.tellBroken = wrong; });
+    this.headerRead.catch(() => {});
+    this.ready.catch(() => {});
+    const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.bits = largest >= 8192 ? 13 : 12;
+    this.worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
+    this.worker.onmessage = ({ data }) => this.heard(data);
+    this.worker.onerror = () => this.fail(words.scene.unreadable);
+    this.worker.postMessage({ kind: "load", source, room: { texels: (1 << this.bits) * Math.min(largest, 16384), bytes: memory } });
+  }
+
+  /** @param {any} told */
+  heard(told) {
+    if (this.gl.isContextLost()) return;
+    if (told.kind === "header") this.allocate(told.header, told.degree);
+    else if (told.kind === "batch") this.take(told);
+    else if (told.kind === "order") this.takeOrder(told);
+    else if (told.kind === "done") {
+      this.whole = true;
+      this.middle = told.middle;
+      this.tellReady?.();
+    } else this.fail(told.message);
+    this.changed();
+  }
+
+  /** @param {string} message */
+  fail(message) {
+    const wrong = new Error(message);
+    this.tellWrong?.(wrong);
+    this.tellBroken?.(wrong);
+  }
+
+  /**
+   * @param {Shown} header
+   * @param {number} degree
+   */
+  allocate(header, degree) {
+    const { gl } = this;
+    this.header = header;
+    this.degree = degree;
+    this.texels = harmonicTexels(degree);
+    this.geometry = this.texture(gl.RGBA32UI, 2 * header.count);
+    this.harmonics = degree ? this.texture(gl.RGBA32UI, this.texels * header.count) : this.geometry;
+    this.colours.set("own", this.texture(gl.RGB16F, header.count));
+    this.tellHeader?.(header);
+  }
+
+  /**
+   * @param {number} form
+   * @param {number} texels
+   */
+  texture(form, texels) {
+    const { gl } = this, made = gl.createTexture(), width = 1 << this.bits;
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, form, width, Math.ceil(texels / width));
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+    return made;
+  }
+
+  /** @param {{begin: number, count: number, geometry: Uint32Array, colours: Uint16Array, harmonics: Uint16Array, middle?: Middle}} batch */
+  take({ begin, count, geometry, colours, harmonics, middle }) {
+    const { gl } = this;
+    this.fill(this.geometry, begin * 2, geometry, gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4);
+    this.fill(this.colours.get("own"), begin, colours, gl.RGB, gl.HALF_FLOAT, 3);
+    if (this.degree) this.fill(this.harmonics, begin * (this.texels ?? 0), new Uint32Array(harmonics.buffer), gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4);
+    this.middle = middle ?? this.middle;
+    this.loaded = begin + count;
+  }
+
+  /**
+   * Whole rows, then what is left of the last one.
+   *
+   * @param {WebGLTexture | null | undefined} texture
+   * @param {number} begin texel, at the beginning of a row
+   * @param {Uint32Array | Uint16Array} data
+   * @param {number} form
+   * @param {number} type
+   * @param {number} parts values of a texel
+   */
+  fill(texture, begin, data, form, type, parts) {
+    const { gl } = this, width = 1 << this.bits, texels = data.length / parts, rows = Math.floor(texels / width), left = texels - rows * width;
+    gl.bindTexture(gl.TEXTURE_2D, texture ?? null);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 2);
+    const row = begin >> this.bits;
+    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, rows, form, type, data);
+    if (left) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row + rows, left, 1, form, type, data.subarray(rows * width * parts));
+  }
+
+  /**
+   * Another colour set: three halves for each Gaussian, as `colours.f16` has them.
+   *
+   * @param {string} name
+   * @param {ReadableStream<Uint8Array>} stream
+   */
+  async addColours(name, stream) {
+    await this.headerRead;
+    const { gl } = this, count = this.header?.count ?? 0, texture = this.texture(gl.RGB16F, count);
+    const whole = new Uint8Array(count * 6), reader = stream.getReader();
+    let filled = 0;
+    for (;;) {
+      const { value, done } = await reader.read();
+      if (done) break;
+      if (filled + value.length > whole.length) throw new Error(words.scene.otherColours);
+      whole.set(value, filled);
+      filled += value.length;
+    }
+    if (filled !== whole.length) throw new Error(words.scene.otherColours);
+    const halves = new Uint16Array(whole.buffer);
+    for (let begin = 0; begin < count; begin += BATCH) {
+      this.fill(texture, begin, halves.subarray(begin * 3, Math.min(count, begin + BATCH) * 3), gl.RGB, gl.HALF_FLOAT, 3);
+    }
+    this.colours.set(name, texture);
+    this.changed();
+  }
+
+  /**
+   * Ask for an order, unless one is being computed.
+   *
+   * @param {Pose} pose
+   * @param {number} number of the pose
+   * @returns {boolean} whether it was asked for
+   */
+  sort(pose, number) {
+    if (this.busy || !this.loaded) return false;
+    this.busy = true;
+    this.worker.postMessage({ kind: "sort", pose, number });
+    return true;
+  }
+
+  /** @param {{order: Uint32Array, number: number, of: number}} told */
+  takeOrder({ order, number, of }) {
+    const { gl } = this;
+    this.busy = false;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    if (order.length > this.room) {
+      this.room = Math.ceil(order.length * 1.25);
+      gl.bufferData(gl.ARRAY_BUFFER, this.room * 4, gl.DYNAMIC_DRAW);
+    }
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+    this.drawn = order.length;
+    this.sortedOf = of;
+    this.sortedFor = number;
+  }
+
+  /** Bytes of its textures and its order. */
+  get bytes() {
+    const count = this.header?.count ?? 0;
+    return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colours.size) + this.room * 4;
+  }
+
+  /** Let go of everything. */
+  end() {
+    this.worker.terminate();
+    const { gl } = this;
+    for (const texture of new Set([this.geometry, this.harmonics, ...this.colours.values()])) gl.deleteTexture(texture ?? null);
+    gl.deleteBuffer(this.order);
+  }
+}

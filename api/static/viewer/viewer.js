@@ -1,0 +1,413 @@
+// @ts-check
+/** Draws one or two scenes with two colour sets and a wipe between them; only when something has changed. */
+import { ViewCamera } from "./camera.js";
+import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, wholeVertex } from "./shaders.js";
+import { SplatScene } from "./splat_scene.js";
+import { words } from "../words.js";
+
+/** @typedef {{scene: SplatScene, colours: string, fade?: number}} Side what stands on one side of the wipe */
+/** @typedef {{program: WebGLProgram, at: (name: string) => WebGLUniformLocation | null}} Program */
+
+/** Milliseconds of a frame above which a moving picture has half, or a fourth, as many pixels on each side. */
+const SLOW = 70, VERY_SLOW = 350;
+/** Milliseconds without movement after which it has all. */
+const STILL = 160;
+/** Of lines, and how much of what is behind them they hide. */
+const INK = [0.98, 0.6, 0.28, 0.55];
+
+export class Viewer {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {() => void} told the state has changed
+   */
+  constructor(canvas, told = () => {}) {
+    this.canvas = canvas;
+    this.told = told;
+    this.camera = new ViewCamera();
+    /** @type {{left: Side, right: Side} | null} */
+    this.sides = null;
+    /** Share of the width that shows the left side. */
+    this.cut = 0;
+    this.background = [0, 0, 0];
+    /** Lines in the world, pairs of points [n * 2 * 3]. */
+    this.lines = new Float32Array(0);
+    this.touched = false;
+    this.frames = 0;
+    /** Of the last frames, milliseconds from its begin to its end on the GPU. @type {number[]} */
+    this.milliseconds = [];
+    this.lost = false;
+    this.ended = false;
+    this.scale = 1;
+    this.movingScale = 1;
+    this.movedAt = 0;
+    this.requested = 0;
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false, powerPreference: "high-performance" });
+    if (!gl) throw new Error(words.viewer.noWebGL);
+    this.gl = gl;
+    this.prepare();
+    this.onLost = (/** @type {Event} */ event) => this.lose(event);
+    this.onRestored = () => this.restore();
+    canvas.addEventListener("webglcontextlost", this.onLost);
+    canvas.addEventListener("webglcontextrestored", this.onRestored);
+    this.resized = new ResizeObserver(() => this.draw());
+    this.resized.observe(canvas);
+  }
+
+  prepare() {
+    const { gl } = this;
+    this.exact = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    gl.getExtension("OES_texture_float_linear");
+    /** @type {Map<number, Program>} */
+    this.splatPrograms = new Map();
+    this.compose = this.program(wholeVertex, overBackground);
+    this.line = this.program(lineVertex, lineFragment);
+    this.corners = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+    this.lineBuffer = gl.createBuffer();
+    this.frame = gl.createFramebuffer();
+    this.picture = null;
+    this.pictureSize = [0, 0];
+    /** @type {WebGLSync | null} */
+    this.fence = null;
+  }
+
+  /**
+   * @param {string} vertex
+   * @param {string} fragment
+   * @returns {Program}
+   */
+  program(vertex, fragment) {
+    const { gl } = this, program = gl.createProgram();
+    for (const [kind, text] of /** @type {[number, string][]} */ ([[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]])) {
+      const shader = /** @type {WebGLShader} */ (gl.createShader(kind));
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(program) ?? "shader");
+    /** @type {Map<string, WebGLUniformLocation | null>} */
+    const found = new Map();
+    const at = (/** @type {string} */ name) => {
+      if (!found.has(name)) found.set(name, gl.getUniformLocation(program, name));
+      return found.get(name) ?? null;
+    };
+    return { program, at };
+  }
+
+  /**
+   * Begin to read a scene. It is shown once it stands on a side.
+   *
+   * @param {File | string} source
+   */
+  open(source) {
+    return new SplatScene(this.gl, source, () => this.sceneChanged());
+  }
+
+  sceneChanged() {
+    const middle = this.sides?.left.scene.middle;
+    if (middle && !this.touched && !this.camera.shape && middle !== this.framed) {
+      this.framed = middle;
+      this.camera.frame(middle, this.camera.up);
+    }
+    this.told();
+    this.draw();
+  }
+
+  /**
+   * @param {Side} left
+   * @param {Side} right
+   */
+  show(left, right = left) {
+    this.sides = { left, right };
+    this.sceneChanged();
+  }
+
+  /** @param {number} share */
+  wipe(share) {
+    this.cut = share;
+    this.draw();
+  }
+
+  /** The view has moved. */
+  moved() {
+    this.touched = true;
+    this.movedAt = performance.now();
+    this.draw();
+  }
+
+  /** Draw with the next frame. */
+  draw() {
+    this.settled = false;
+    this.canvas.dataset.state = "drawing";
+    if (!this.requested && !this.ended) this.requested = requestAnimationFrame(() => this.step());
+  }
+
+  step() {
+    this.requested = 0;
+    if (this.lost || this.ended) return;
+    if (this.fence && !this.finished()) {
+      this.requested = requestAnimationFrame(() => this.step());
+      return;
+    }
+    const moving = performance.now() - this.movedAt < STILL;
+    const scale = moving ? this.movingScale : 1;
+    const again = this.askForOrder();
+    this.scale = scale;
+    this.render();
+    this.begun = performance.now();
+    this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.gl.flush();
+    this.frames++;
+    this.settled = !again && scale === 1 && this.sides !== null;
+    if (!this.sides) return;
+    this.requested = requestAnimationFrame(() => (this.settled ? this.settle() : this.step()));
+  }
+
+  /** Wait until the last picture is there, then rest. */
+  settle() {
+    this.requested = 0;
+    if (this.lost || this.ended) return;
+    if (!this.settled) return void (this.requested = requestAnimationFrame(() => this.step()));
+    if (!this.finished()) {
+      this.requested = requestAnimationFrame(() => this.settle());
+      return;
+    }
+    const { left, right } = /** @type {{left: Side, right: Side}} */ (this.sides);
+    this.canvas.dataset.state = left.scene.whole && right.scene.whole ? "settled" : "loading";
+    this.told();
+  }
+
+  /** Whether the GPU is through with the last frame. */
+  finished() {
+    const { gl } = this;
+    if (!this.fence) return true;
+    const state = gl.clientWaitSync(this.fence, 0, 0);
+    if (state === gl.TIMEOUT_EXPIRED) return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    const took = performance.now() - (this.begun ?? 0);
+    this.milliseconds.push(took);
+    if (this.milliseconds.length > 100) this.milliseconds.shift();
+    if (this.scale === 1) this.movingScale = took > VERY_SLOW ? 0.25 : took > SLOW ? 0.5 : 1;
+    return true;
+  }
+
+  /** Have the scenes sorted for this view; whether the picture is not yet that of the newest order. */
+  askForOrder() {
+    if (!this.sides) return false;
+    let waiting = false;
+    for (const scene of new Set([this.sides.left.scene, this.sides.right.scene])) {
+      const stale = scene.loaded > 0 && (scene.sortedFor !== this.poseNumber() || scene.sortedOf < scene.loaded);
+      if (stale) scene.sort(this.pose(), this.poseNumber());
+      waiting ||= stale;
+    }
+    return waiting;
+  }
+
+  poseNumber() {
+    const [width, height] = this.size();
+    return this.camera.number * 1e6 + ((width * 31 + height) % 1e6);
+  }
+
+  pose() {
+    const [width, height] = this.size(), [fx, fy] = this.camera.pixels(width, height);
+    return { axes: this.camera.axes, eye: this.camera.eye, tan: [width / 2 / fx, height / 2 / fy], near: this.camera.near };
+  }
+
+  /** Pixels of the canvas. */
+  size() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    return [Math.max(1, Math.round(this.canvas.clientWidth * ratio)), Math.max(1, Math.round(this.canvas.clientHeight * ratio))];
+  }
+
+  render() {
+    const { gl, canvas } = this, [width, height] = this.size();
+    if (canvas.width !== width || canvas.height !== height) {
+      canvas.width = width;
+      canvas.height = height;
+    }
+    const w = Math.ceil(width * this.scale), h = Math.ceil(height * this.scale);
+    this.target(w, h);
+    gl.viewport(0, 0, w, h);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (this.sides) this.splats(w, h);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    this.composite(w / width);
+    if (this.lines.length) this.drawLines(width, height);
+  }
+
+  /**
+   * The picture that is blended into: halves, since bytes would lose faint Gaussians.
+   *
+   * @param {number} width
+   * @param {number} height
+   */
+  target(width, height) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
+    if (this.pictureSize[0] === width && this.pictureSize[1] === height) return;
+    gl.deleteTexture(this.picture);
+    this.picture = gl.createTexture();
+    this.pictureSize = [width, height];
+    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.exact ? gl.RGBA16F : gl.RGBA8, width, height);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+  }
+
+  /**
+   * @param {number} width
+   * @param {number} height
+   */
+  splats(width, height) {
+    const { gl } = this, { left, right } = /** @type {{left: Side, right: Side}} */ (this.sides);
+    const cut = Math.round(this.cut * width);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    if (left.scene === right.scene) this.drawScene(left, right, cut, width, height);
+    else {
+      gl.enable(gl.SCISSOR_TEST);
+      gl.scissor(0, 0, cut, height);
+      if (cut > 0) this.drawScene(left, left, width, width, height);
+      gl.scissor(cut, 0, width - cut, height);
+      if (cut < width) this.drawScene(right, right, 0, width, height);
+      gl.disable(gl.SCISSOR_TEST);
+    }
+    gl.disable(gl.BLEND);
+  }
+
+  /**
+   * @param {Side} left
+   * @param {Side} right colours of the same scene
+   * @param {number} cut pixels
+   * @param {number} width
+   * @param {number} height
+   */
+  drawScene(left, right, cut, width, height) {
+    const { gl } = this, { scene } = left;
+    const own = scene.colours.get("own");
+    if (!scene.drawn || !own) return;
+    const key = scene.degree * 100 + scene.bits;
+    let splat = this.splatPrograms?.get(key);
+    if (!splat) this.splatPrograms?.set(key, (splat = this.program(splatVertex(scene.degree, scene.bits), splatFragment)));
+    const { program, at } = splat;
+    gl.useProgram(program);
+    this.setView(at, width, height);
+    gl.uniform2f(at("fade"), 1 - (left.fade ?? 0), 1 - (right.fade ?? 0));
+    gl.uniform1f(at("cut"), cut);
+    const textures = { geometry: scene.geometry, leftColours: scene.colours.get(left.colours) ?? own, rightColours: scene.colours.get(right.colours) ?? own, harmonics: scene.harmonics };
+    Object.entries(textures).forEach(([name, texture], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture ?? null);
+      gl.uniform1i(at(name), unit);
+    });
+    gl.activeTexture(gl.TEXTURE0 + 7);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners ?? null);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, scene.order);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(1, 1);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, scene.drawn);
+    gl.vertexAttribDivisor(1, 0);
+    gl.disableVertexAttribArray(1);
+  }
+
+  /**
+   * @param {(name: string) => WebGLUniformLocation | null} at
+   * @param {number} width
+   * @param {number} height
+   */
+  setView(at, width, height) {
+    const { gl, camera } = this, [fx, fy] = camera.pixels(width, height);
+    gl.uniformMatrix3fv(at("axes"), false, camera.axes.flat());
+    gl.uniform3f(at("eye"), camera.eye[0], camera.eye[1], camera.eye[2]);
+    gl.uniform2f(at("focal"), fx, fy);
+    gl.uniform2f(at("size"), width, height);
+    gl.uniform1f(at("near"), camera.near);
+  }
+
+  /** @param {number} scale */
+  composite(scale) {
+    const { gl } = this, { program, at } = /** @type {Program} */ (this.compose);
+    gl.useProgram(program);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.uniform1i(at("picture"), 0);
+    gl.uniform3f(at("background"), this.background[0], this.background[1], this.background[2]);
+    gl.uniform2f(at("scale"), scale, scale);
+    gl.disableVertexAttribArray(0);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /**
+   * @param {number} width
+   * @param {number} height
+   */
+  drawLines(width, height) {
+    const { gl } = this, { program, at } = /** @type {Program} */ (this.line);
+    gl.useProgram(program);
+    this.setView(at, width, height);
+    gl.uniform1f(at("near"), 1e-3 * this.camera.size);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.lineBuffer ?? null);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+    gl.bufferData(gl.ARRAY_BUFFER, this.lines, gl.STREAM_DRAW);
+    gl.uniform4fv(at("ink"), INK);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArrays(gl.LINES, 0, this.lines.length / 3);
+    gl.disable(gl.BLEND);
+  }
+
+  /**
+   * The picture as it stands.
+   *
+   * @returns {Promise<Blob>}
+   */
+  picturePng() {
+    this.scale = 1;
+    this.render(); // a canvas forgets its picture when the task ends
+    return new Promise((done, wrong) => this.canvas.toBlob((blob) => (blob ? done(blob) : wrong(new Error(words.viewer.noPicture))), "image/png"));
+  }
+
+  /** @param {Event} event */
+  lose(event) {
+    event.preventDefault();
+    this.lost = true;
+    this.canvas.dataset.state = "lost";
+    this.told();
+  }
+
+  /** The GPU is back, without anything that was on it: everything is read again. */
+  restore() {
+    this.lost = false;
+    this.prepare();
+    this.framed = undefined;
+    const before = this.sides;
+    this.sides = null;
+    if (before) this.onReload?.(before);
+    this.told();
+  }
+
+  /** @type {((sides: {left: Side, right: Side}) => void) | undefined} */
+  onReload;
+
+  /** Let go of everything. */
+  end() {
+    this.ended = true;
+    cancelAnimationFrame(this.requested);
+    this.resized.disconnect();
+    this.canvas.removeEventListener("webglcontextlost", this.onLost);
+    this.canvas.removeEventListener("webglcontextrestored", this.onRestored);
+    for (const scene of new Set([this.sides?.left.scene, this.sides?.right.scene])) scene?.end();
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+}

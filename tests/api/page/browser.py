@@ -1,0 +1,174 @@
+"""A real browser for tests of the page: Debian's Chromium, driven by playwright, with WebGL in software."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sgsst_core.files.ply import read_scene
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+
+#: Where WebGL is computed by the processor: the same pixels on every machine.
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
+#: Milliseconds that a test waits for anything.
+PATIENCE = 180_000
+#: Runs in the page before anything of its own: what its policy refuses is counted.
+_COUNT_VIOLATIONS = """
+window.violations = [];
+document.addEventListener("securitypolicyviolation", ({ violatedDirective, blockedURI }) => {
+  window.violations.push(`${violatedDirective} ${blockedURI}`);
+});
+"""
+
+
+def missing() -> str | None:
+    """Why there is no browser; None where there is one."""
+    try:
+        import playwright.sync_api  # noqa: F401
+    except ImportError:
+        return "playwright is not installed: pip install -e '.[dev]'"
+    if chromium() is None:
+        return "there is no Chromium: apt-get install chromium, or name one by SGSST_CHROMIUM"
+    return None
+
+
+def chromium() -> str | None:
+    """Path of the browser."""
+    named = os.environ.get("SGSST_CHROMIUM")
+    return named or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@contextmanager
+def open_browser(*flags: str) -> Iterator[Any]:
+    """A browser of playwright's synchronous interface; in its block no event loop of asyncio can run."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium(), args=[*FLAGS, *flags], chromium_sandbox=False)
+        yield browser
+        browser.close()
+
+
+class Watched:
+    """A page, and everything that it must not do.
+
+    Attributes:
+        page: of playwright.
+        wrong: errors of the console, exceptions, and requests to other origins.
+    """
+
+    def __init__(self, browser: Any, url: str, *, width: int = 600, height: int = 500, **context: Any) -> None:
+        self.url = url
+        self.context = browser.new_context(viewport={"width": width, "height": height}, **context)
+        self.context.set_default_timeout(PATIENCE)
+        self.page = self.context.new_page()
+        self.page.add_init_script(_COUNT_VIOLATIONS)
+        self.wrong: list[str] = []
+        self.page.on("pageerror", lambda error: self.wrong.append(f"exception: {error}"))
+        self.page.on("console", self._console)
+        self.page.on("request", self._request)
+
+    def _console(self, message: Any) -> None:
+        if message.type == "error":
+            self.wrong.append(f"console: {message.text}")
+
+    def _request(self, request: Any) -> None:
+        if not request.url.startswith((self.url, "blob:", "data:")):
+            self.wrong.append(f"request: {request.url}")
+
+    def check(self, *allowed: str) -> None:
+        """Fail where something went wrong but for console errors that hold one of some texts."""
+        violations = self.page.evaluate("() => window.violations")
+        found = [text for text in self.wrong if not any(part in text for part in allowed)]
+        assert not found, found
+        assert not violations, violations
+
+    def settled(self) -> None:
+        """Wait until the 3D view shows all of its scene, sorted for its camera."""
+        self.page.locator("canvas[data-state=settled]").wait_for()
+
+    def wipe(self, key: str) -> None:
+        """Press a key on the slider: Home shows the right side alone, End the left one."""
+        slider = self.page.get_by_label("Wipe", exact=True)
+        slider.wait_for()
+        slider.focus()
+        self.page.keyboard.press(key)
+
+    def pixels(self) -> NDArray[np.float64]:
+        """The 3D view [h, w, 3], 0 to 255, as the page saves it."""
+        self.settled()
+        with self.page.expect_download() as download:
+            self.page.get_by_role("button", name="Save a picture").click()
+        with Image.open(download.value.path()) as picture:
+            return np.asarray(picture.convert("RGB"), dtype=np.float64)
+
+
+def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
+    """What `sgsst render` makes of a scene's file, [h, w, 3] of 0 to 255."""
+    found = read_scene(scene).scene
+    colours = view_colours(found.sh_dc, rest_colours(found.sh_rest, found.means, camera))
+    image = make_rasterizer("cpu", found).render(colours, camera)
+    return (image.double().clamp(0, 1) * 255).round().numpy()
+
+
+def psnr(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
+    """Peak signal-to-noise ratio of pictures [h, w, 3] of 0 to 255, decibels."""
+    assert found.shape == wanted.shape, (found.shape, wanted.shape)
+    return float(10 * np.log10(255**2 / max(float(((found - wanted) ** 2).mean()), 1e-9)))
+
+
+#: Shows a scene by the page's own modules: `[base, scene, cameras, name, width, height]` to what `STEPS` return.
+VIEW = """async ([base, scene, cameras, name, width, height]) => {
+  const { Viewer } = await import(`${base}/viewer/viewer.js`), { readCameras } = await import(`${base}/cameras.js`);
+  const canvas = document.createElement("canvas");
+  const size = { width: `${width}px`, height: `${height}px` };
+  Object.assign(canvas.style, { ...size, position: "fixed", left: 0, top: 0, zIndex: 9 });
+  document.body.append(canvas);
+  const viewer = new Viewer(canvas), blob = await (await fetch(cameras)).blob();
+  const camera = (await readCameras([{ name: "cameras.json", blob }])).find((each) => each.name === name);
+  const source = viewer.open(new URL(scene, location.href).href);
+  viewer.show({ scene: source, colours: "own" });
+  await source.ready;
+  viewer.camera.stand(camera, source.middle);
+  viewer.draw();
+  const pause = () => new Promise((go) => setTimeout(go, 20));
+  const settled = async () => { while (canvas.dataset.state !== "settled") await pause(); };
+  const picture = async () => {
+    await settled();
+    const bytes = new Uint8Array(await (await viewer.picturePng()).arrayBuffer());
+    return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+  };
+  try {
+    return await (STEPS)(viewer, source, picture, base);
+  } finally {
+    viewer.end();
+    canvas.remove();
+  }
+}"""
+
+
+def view_script(steps: str = "(viewer, source, picture) => picture()") -> str:
+    """`VIEW` with steps: a function of viewer, scene, a maker of PNGs in base64, and the modules' address."""
+    return VIEW.replace("STEPS", steps)
+
+
+def decoded(png: str) -> NDArray[np.float64]:
+    """Pixels [h, w, 3] of a PNG in base64."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB"), dtype=np.float64)
+
+
+def serve_files(page: Any, folder: Path) -> None:
+    """Answer the page's requests for `/given/NAME` with files of a folder."""
+    page.route("**/given/*", lambda route: route.fulfill(path=folder / route.request.url.rsplit("/", 1)[1]))

@@ -1,0 +1,44 @@
+"""The page's tests need a browser and a service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.page.browser import Watched, missing, open_browser
+from tests.api.service import Service
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Of this module alone: while it is open, nothing else may use asyncio."""
+    reason = missing()
+    if reason:
+        pytest.skip(reason)
+    with open_browser() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("service") / "data") as running:
+        yield running
+
+
+@pytest.fixture
+def visit(browser: Any, service: Service) -> Iterator[Callable[..., Watched]]:
+    """Opens pages of the service, in windows that know nothing of each other."""
+    opened: list[Watched] = []
+
+    def visit(path: str = "/", **context: Any) -> Watched:
+        watched = Watched(browser, service.url, **context)
+        opened.append(watched)
+        watched.page.goto(service.url + path)
+        return watched
+
+    yield visit
+    for watched in opened:
+        watched.context.close()

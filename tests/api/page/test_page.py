@@ -1,0 +1,438 @@
+"""What a user does on the page, in a real browser with the real service behind it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.scene.camera import resized
+from tests.api.page.browser import Watched, psnr, rendered
+from tests.api.service import ROOT, Service, wait_for
+from tests.small_scenes import cameras, wall, write_files
+
+pytestmark = pytest.mark.slow
+
+Visit = Callable[..., Watched]
+STEPS = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
+#: Longer than a test looks at it.
+LONG = STEPS | {"steps_sos": 1_000_000}
+REFUSED = "the server responded with a status of 422"
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    ply, file, style = write_files(tmp_path, wall(sh_degree=1), cameras(3, 96, 72))
+    return {"scene": ply, "cameras": file, "style": style}
+
+
+def submit(service: Service, files: dict[str, Path], key: str | None = None, **parameters: Any) -> str:
+    """A job by the API alone."""
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    with service.client(key) as client:
+        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(STEPS | parameters)})
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+def done(service: Service, job_id: str) -> str:
+    """Wait until a job has succeeded."""
+
+    def succeeded() -> bool:
+        status = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
+        assert status not in ("failed", "canceled"), service.said()
+        return bool(status == "succeeded")
+
+    wait_for(succeeded, f"{job_id} to succeed", service.said)
+    return job_id
+
+
+def choose(watched: Watched, files: dict[str, Path]) -> None:
+    for role, path in files.items():
+        watched.page.get_by_label(role.capitalize(), exact=True).set_input_files(path)
+
+
+def set_options(watched: Watched, **values: Any) -> None:
+    """Fill in options, which stand folded."""
+    page = watched.page
+    page.locator(".presets input").first.wait_for()
+    page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
+    for name, value in values.items():
+        control = page.locator(f"[data-name={name}]").locator("input, select").first
+        if control.evaluate("(element) => element.tagName") == "SELECT":
+            control.select_option(str(value).lower())
+        else:
+            control.fill(str(value))
+
+
+_DROP = """(files) => {
+  const carried = new DataTransfer();
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  for (const [name, text] of files) carried.items.add(new File([bytes(text)], name));
+  for (const kind of ["dragenter", "dragover", "drop"]) {
+    const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer: carried });
+    document.querySelector(".frame").dispatchEvent(event);
+  }
+}"""
+
+
+def drop(watched: Watched, files: dict[str, Path]) -> None:
+    """All files at once, from outside the browser onto the page."""
+    carried = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in files.values()]
+    watched.page.evaluate(_DROP, carried)
+
+
+def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+    """Drop, look, ask what it costs, start, watch, and wipe: the pixels on each side are those of `sgsst render`."""
+    watched = visit(width=600, height=500)
+    page = watched.page
+    drop(watched, files)
+    page.get_by_text("616 Gaussians · SH degree 1").wait_for()
+    watched.settled()
+    page.get_by_text("3 cameras, drawn in the scene").wait_for()
+    assert httpx.get(f"{service.url}/v1/jobs").json()["jobs"] == []  # nothing was sent to show it
+
+    set_options(watched, **STEPS)
+    page.get_by_role("button", name="What would it cost?").click()
+    cost = page.get_by_role("region", name="What it would cost")
+    cost.get_by_text("616", exact=True).wait_for()
+    cost.get_by_text("network layers").wait_for()
+
+    page.get_by_role("button", name="Start").click()
+    page.locator("h1", has_text="scene").wait_for()
+    page.locator(".badge", has_text="Done").wait_for()
+    page.get_by_role("img", name="Loss against seconds").wait_for()
+    page.get_by_role("heading", name="What was decided").wait_for()
+    page.get_by_label("Wipe", exact=True).wait_for()
+    job_id = page.url.rsplit("/", 1)[1]
+
+    page.get_by_label("Camera", exact=True).select_option("1")
+    camera = resized(read_cameras(files["cameras"])[1], 384)
+    result = tmp_path / "stylized.ply"
+    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    original, stylized = rendered(files["scene"], camera), rendered(result, camera)
+    watched.wipe("End")
+    before = frame_of(watched, original)
+    watched.wipe("Home")
+    after = frame_of(watched, stylized)
+    assert psnr(before, original) > 38  # the view is larger than the rendered picture
+    assert psnr(after, stylized) > 38
+    assert psnr(before, stylized) < 25
+    watched.check()
+
+
+def frame_of(watched: Watched, like: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The camera's frame in the middle of the 3D view, in another picture's size."""
+    pixels = watched.pixels()
+    height, width = pixels.shape[:2]
+    h, w = min(height, width * 3 / 4), min(width, height * 4 / 3)
+    box = ((width - w) / 2, (height - h) / 2, (width + w) / 2, (height + h) / 2)
+    size = (like.shape[1], like.shape[0])
+    small = Image.fromarray(pixels.astype(np.uint8)).resize(size, Image.Resampling.BOX, box=box)
+    return np.asarray(small, dtype=np.float64)
+
+
+def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    big = tmp_path / "big.ply"
+    write_scene(big, wall(400, 250, sh_degree=3))
+    watched = visit()
+    page = watched.page
+    sent: list[tuple[str, int, int]] = []
+
+    def note(request: Any) -> None:
+        if request.method == "PATCH":
+            sent.append((request.url, int(request.headers["upload-offset"]), len(request.post_data_buffer or b"")))
+
+    def slow(route: Any) -> None:
+        if len(sent) <= 3:
+            route.continue_()
+        # further parts hang until the page is left
+
+    page.on("request", note)
+    page.route("**/v1/uploads/*", lambda route: slow(route) if route.request.method == "PATCH" else route.continue_())
+    choose(watched, files | {"scene": big})
+    page.get_by_role("button", name="Start").click()
+    wait_for(lambda: page.evaluate("1") and any(offset > 0 for _, offset, _ in sent), "a second part")
+    page.get_by_role("button", name="Pause").wait_for()
+    page.unroute_all(behavior="ignoreErrors")
+    page.reload()
+    page.get_by_text("had arrived to").wait_for()
+
+    first, before = next((url, offset) for url, offset, _ in sent if offset > 0)
+    sent.clear()
+    set_options(watched, **LONG)
+    choose(watched, files | {"scene": big})
+    page.get_by_role("button", name="Start").click()
+    page.get_by_role("button", name="Cancel").wait_for()
+    again = [offset for url, offset, _ in sent if url == first]
+    assert again, "the upload was begun anew"
+    assert min(again) >= before
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+
+    sent.clear()  # the same files once more: the service has them
+    page.get_by_role("link", name="New").click()
+    set_options(watched, **LONG)
+    choose(watched, files | {"scene": big})
+    page.get_by_role("button", name="Start").click()
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+    assert sent == []
+    watched.check("net::ERR")
+
+
+def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    big = tmp_path / "big.ply"
+    write_scene(big, wall(300, 200, sh_degree=3))
+    watched = visit()
+    page = watched.page
+    held: list[Any] = []
+    page.route(
+        "**/v1/uploads/*", lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_()
+    )
+    set_options(watched, **LONG)
+    choose(watched, files | {"scene": big})
+    page.get_by_role("button", name="Start").click()
+    wait_for(lambda: page.evaluate("1") and held, "a part to be sent")
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_text("paused at 0 %").wait_for()
+    page.unroute_all(behavior="ignoreErrors")
+    page.get_by_role("button", name="Go on").click()
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+    watched.check("net::ERR")
+
+
+def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """The stream goes on where it was, and the history of the whole run is there."""
+    job_id = submit(service, files, **LONG)
+    watched = visit(f"/#/jobs/{job_id}")
+    page = watched.page
+    page.get_by_text("All scales · step").wait_for()
+    page.get_by_role("img", name="Loss against seconds").wait_for()
+    service.kill("api.http.server")
+    page.get_by_text("The connection is lost").wait_for()
+    wait_for(service.ready, "the API to be back", service.said)
+    page.get_by_text("The connection is lost").wait_for(state="hidden")
+    step = page.locator(".state").inner_text()
+    wait_for(lambda: page.locator(".state").inner_text() != step, "news of the job", service.said)
+    page.reload()
+    page.get_by_role("img", name="Loss against seconds").wait_for()
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("button", name="Retry").wait_for()
+    watched.check("net::ERR", "Failed to load resource")
+
+
+def test_refusals_stand_beside_their_field(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    watched = visit()
+    page = watched.page
+    set_options(watched, steps_sos=10)
+    page.get_by_role("button", name="Start").click()
+    page.locator(".slot", has_text="Scene").get_by_text("Choose a scene.").wait_for()
+    picture = tmp_path / "style.png"
+    picture.write_bytes(b"this is no picture")
+    choose(watched, files | {"style": picture})
+    page.get_by_role("button", name="What would it cost?").click()
+    page.locator(".slot", has_text="Style").get_by_text("not an image").wait_for()
+    page.get_by_role("button", name="Remove style.png").click()
+    page.get_by_label("Style", exact=True).set_input_files(files["style"])
+    set_options(watched, resolution=-5)
+    page.get_by_role("button", name="What would it cost?").click()
+    field = page.locator("[data-name=resolution]")
+    field.get_by_text("greater than or equal to 1").wait_for()
+    assert field.locator("input").get_attribute("aria-invalid") == "true"
+    watched.check(REFUSED)
+
+
+def test_names_of_files_are_text(visit: Visit, service: Service, tmp_path: Path) -> None:
+    """Wherever they stand: before the upload, in the list, in the view of the job, on the sides of the wipe."""
+    hostile = "<img src=x onerror=document.title='broken'>"
+    ply, file, style = write_files(tmp_path, wall())
+    files = {
+        "scene": ply.rename(tmp_path / f"{hostile}.ply"),
+        "cameras": file,
+        "style": style.rename(tmp_path / f"{hostile}.png"),
+    }
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    page.locator(".slot", has_text="Scene").get_by_text(hostile).first.wait_for()
+    job_id = done(service, submit(service, files, name=hostile))
+    page.goto(f"{service.url}/#/jobs")
+    page.locator(".tile", has_text=hostile).wait_for()
+    page.goto(f"{service.url}/#/jobs/{job_id}")
+    page.get_by_role("heading", name=hostile).wait_for()
+    watched.settled()
+    assert page.locator("img[src=x]").count() == 0
+    assert page.title() != "broken"
+    watched.check()
+
+
+def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    ids = [done(service, submit(service, files, name=f"run {seed} of three", seed=seed)) for seed in range(3)]
+    watched = visit("/#/jobs")
+    page = watched.page
+    tiles = page.locator(".tile", has_text="of three")
+    tiles.nth(2).wait_for()
+    tiles.first.locator("img").wait_for()
+    page.get_by_label("Filter").fill("run 1 of three")
+    page.locator(".tile", has_text="run 0 of three").wait_for(state="detached")
+    page.get_by_label("Filter").fill("of three")
+    for name in ("run 0 of three", "run 1 of three"):
+        page.get_by_label(f"Compare {name}").check()
+    page.get_by_role("button", name="Compare the two").click()
+    page.get_by_label("Left").wait_for()
+    watched.settled()
+    watched.wipe("Home")
+    right = watched.pixels()
+    watched.wipe("End")
+    left = watched.pixels()
+    assert np.abs(left - right).mean() > 0.1  # runs of different seeds differ a little
+    page.get_by_label("Left").select_option("original")
+    assert np.abs(watched.pixels() - left).mean() > 5
+
+    page.goto(f"{service.url}/#/jobs")
+    page.get_by_role("button", name="Delete run 2 of three").click()
+    page.get_by_role("button", name="Delete", exact=True).click()
+    page.locator(".tile", has_text="run 2 of three").wait_for(state="detached")
+    assert httpx.get(f"{service.url}/v1/jobs/{ids[2]}").status_code == 404
+    watched.check()
+
+
+def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = done(service, submit(service, files, refine=2, name="refined"))
+    stylized = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content
+    path = files["scene"].with_name("refined.ply")
+    path.write_bytes(stylized)
+    assert len(read_scene(path).scene) > 616
+    watched = visit(f"/#/jobs/{job_id}")
+    watched.wipe("Home")
+    right = watched.pixels()
+    watched.wipe("End")
+    assert np.abs(watched.pixels() - right).mean() > 5
+    watched.check("status of 404")  # that there are no colours alone is asked first
+
+
+def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """From the list to a finished job, and around it, without a pointer."""
+    job_id = done(service, submit(service, files, name="by keyboard"))
+    watched = visit("/#/jobs")
+    page = watched.page
+    page.locator(".tile", has_text="by keyboard").wait_for()
+    reach(page, lambda: page.evaluate("() => document.activeElement.hash || ''") == f"#/jobs/{job_id}")
+    page.keyboard.press("Enter")
+    page.get_by_label("Wipe", exact=True).wait_for()
+    watched.settled()
+    reach(page, lambda: page.evaluate("() => document.activeElement.tagName") == "CANVAS")
+    frames = int(page.locator(".stage").get_attribute("data-frames"))
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("w")
+    wait_for(lambda: int(page.locator(".stage").get_attribute("data-frames")) > frames, "the view to move")
+    page.keyboard.press(" ")
+    page.locator("#said", has_text="Stylized").or_(page.locator("#said", has_text="Original")).wait_for()
+    page.keyboard.press(".")
+    page.locator("#said", has_text="of 3").wait_for()
+    watched.check()
+
+
+def reach(page: Any, there: Callable[[], bool]) -> None:
+    """Press Tab until a condition holds."""
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if there():
+            return
+    raise AssertionError("Tab does not lead there")
+
+
+VIEWS = {"new": "/#/", "jobs": "/#/jobs", "missing": "/#/nowhere"}
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1100])
+def test_accessible_and_never_too_wide(
+    visit: Visit, service: Service, files: dict[str, Path], scheme: str, width: int
+) -> None:
+    from axe_playwright_python.sync_playwright import Axe
+
+    job_id = done(service, submit(service, files, name="looked at"))
+    watched = visit(width=width, height=740, color_scheme=scheme, reduced_motion="reduce")
+    page = watched.page
+    for name, path in (VIEWS | {"job": f"/#/jobs/{job_id}"}).items():
+        page.goto(service.url + path)
+        page.locator("h1").wait_for()
+        if name == "new":
+            page.locator("[data-name=resolution]").wait_for()
+            page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
+        if name == "jobs":
+            page.locator(".tile").first.wait_for()
+        if name == "job":
+            watched.settled()
+        found = Axe().run(page)
+        assert found.violations_count == 0, f"{name}: {found.generate_report()}"
+        assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), name
+    watched.check()
+
+
+def test_nothing_moves_while_the_page_loads(visit: Visit) -> None:
+    watched = visit(width=1000, height=700)
+    watched.page.locator("[data-name=resolution]").wait_for()
+    moved = watched.page.evaluate(
+        """() => new Promise((done) => {
+          let sum = 0;
+          new PerformanceObserver((list) => { for (const entry of list.getEntries()) sum += entry.value; })
+            .observe({ type: "layout-shift", buffered: true });
+          setTimeout(() => done(sum), 300);
+        })"""
+    )
+    assert moved < 0.1  # what counts as good
+    watched.check()
+
+
+def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path: Path, tiny_installed: Path) -> None:
+    with Service(tmp_path / "data", SGSST_REQUIRE_KEYS="true") as service:
+        keys = [_new_key(service, name) for name in ("ann", "ben")]
+        job_id = submit(service, files, keys[0], name="of ann", **{"steps_sos": 10})
+        ann, ben = (Watched(browser, service.url) for _ in keys)
+        for watched, key in zip((ann, ben), keys, strict=True):
+            page = watched.page
+            page.goto(f"{service.url}/#/jobs")
+            page.get_by_label("API key").fill("sgsst_wrong")
+            page.get_by_role("button", name="Sign in").click()
+            page.get_by_text("does not know this key").wait_for()
+            page.get_by_label("API key").fill(key)
+            page.get_by_role("button", name="Sign in").click()
+            page.get_by_role("button", name="Sign out").wait_for()
+            assert page.evaluate("() => document.cookie + JSON.stringify({...localStorage, ...sessionStorage})") == "{}"
+        ann.page.locator(".tile", has_text="of ann").wait_for()
+        ben.page.get_by_text("No jobs yet").wait_for()
+        ben.page.goto(f"{service.url}/#/jobs/{job_id}")
+        ben.page.get_by_text("There is no job").wait_for()
+        ann.page.goto(f"{service.url}/#/jobs/{job_id}")
+        ann.page.locator(".badge", has_text="Done").wait_for()
+        ann.settled()
+        ann.page.get_by_role("button", name="Sign out").click()
+        ann.page.get_by_label("API key").wait_for()
+        ann.page.reload()
+        ann.page.get_by_label("API key").wait_for()
+        ann.check("status of 401")
+        ben.check("status of 401", "status of 404")
+        for watched in (ann, ben):
+            watched.context.close()
+
+
+def _new_key(service: Service, name: str) -> str:
+    command = [sys.executable, "-m", "api.cli", "keys", "create", name]
+    made = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
+    return made.stdout.split()[-1]

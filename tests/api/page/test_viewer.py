@@ -1,0 +1,212 @@
+"""The 3D view against `sgsst render`, its wipe, its order, and a graphics device that goes away."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.ply import read_scene
+from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.orbit import orbit
+from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
+from tests.small_scenes import cameras, wall, write_files
+
+pytestmark = pytest.mark.slow
+
+#: What the viewer was built to reach in every camera, decibels.
+FAITHFUL = 45.0
+Visit = Callable[..., Watched]
+
+
+def base_of(watched: Watched) -> str:
+    """Where the page's modules are."""
+    source: str = watched.page.locator("script[type=module]").get_attribute("src")
+    return source.rsplit("/", 1)[0]
+
+
+def shown(watched: Watched, folder: Path, name: str, size: tuple[int, int], steps: str | None = None) -> Any:
+    serve_files(watched.page, folder)
+    script = view_script(steps) if steps else view_script()
+    return watched.page.evaluate(script, [base_of(watched), "/given/scene.ply", "/given/cameras.json", name, *size])
+
+
+def real_scene(shared_data: Path, name: str) -> tuple[Scene, list[Camera]]:
+    scene = read_scene(shared_data / "scenes" / name / "point_cloud.ply").scene
+    file = shared_data / "scenes" / name / "cameras.json"
+    if file.exists():
+        return scene, [resized(camera, 240) for camera in read_cameras(file)[::33]]
+    return scene, orbit(scene, 3, width=240, height=180)
+
+
+@pytest.mark.parametrize(("name", "degree"), [("biker", 0), ("playbot_synthetic_sh2", 2), ("snowmiku_plush", 3)])
+def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path: Path, name: str, degree: int) -> None:
+    scene, views = real_scene(shared_data, name)
+    assert scene.sh_degree == degree
+    write_files(tmp_path, scene, views)
+    watched = visit("/#/jobs")
+    for camera in views:
+        found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
+        assert psnr(found, rendered(tmp_path / "scene.ply", camera)) >= FAITHFUL, camera.name
+    watched.check()
+
+
+def test_less_memory_shows_fewer_harmonics_and_says_so(visit: Visit, tmp_path: Path) -> None:
+    write_files(tmp_path, wall(sh_degree=3))
+    watched = visit("/#/jobs")
+    steps = """async (viewer, source, picture, base) => {
+      const { SplatScene } = await import(`${base}/viewer/splat_scene.js`);
+      const tight = new SplatScene(viewer.gl, new URL("/given/scene.ply", location.href).href, () => {}, 616 * 80);
+      await tight.ready;
+      const found = [source.degree, tight.header.degree, tight.degree];
+      tight.end();
+      return found;
+    }"""
+    assert shown(watched, tmp_path, "view_1", (64, 48), steps) == [3, 3, 1]
+
+
+def test_wipe_is_exact_to_the_pixel(visit: Visit, tmp_path: Path) -> None:
+    write_files(tmp_path, wall(sh_degree=1), cameras(1, 200, 150))
+    halves = struct.pack("<1848e", *np.linspace(-2, 2, 1848))
+    (tmp_path / "colours.f16").write_bytes(halves)
+    steps = """async (viewer, source, picture) => {
+      await source.addColours("other", (await fetch("/given/colours.f16")).body);
+      viewer.show({ scene: source, colours: "own" }, { scene: source, colours: "other" });
+      const found = [];
+      for (const cut of [0, 0.333, 1]) { viewer.wipe(cut); found.push(await picture()); }
+      return found;
+    }"""
+    after, half, before = map(decoded, shown(visit("/#/jobs"), tmp_path, "view_0", (200, 150), steps))
+    edge = round(0.333 * 200)
+    assert np.array_equal(half[:, :edge], before[:, :edge])
+    assert np.array_equal(half[:, edge:], after[:, edge:])
+    assert np.abs(before - after).mean() > 20
+
+
+def test_two_scenes_share_the_wipe(visit: Visit, tmp_path: Path) -> None:
+    write_files(tmp_path, wall(), cameras(1, 200, 150))
+    steps = """async (viewer, source, picture) => {
+      const other = viewer.open(source.source);
+      await other.ready;
+      const alone = await picture();
+      viewer.show({ scene: source, colours: "own" }, { scene: other, colours: "own" });
+      viewer.wipe(0.5);
+      return [alone, await picture()];
+    }"""
+    alone, both = map(decoded, shown(visit("/#/jobs"), tmp_path, "view_0", (200, 150), steps))
+    assert np.array_equal(alone, both)
+
+
+def test_order_is_right_from_every_side(visit: Visit, tmp_path: Path) -> None:
+    """Against a plain sort of float64 depths: no Gaussian before one that is nearer by more than float32 can tell."""
+    write_files(tmp_path, wall())
+    steps = """async (viewer, source, picture, base) => {
+      const { depthOrder } = await import(`${base}/viewer/depth_order.js`);
+      const count = 20000, centres = new Float32Array(count * 3), reach = new Float32Array(count).fill(0.01);
+      let seed = 7;
+      for (let i = 0; i < centres.length; i++) {
+        seed = (Math.imul(seed, 1103515245) + 12345) >>> 0;
+        centres[i] = (seed / 2 ** 32 - 0.5) * (i % 97 ? 4 : 400);
+      }
+      const worst = [];
+      for (let turn = 0; turn < 12; turn++) {
+        const c = Math.cos(turn), s = Math.sin(turn);
+        const axes = [[c, 0, -s], [0, 1, 0], [s, 0, c]], eye = [-5 * s, 0, -5 * c];
+        const order = depthOrder(centres, reach, count, { axes, eye, tan: [1e6, 1e6], near: 0.2 });
+        const depth = (i) => axes[2].reduce((sum, part, k) => sum + part * (centres[3 * i + k] - eye[k]), 0);
+        let expected = 0, back = 0;
+        for (let i = 0; i < count; i++) expected += depth(i) >= 0.2;
+        for (let k = 1; k < order.length; k++) {
+          back = Math.max(back, (depth(order[k]) - depth(order[k - 1])) / depth(order[k]));
+        }
+        worst.push([expected - order.length, new Set(order).size - order.length, back]);
+      }
+      return worst;
+    }"""
+    for left_out, twice, back in shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps):
+        assert abs(left_out) <= 1  # one may lie on the near plane to within rounding
+        assert twice == 0
+        assert back < 1e-5
+
+
+def test_halves_are_rounded_to_nearest(visit: Visit, tmp_path: Path) -> None:
+    values = np.concatenate([np.linspace(-70, 70, 999), np.geomspace(1e-9, 6e4, 999), [0.0, -0.0, 65504.0, 1e9, -1e9]])
+    steps = """async (viewer, source, picture, base) => {
+      const { halfOf } = await import(`${base}/viewer/half.js`);
+      return Array.from(new Uint32Array(new Float32Array(VALUES).buffer), halfOf);
+    }""".replace("VALUES", json.dumps(values.tolist()))
+    write_files(tmp_path, wall())
+    found = np.array(shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps), dtype=np.uint16).view(np.float16)
+    wanted = values.astype(np.float32).clip(-65504, 65504)
+    below = np.abs(wanted).clip(max=32767).astype(np.float16)
+    spacing = np.where(np.abs(wanted) > 32767, 32.0, np.spacing(below).astype(np.float64))
+    assert (np.abs(found.astype(np.float64) - wanted) <= spacing / 2 * (1 + 1e-6)).all()
+
+
+def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:
+    write_files(tmp_path, wall(sh_degree=1))
+    steps = """async (viewer, source, picture) => {
+      const before = await picture(), device = viewer.gl.getExtension("WEBGL_lose_context");
+      viewer.onReload = () => {
+        const again = viewer.open(source.source);
+        viewer.show({ scene: again, colours: "own" });
+      };
+      device.loseContext();
+      while (!viewer.lost) await new Promise((go) => setTimeout(go, 20));
+      device.restoreContext();
+      const there = () => !viewer.lost && viewer.sides && viewer.sides.left.scene.whole;
+      while (!there()) await new Promise((go) => setTimeout(go, 20));
+      return [before, await picture()];
+    }"""
+    before, after = map(decoded, shown(visit("/#/jobs"), tmp_path, "view_1", (128, 96), steps))
+    assert np.array_equal(before, after)
+
+
+def test_nothing_is_drawn_while_nothing_changes(visit: Visit, tmp_path: Path) -> None:
+    write_files(tmp_path, wall())
+    steps = """async (viewer, source, picture) => {
+      await picture();
+      const before = viewer.frames;
+      await new Promise((go) => setTimeout(go, 700));
+      return viewer.frames - before;
+    }"""
+    assert shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps) == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"no ply at all", "This is not a PLY file."),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+            "Only binary little-endian PLY",
+        ),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234",
+            "no 3D Gaussians",
+        ),
+    ],
+)
+def test_files_that_cannot_be_shown(visit: Visit, tmp_path: Path, content: bytes, said: str) -> None:
+    watched = visit()
+    file = tmp_path / "scene.ply"
+    file.write_bytes(content)
+    watched.page.get_by_label("Scene", exact=True).set_input_files(file)
+    watched.page.locator(".frame .note").filter(has_text=said).wait_for()
+    watched.check()
+
+
+def test_cut_file_says_so(visit: Visit, tmp_path: Path) -> None:
+    ply, _, _ = write_files(tmp_path, wall())
+    ply.write_bytes(ply.read_bytes()[:-100])
+    watched = visit()
+    watched.page.get_by_label("Scene", exact=True).set_input_files(ply)
+    watched.page.locator(".frame .note").filter(has_text="ends too early").wait_for()
+    watched.check()
