@@ -45,7 +45,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        store = open_store(settings)
+        store = open_store(settings, patience=settings.start_seconds)
         results = Artifacts(settings.artifacts_url)
         blobs = open_blobs(settings, store.inputs, results)
         context = Context(

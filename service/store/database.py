@@ -89,12 +89,20 @@ class Database:
             yield connection
 
     def upgrade(self) -> None:
-        """Bring the tables to this version; of several processes that start at once one does it."""
-        if self._version() == SCHEMA:
+        """Bring the tables to this version; of several processes that start at once one does it.
+
+        Tables of a later version are used as they are: its migrations only add, so that this version's processes go on,
+        and start, while they are replaced one by one.
+        """
+        if self.is_up_to_date():
             return
         with self._upgrading():
-            if self._version() != SCHEMA:
+            if not self.is_up_to_date():
                 self._migrate()
+
+    def is_up_to_date(self) -> bool:
+        """Whether the tables are those of this version, or of a later one."""
+        return (self._version() or "") >= SCHEMA  # numbers of four digits, in the order of the migrations
 
     def ping(self) -> None:
         """Prove that the database answers; raises whatever its driver raises."""
