@@ -56,7 +56,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             inspector=Inspector(settings, store, blobs),
             packer=Packer(settings, store, blobs, results),
             hub=Hub(store),
-            metrics=Metrics(store),
+            metrics=Metrics(store, settings.folder),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS

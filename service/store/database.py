@@ -38,6 +38,8 @@ _LOST_AFTER = {
 IDEMPOTENCY_SECONDS = 86_400.0
 #: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
 _LOCK = 7_347_758
+#: Upper bounds of a histogram's buckets, seconds: from a click to a day.
+BUCKETS = (1, 5, 15, 60, 300, 900, 1800, 3600, 7200, 14400, 43200, 86400)
 
 Clock = Callable[[], float]
 
@@ -191,6 +193,18 @@ def count(session: Session, name: str, labels: str = "", amount: float = 1.0) ->
     """Add to a counter, within the transaction of what is counted."""
     statement = _add_statement(session.get_bind().dialect.name)
     session.execute(statement, {"name": name, "labels": labels, "value": amount})
+
+
+def observe(session: Session, name: str, seconds: float) -> None:
+    """Add to a histogram, as `count`: to its sum, its number, and the one bucket that the value lies in.
+
+    Buckets are counters `NAME_bucket` with the label `le`, each without those below it; who shows them adds them up.
+    """
+    count(session, f"{name}_sum", amount=seconds)
+    count(session, f"{name}_count")
+    bound = next((bound for bound in BUCKETS if seconds <= bound), None)
+    if bound is not None:  # what is longer than all is in the number alone
+        count(session, f"{name}_bucket", f'le="{bound}"')
 
 
 @cache
