@@ -7,8 +7,8 @@ with the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_..
 `pg_restore` of the server's version or a later one. What FOLDER has of an earlier backup is not copied again: names of
 files are never written twice, but for unfinished uploads where the store is a local folder.
 
-Files are copied before and after the database: what its rows refer to was there at one of the two. A checkpoint that was
-made and replaced in between is missing; its job begins anew.
+Files are copied before and after the database: what its rows refer to was there at one of the two. A checkpoint that
+was made and replaced in between is missing; its job begins anew.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def restore(settings: ServiceSettings, folder: Path) -> None:
         place.make_bucket()
         restored += _copy(kept, place)
     _load(store, folder)
-    missing = _missing(settings, store, places)
+    missing = _missing(store, places)
     store.close()
     print(f"restored the database and {restored} files; {len(missing)} files are missing")
     for name in missing:
@@ -148,7 +148,8 @@ def _dump(store: Store, folder: Path) -> None:
 
 def _load(store: Store, folder: Path) -> None:
     if store.database.sqlite:
-        with sqlite3.connect(folder / "database") as source, sqlite3.connect(str(store.database.url.database)) as target:
+        target_file = str(store.database.url.database)
+        with sqlite3.connect(folder / "database") as source, sqlite3.connect(target_file) as target:
             source.backup(target)
     else:
         words = ("--no-owner", "--exit-on-error", "--single-transaction", str(folder / "database"))
@@ -166,7 +167,7 @@ def _run(program: str, *words: str, url: URL) -> None:
         raise BackupError(f"{program} is missing: it comes with PostgreSQL's client.") from error
 
 
-def _missing(settings: ServiceSettings, store: Store, places: dict[str, ObjectStore]) -> list[str]:
+def _missing(store: Store, places: dict[str, ObjectStore]) -> list[str]:
     """Files that rows refer to and that are not there. Rows of checkpoints among them are removed."""
     there = {name: set(place.below("")) for name, place in places.items()}
     remote = "blobs" not in there

@@ -1,13 +1,12 @@
 """Images and the compose file, built and run by buildah, podman and podman-compose as root, beside nothing else.
 
-Images lie in a storage of their own, which is kept as a cache (`SGSST_TEST_CONTAINERS`, by default a folder in the user's
-cache): what is in it was built before, or pulled. Where no registry can be reached, Debian's base image is made from its
-packages, and images that were to be pulled are replaced by those of `stand_ins`.
+Images lie in a storage of their own, which is kept as a cache (`SGSST_TEST_CONTAINERS`, by default a folder in the
+user's cache): what is in it was built before, or pulled. Where no registry can be reached, Debian's base image is made
+from its packages, and images that were to be pulled are replaced by those of `stand_ins`.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -155,11 +154,4 @@ def containers() -> Iterator[Containers]:
             made.provide(STORE, "store")
             yield made
         finally:
-            made.run("podman", "image", "prune", "--force", check=False)
             made.run("umount", str(Path(storage, "overlay")), check=False)
-
-
-def labels(containers: Containers, image: str) -> dict[str, str]:
-    """Of an image."""
-    (found,) = json.loads(containers.run("podman", "image", "inspect", image))
-    return dict(found["Labels"])

@@ -1,4 +1,4 @@
-"""`deploy/kubernetes`: rendered by kustomize, against the schemas of Kubernetes and KubeRay, and what must hold of it."""
+"""`deploy/kubernetes`: rendered by kustomize, against the schemas of Kubernetes and KubeRay, and what must hold."""
 
 from __future__ import annotations
 
