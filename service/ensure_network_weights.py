@@ -1,4 +1,7 @@
-"""`python -m service.ensure_network_weights`: fetch the smallest network where none is installed, and say so."""
+"""`python -m service.ensure_network_weights [NAME...]`: fetch networks that are not installed, and say so.
+
+Without names any one will do, and VGG16 is fetched where there is none.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,21 @@ from sgsst_core.features.network_weights import fetch_network_weights, list_netw
 
 
 def main() -> int:
-    """Returns 0 where there is a network at the end."""
-    if any(entry.path for entry in list_network_weights() if entry.name in ("vgg19", "vgg16")):
-        return 0
-    print("No feature network is installed yet: fetching VGG16 (64 MB). `sgsst weights fetch vgg19` gets the paper's.")
-    try:
-        fetch_network_weights("vgg16")
-    except SgsstError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    """Returns 0 where the networks are there at the end."""
+    installed = {entry.name for entry in list_network_weights() if entry.path}
+    wanted = sys.argv[1:]
+    if not wanted and not installed & {"vgg19", "vgg16"}:
+        print("No feature network is installed yet: `sgsst weights fetch vgg19` gets the paper's.")
+        wanted = ["vgg16"]
+    for name in wanted:
+        if name in installed:
+            continue
+        print(f"Fetching {name}.")
+        try:
+            fetch_network_weights(name)
+        except SgsstError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
     return 0
 
 

@@ -44,6 +44,7 @@ class ServiceSettings(BaseSettings):
         retry_seconds: wait before the second attempt; doubles with each.
         parallel_jobs: jobs side by side; None: one for each GPU, or one.
         cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may give to jobs.
+        start_seconds: for which a process that starts waits for a database server that does not answer yet.
         checkpoint_seconds: how often a running job saves its state.
         preview_seconds: how often it shows a picture of it, and its log where that has grown.
         stop_seconds: what a job may take to stop before it is killed.
@@ -90,6 +91,7 @@ class ServiceSettings(BaseSettings):
     retry_seconds: float = Field(5, ge=0)
     parallel_jobs: int | None = Field(None, gt=0)
     cluster_gpus: int = Field(0, ge=0)
+    start_seconds: float = Field(60, ge=0)
     checkpoint_seconds: float = Field(60, gt=0)
     preview_seconds: float = Field(20, gt=0)
     stop_seconds: float = Field(20, gt=0)

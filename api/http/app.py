@@ -47,7 +47,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        store = open_store(settings)
+        store = open_store(settings, patience=settings.start_seconds)
         results = Artifacts(settings.artifacts_url)
         blobs = open_blobs(settings, store.inputs, results)
         context = Context(
@@ -58,9 +58,9 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             inspector=Inspector(settings, store, blobs),
             packer=Packer(settings, store, blobs, results),
             hub=Hub(store),
-            metrics=Metrics(store),
             sign_ins=SignIns(),
             rates=Rates(),
+            metrics=Metrics(store, settings.folder),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS

@@ -2,31 +2,54 @@
 
 from __future__ import annotations
 
+import shutil
+from collections import defaultdict
 from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from service.store import Store
+from service.store.database import BUCKETS
+from service.store.states import AttemptOutcome, JobStatus
 
-_HELP = {
-    "sgsst_jobs_submitted": "Jobs that were accepted.",
-    "sgsst_jobs_finished": "Jobs that have ended, by status.",
-    "sgsst_attempts": "Attempts that were begun.",
-    "sgsst_attempts_ended": "Attempts that have ended, by outcome.",
-    "sgsst_lease_expirations": "Leases that ran out because a dispatcher was not heard of.",
-    "sgsst_queue_wait_seconds_sum": "Seconds that jobs waited for their attempts.",
-    "sgsst_queue_wait_seconds_count": "Waits counted in sgsst_queue_wait_seconds_sum.",
-    "sgsst_job_seconds_sum": "Seconds from first attempt to success.",
-    "sgsst_job_seconds_count": "Successes counted in sgsst_job_seconds_sum.",
+
+class _Counter(NamedTuple):
+    """What a counter counts, and the label that it has, with all values: each is shown from the start, as 0."""
+
+    help: str
+    label: str | None = None
+    values: tuple[str, ...] = ()
+
+
+_ENDS = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELED)
+_COUNTERS = {
+    "sgsst_jobs_submitted": _Counter("Jobs that were accepted."),
+    "sgsst_jobs_finished": _Counter("Jobs that have ended, by status.", "status", tuple(map(str, _ENDS))),
+    "sgsst_attempts": _Counter("Attempts that were begun."),
+    "sgsst_attempts_ended": _Counter(
+        "Attempts that have ended, by outcome.", "outcome", tuple(map(str, AttemptOutcome))
+    ),
+    "sgsst_outages": _Counter("Attempts that a machine, the network or the store of files made fail."),
+    "sgsst_lease_expirations": _Counter("Leases that ran out because a dispatcher was not heard of."),
+}
+_HISTOGRAMS = {
+    "sgsst_queue_wait_seconds": "Seconds that jobs waited for their attempts.",
+    "sgsst_job_seconds": "Seconds from first attempt to success.",
 }
 
 
 class Metrics:
-    """What `/metrics` shows."""
+    """What `/metrics` shows.
 
-    def __init__(self, store: Store) -> None:
+    Args:
+        folder: the service's, whose disk uploads are received on.
+    """
+
+    def __init__(self, store: Store, folder: Path) -> None:
         self._registry = CollectorRegistry()
         self._requests = Counter(
             "sgsst_requests", "HTTP requests.", ["method", "route", "status"], registry=self._registry
@@ -34,7 +57,7 @@ class Metrics:
         self._seconds = Histogram(
             "sgsst_request_seconds", "Seconds until the response began.", ["method", "route"], registry=self._registry
         )
-        self._registry.register(_StoreCollector(store))
+        self._registry.register(_StoreCollector(store, folder))
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request."""
@@ -49,8 +72,8 @@ class Metrics:
 class _StoreCollector(Collector):
     """Counts that outlive processes, read from the store when asked for."""
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, folder: Path) -> None:
+        self._store, self._folder = store, folder
 
     def describe(self) -> Iterable[Metric]:
         return []
@@ -58,8 +81,9 @@ class _StoreCollector(Collector):
     def collect(self) -> Iterable[Metric]:
         operations = self._store.operations
         depth = GaugeMetricFamily("sgsst_jobs", "Jobs by status.", labels=["status"])
-        for status, number in operations.depths().items():
-            depth.add_metric([status], number)
+        found = operations.depths()
+        for status in JobStatus:
+            depth.add_metric([status], found.get(status, 0))
         yield depth
         yield GaugeMetricFamily(
             "sgsst_queue_oldest_seconds", "Seconds that the oldest queued job has waited.", operations.oldest_queued()
@@ -72,14 +96,30 @@ class _StoreCollector(Collector):
         places, free = sum(row.places for row in alive), sum(row.free for row in alive)
         yield GaugeMetricFamily("sgsst_places", "GPUs, or places for jobs where there are none.", places)
         yield GaugeMetricFamily("sgsst_places_free", "Those that no job has.", free)
+        room = shutil.disk_usage(self._folder)
+        yield GaugeMetricFamily("sgsst_disk_free_bytes", "Of the disk that this process receives files on.", room.free)
+        yield GaugeMetricFamily("sgsst_disk_bytes", "All of that disk.", room.total)
 
     def _counters(self) -> Iterable[Metric]:
-        families: dict[str, CounterMetricFamily] = {}
+        found: defaultdict[str, dict[str, float]] = defaultdict(dict)
         for name, labels, value in self._store.operations.counters():
-            plain = name.removesuffix("_total")
-            key, _, label = labels.partition("=")
-            family = families.setdefault(
-                plain, CounterMetricFamily(plain, _HELP.get(plain, plain), labels=[key] if key else None)
-            )
-            family.add_metric([label.strip('"')] if key else [], value)
-        return families.values()
+            found[name][labels.partition("=")[2].strip('"')] = value
+        for name, counter in _COUNTERS.items():
+            family = CounterMetricFamily(name, counter.help, labels=[counter.label] if counter.label else None)
+            values = found[f"{name}_total"]
+            for value in sorted({*counter.values, *values} if counter.label else {""}):
+                family.add_metric([value] if counter.label else [], values.get(value, 0.0))
+            yield family
+        for name, help_text in _HISTOGRAMS.items():
+            buckets = found[f"{name}_bucket"]
+            number, total = (found[f"{name}_{part}"].get("", 0.0) for part in ("count", "sum"))
+            yield HistogramMetricFamily(name, help_text, _cumulative(buckets, number), total)
+
+
+def _cumulative(buckets: dict[str, float], number: float) -> list[tuple[str, float]]:
+    """Buckets as Prometheus wants them, each with those below it."""
+    below, rows = 0.0, []
+    for bound in BUCKETS:
+        below += buckets.get(str(bound), 0.0)
+        rows.append((str(float(bound)), below))
+    return [*rows, ("+Inf", number)]

@@ -167,6 +167,15 @@ class ObjectStore:
             if not self._files.exists(place):
                 raise FileNotFoundError(f"The results' place {place!r} is not there, or cannot be reached.")
 
+    def make_bucket(self) -> None:
+        """Create the bucket of an S3 store, unless it is there."""
+        if self._s3:
+            bucket = self.root.partition("/")[0]
+            with self._told(bucket):
+                self._files.invalidate_cache()
+                if not self._files.exists(bucket):
+                    self._files.mkdir(bucket)
+
     def make_folder(self) -> None:
         """Create the place itself."""
         self._files.makedirs(self.root, exist_ok=True)

@@ -237,7 +237,7 @@ def main() -> None:
         die_with_parent()
     settings = ServiceSettings()
     set_up(settings.log_format)
-    dispatcher = Dispatcher(settings, open_store(settings))
+    dispatcher = Dispatcher(settings, open_store(settings, patience=settings.start_seconds))
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         dispatcher.stop()

@@ -17,9 +17,15 @@ def own_name() -> str:
 def is_dead(name: str) -> bool:
     """Whether a dispatcher of that name ran where this process can see it, and is gone."""
     parts = name.rsplit("-", 3)
-    if len(parts) != 4 or parts[1] != _home_digest() or not (parts[2] + parts[3]).isdigit():
+    if not is_of_this_machine(name) or not (parts[2] + parts[3]).isdigit():
         return False
     return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
+
+
+def is_of_this_machine(name: str) -> bool:
+    """Whether a dispatcher of that name runs, or ran, where this process can see it."""
+    parts = name.rsplit("-", 3)
+    return len(parts) == 4 and parts[1] == _home_digest()
 
 
 def _home_digest() -> str:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
+
+from sqlalchemy.exc import OperationalError
 
 from service.settings import ServiceSettings
 from service.store.database import Clock, Database
@@ -15,6 +18,11 @@ from service.store.quotas import Usage
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
 from service.store.sessions import Sessions
+
+#: Between two questions to a database that is not there yet.
+_ASK_AGAIN_SECONDS = 1.0
+
+_log = logging.getLogger(__name__)
 
 
 class Store:
@@ -37,8 +45,25 @@ class Store:
         self.database.close()
 
 
-def open_store(settings: ServiceSettings, clock: Clock = time.time) -> Store:
-    """The store, with its tables created or brought up to date."""
+def open_store(settings: ServiceSettings, clock: Clock = time.time, patience: float = 0.0) -> Store:
+    """The store, with its tables created or brought up to date.
+
+    Args:
+        patience: seconds for which a database server that does not answer is asked again: of services that are started
+            together, some are ready before it.
+
+    Raises:
+        OperationalError: it does not answer.
+    """
     store = Store(settings, clock)
-    store.database.upgrade()
-    return store
+    until = time.monotonic() + (0.0 if store.database.sqlite else patience)
+    while True:
+        try:
+            store.database.upgrade()
+        except OperationalError as error:
+            if time.monotonic() >= until:
+                raise
+            _log.warning("the database does not answer yet: %s", type(error.orig).__name__)
+            time.sleep(_ASK_AGAIN_SECONDS)
+        else:
+            return store

@@ -38,6 +38,8 @@ _LOST_AFTER = {
 IDEMPOTENCY_SECONDS = 86_400.0
 #: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
 _LOCK = 7_347_758
+#: Upper bounds of a histogram's buckets, seconds: from a click to a day.
+BUCKETS = (1, 5, 15, 60, 300, 900, 1800, 3600, 7200, 14400, 43200, 86400)
 
 Clock = Callable[[], float]
 
@@ -89,12 +91,20 @@ class Database:
             yield connection
 
     def upgrade(self) -> None:
-        """Bring the tables to this version; of several processes that start at once one does it."""
-        if self._version() == SCHEMA:
+        """Bring the tables to this version; of several processes that start at once one does it.
+
+        Tables of a later version are used as they are: its migrations only add, so that this version's processes go on,
+        and start, while they are replaced one by one.
+        """
+        if self.is_up_to_date():
             return
         with self._upgrading():
-            if self._version() != SCHEMA:
+            if not self.is_up_to_date():
                 self._migrate()
+
+    def is_up_to_date(self) -> bool:
+        """Whether the tables are those of this version, or of a later one."""
+        return (self._version() or "") >= SCHEMA  # numbers of four digits, in the order of the migrations
 
     def ping(self) -> None:
         """Prove that the database answers; raises whatever its driver raises."""
@@ -183,6 +193,18 @@ def count(session: Session, name: str, labels: str = "", amount: float = 1.0) ->
     """Add to a counter, within the transaction of what is counted."""
     statement = _add_statement(session.get_bind().dialect.name)
     session.execute(statement, {"name": name, "labels": labels, "value": amount})
+
+
+def observe(session: Session, name: str, seconds: float) -> None:
+    """Add to a histogram, as `count`: to its sum, its number, and the one bucket that the value lies in.
+
+    Buckets are counters `NAME_bucket` with the label `le`, each without those below it; who shows them adds them up.
+    """
+    count(session, f"{name}_sum", amount=seconds)
+    count(session, f"{name}_count")
+    bound = next((bound for bound in BUCKETS if seconds <= bound), None)
+    if bound is not None:  # what is longer than all is in the number alone
+        count(session, f"{name}_bucket", f'le="{bound}"')
 
 
 @cache

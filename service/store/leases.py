@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
-from service.store.database import Database, count, upsert
+from service.store.database import Database, count, observe, upsert
 from service.store.history import keep_point
 from service.store.queue import LOST, WAITING, mine, next_job, reserve
 from service.store.quotas import count_gpu_seconds
@@ -128,8 +128,7 @@ class Leases:
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
         move(session, job, Transition.TAKE, now)
         count(session, "sgsst_attempts_total")
-        count(session, "sgsst_queue_wait_seconds_sum", amount=max(0.0, now - job.queued_at))
-        count(session, "sgsst_queue_wait_seconds_count")
+        observe(session, "sgsst_queue_wait_seconds", max(0.0, now - job.queued_at))
         return Lease(job, dispatcher, job.lease_epoch)
 
     def renew(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
@@ -223,8 +222,7 @@ class Leases:
             session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, hidden))
             job.result, job.error = result, None
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
-            count(session, "sgsst_job_seconds_sum", amount=max(0.0, now - (job.started_at or now)))
-            count(session, "sgsst_job_seconds_count")
+            observe(session, "sgsst_job_seconds", max(0.0, now - (job.started_at or now)))
             end(session, job, Transition.SUCCEED, now, self._retention)
             return unused
 
@@ -298,6 +296,7 @@ class Leases:
         _close_attempt(session, job, outcome, error, now)
         before, status = FailureCount(job.failures, job.failed_step), JobStatus(job.status)
         if error is not None and error["code"] == InfrastructureError.code:
+            count(session, "sgsst_outages_total")
             verdict = self._policy.after_outage(status, before, _outages(session, job))
         else:
             verdict = self._policy.after_attempt(outcome, status, before, job.saved_step, permanent=permanent)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 import socket
 import struct
 import time
@@ -685,10 +686,18 @@ def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, b
         assert found['sgsst_attempts_ended_total{outcome="failed"}'] == "1.0"
         assert found['sgsst_jobs_finished_total{status="failed"}'] == "1.0"
         assert found['sgsst_jobs{status="running"}'] == "2.0"
-        assert found["sgsst_queue_wait_seconds_count_total"] == "4.0"
-        assert float(found["sgsst_queue_wait_seconds_sum_total"]) >= 2000
+        assert found["sgsst_queue_wait_seconds_count"] == "4.0"
+        assert float(found["sgsst_queue_wait_seconds_sum"]) >= 2000
+        waits = {
+            float(name.split('"')[1]): float(number)
+            for name, number in found.items()
+            if name.startswith("sgsst_queue_wait_seconds_bucket")
+        }
+        # the first waited hardly, the other three (one of them twice) a thousand seconds
+        assert (waits[15.0], waits[900.0], waits[1800.0], waits[float("inf")]) == (1, 1, 4, 4)
+        assert found["sgsst_job_seconds_count"] == found["sgsst_outages_total"] == "0.0"
         assert found["sgsst_iterations_per_second"] == "5.0"
-        assert "job_" not in text, "metrics name no job"
+        assert not re.search(r"job_[0-9a-f]{11}", text), "metrics name no job"
         store.close()
 
 

@@ -1,0 +1,121 @@
+"""Memory and seconds of jobs by Gaussians and pixels, on this machine, from the planner's model. For operators.
+
+python -m benchmarks.sizing [--preset standard] [--views 50]
+
+The built-in scene is measured as for a job. What a plan would be for others follows from that by the planner's own
+model (`decide`), with these changes: a view shows half of the Gaussians, its blend weights grow as its pixels, and a
+render's seconds half as its pixels and half as the Gaussians. A dry run of a real scene is always better.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from api.cli.demo_scene import build_demo
+from sgsst_core.features.network_weights import load_network_weights
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.ply import read_scene
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.cost import RasterCost, gaussian_bytes
+from sgsst_core.planning.decide import decide
+from sgsst_core.planning.plan import Prediction
+from sgsst_core.planning.probe import Probe, equip, measure
+from sgsst_core.planning.ranks_model import probe_link
+from sgsst_core.planning.survey import Survey, survey
+from sgsst_core.scene.camera import fit_cameras
+from sgsst_core.settings import Settings, make_settings
+
+GAUSSIANS = (100_000, 500_000, 1_000_000, 4_000_000, 12_000_000)
+WIDTHS = (480, 960, 1920)
+SH_DEGREE = 3
+
+
+def measured(settings: Settings) -> Probe:
+    """The built-in scene's probe."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = build_demo(Path(folder))
+        scene, cameras = read_scene(files.ply).scene, read_cameras(files.cameras)
+    fitted = fit_cameras(cameras, settings)
+    workshop = equip(scene, fitted, settings, load_network_weights("auto"), ALONE)
+    looked = survey(workshop.scene, fitted, workshop.rasterizer, ALONE)
+    return measure(workshop, looked, probe_link(ALONE, workshop.network.device))
+
+
+def changed(probe: Probe, gaussians: int, width: int, views: int) -> Probe:
+    """A probe as another scene would have, seen in other views."""
+    height = width * 2 // 3
+    before = probe.sizes[0][0] * probe.sizes[0][1]
+    pixels = width * height / before
+    facts = replace(probe.scene, gaussians=gaussians, sh_degree=SH_DEGREE, used_degree=SH_DEGREE, held_degree=SH_DEGREE)
+    seen = torch.ones(gaussians, dtype=torch.float64)
+    whole = [Rectangle(0, 0, height, width)] * views
+    more = gaussian_bytes(SH_DEGREE) * gaussians - gaussian_bytes(probe.scene.held_degree) * probe.scene.gaussians
+    return replace(
+        probe,
+        scene=facts,
+        sizes=((height, width),) * views,
+        survey=Survey(seen, list(range(views)), whole, 0.0, shown=gaussians / 2),
+        distinct=tuple(range(views)),
+        raster=_raster(probe.raster, pixels, gaussians / probe.scene.gaussians, views / len(probe.sizes)),
+        process_bytes=probe.process_bytes + more,
+    )
+
+
+def _raster(cost: RasterCost, pixels: float, gaussians: float, views: float) -> RasterCost:
+    seconds = (pixels + gaussians) / 2
+    return replace(
+        cost,
+        seconds=cost.seconds * seconds,
+        kept_seconds=None if cost.kept_seconds is None else cost.kept_seconds * seconds,
+        bytes=None if cost.bytes is None else int(cost.bytes * pixels * views),
+        half_bytes=None if cost.half_bytes is None else int(cost.half_bytes * pixels * views),
+        keeping_seconds=None if cost.keeping_seconds is None else cost.keeping_seconds * seconds,
+        first_seconds=cost.first_seconds * seconds,
+        lists_bytes=int(cost.lists_bytes * seconds),
+    )
+
+
+def table(probe: Probe, settings: Settings, views: int) -> str:
+    """GB of a process (and of its GPU), and hours of a job; a line for each number of Gaussians."""
+    lines = [
+        f"| Gaussians | {' | '.join(f'{width}x{width * 2 // 3}' for width in WIDTHS)} |",
+        f"|---|{'---:|' * len(WIDTHS)}",
+    ]
+    for gaussians in GAUSSIANS:
+        cells = []
+        for width in WIDTHS:
+            # as much memory as a plan asks for at most: the scene's own, and a machine's usual budget beside it
+            plan = decide(changed(probe, gaussians, width, views), settings, measured=True)
+            assert plan.prediction is not None
+            cells.append(_cell(plan.prediction))
+        lines.append(f"| {gaussians / 1e6:g} million | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cell(found: Prediction) -> str:
+    memory = f"{found.peak_bytes / 1e9:.1f}"
+    if found.device_bytes is not None:
+        memory += f" + {found.device_bytes / 1e9:.1f}"
+    hours = (found.job + found.ending) / 3600
+    return f"{memory} GB, {hours:.1f} h" if hours >= 1 else f"{memory} GB, {hours * 60:.0f} min"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="Memory and seconds of jobs, from the planner's model.")
+    parser.add_argument("--preset", choices=("preview", "standard", "paper"), default="standard")
+    parser.add_argument("--views", type=int, default=50)
+    options = parser.parse_args()
+    settings = make_settings(options.preset)
+    probe = measured(settings)
+    print(table(probe, settings, options.views))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""Back up a service and restore it: its database, and the store of its files.
+
+    python deploy/backup.py save FOLDER        # beside a service that runs
+    python deploy/backup.py restore FOLDER     # into an empty database, before API and dispatchers are started
+
+with the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_...`), and for PostgreSQL `pg_dump` and
+`pg_restore` of the server's version or a later one. What FOLDER has of an earlier backup is not copied again: names of
+files are never written twice, but for unfinished uploads where the store is a local folder.
+
+Files are copied before and after the database: what its rows refer to was there at one of the two. A checkpoint that
+was made and replaced in between is missing; its job begins anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sqlite3
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from sqlalchemy import delete, inspect, select
+from sqlalchemy.engine import URL
+
+from service.errors import ServiceError
+from service.files.names import CHECKPOINT
+from service.files.objects import ObjectStore
+from service.files.stored_blobs import BLOBS
+from service.settings import ServiceSettings
+from service.store import Store
+from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow
+
+#: Files on their way at a time.
+_AT_A_TIME = 8
+#: Beside a local store of results lie inputs, and unfinished uploads, which grow.
+_LOCAL_FOLDERS, _GROWING = ("blobs", "uploads"), "uploads"
+#: What the name of a file begins with that is not yet there as a whole.
+_HALF = ".half-"
+
+
+class BackupError(Exception):
+    """What to do about it is its text."""
+
+
+def main() -> int:
+    """Returns 0 where everything was saved or restored."""
+    parser = argparse.ArgumentParser(description="Back up a service, or restore it.")
+    parser.add_argument("what", choices=("save", "restore"))
+    parser.add_argument("folder", type=Path)
+    options = parser.parse_args()
+    settings = ServiceSettings()
+    try:
+        (save if options.what == "save" else restore)(settings, options.folder)
+    except (BackupError, ServiceError, OSError, subprocess.CalledProcessError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def save(settings: ServiceSettings, folder: Path) -> None:
+    """Database and files into a folder."""
+    store = Store(settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = folder / "files"
+    copied = _copy_all(settings, files)
+    _dump(store, folder)
+    copied += _copy_all(settings, files)
+    store.close()
+    print(f"saved the database and {copied} new files in {folder}")
+
+
+def restore(settings: ServiceSettings, folder: Path) -> None:
+    """Files and database from a folder; rows of checkpoints whose files are missing go."""
+    if not (folder / "database").exists():
+        raise BackupError(f"{folder} holds no backup.")
+    store = Store(settings)
+    if inspect(store.database.engine).has_table(JobRow.__tablename__):
+        raise BackupError("The database has jobs' tables already. Restore into an empty one.")
+    places = _places(settings)
+    restored = 0
+    for name, place in places.items():
+        kept = ObjectStore(f"file://{(folder / 'files' / name).absolute()}")
+        place.make_bucket()
+        restored += _copy(kept, place)
+    _load(store, folder)
+    missing = _missing(store, places)
+    store.close()
+    print(f"restored the database and {restored} files; {len(missing)} files are missing")
+    for name in missing:
+        print(f"missing: {name}", file=sys.stderr)
+
+
+def _places(settings: ServiceSettings) -> dict[str, ObjectStore]:
+    """Where files are, by the name of their folder in a backup."""
+    store = ObjectStore(settings.artifacts_url)
+    if not store.local:
+        return {"store": store}
+    folders = {name: ObjectStore(f"file://{settings.folder / name}") for name in _LOCAL_FOLDERS}
+    return {"store": store, **folders}
+
+
+def _copy_all(settings: ServiceSettings, files: Path) -> int:
+    copied = 0
+    for name, place in _places(settings).items():
+        (files / name).mkdir(parents=True, exist_ok=True)
+        copied += _copy(place, ObjectStore(f"file://{(files / name).absolute()}"))
+    return copied
+
+
+def _copy(source: ObjectStore, target: ObjectStore) -> int:
+    """What the target has not; returns how many files that was. One that vanishes meanwhile is no longer needed."""
+    there = set() if Path(source.root).name == _GROWING else set(target.below(""))
+    wanted = sorted(name for name in source.below("") if name not in there and not Path(name).name.startswith(_HALF))
+    with ThreadPoolExecutor(_AT_A_TIME) as pool:
+        return sum(pool.map(lambda name: _copy_one(source, target, name), wanted))
+
+
+def _copy_one(source: ObjectStore, target: ObjectStore, name: str) -> bool:
+    local = source if source.local else target
+    path = Path(local.root, name)
+    try:
+        if source.local:
+            if target.local:
+                Path(target.root, name).parent.mkdir(parents=True, exist_ok=True)
+            target.put(path, name)
+        else:
+            half = path.with_name(f"{_HALF}{path.name}")
+            half.parent.mkdir(parents=True, exist_ok=True)
+            source.get(name, half)
+            half.replace(path)  # an interrupted copy is not taken for the file the next time
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _dump(store: Store, folder: Path) -> None:
+    new = folder / "database.new"
+    new.unlink(missing_ok=True)
+    if store.database.sqlite:
+        with sqlite3.connect(str(store.database.url.database)) as source, sqlite3.connect(new) as target:
+            source.backup(target)
+    else:
+        _run("pg_dump", "--format=custom", "--no-owner", f"--file={new}", url=store.database.url)
+    new.replace(folder / "database")
+
+
+def _load(store: Store, folder: Path) -> None:
+    if store.database.sqlite:
+        target_file = str(store.database.url.database)
+        with sqlite3.connect(folder / "database") as source, sqlite3.connect(target_file) as target:
+            source.backup(target)
+    else:
+        words = ("--no-owner", "--exit-on-error", "--single-transaction", str(folder / "database"))
+        _run("pg_restore", f"--dbname={store.database.url.database}", *words, url=store.database.url)
+
+
+def _run(program: str, *words: str, url: URL) -> None:
+    """A program of PostgreSQL's; where the server is it reads from its environment, the password too."""
+    where = {"PGHOST": url.host, "PGPORT": url.port, "PGUSER": url.username, "PGPASSWORD": url.password}
+    where |= {"PGDATABASE": url.database}
+    environment = {**os.environ, **{name: str(value) for name, value in where.items() if value is not None}}
+    try:
+        subprocess.run([program, *words], env=environment, check=True)
+    except FileNotFoundError as error:
+        raise BackupError(f"{program} is missing: it comes with PostgreSQL's client.") from error
+
+
+def _missing(store: Store, places: dict[str, ObjectStore]) -> list[str]:
+    """Files that rows refer to and that are not there. Rows of checkpoints among them are removed."""
+    there = {name: set(place.below("")) for name, place in places.items()}
+    remote = "blobs" not in there
+    blobs = {name.removeprefix(f"{BLOBS}/") for name in there["store"]} if remote else there["blobs"]
+    missing = []
+    with store.database.writing() as session:
+        for row in session.scalars(select(ArtifactRow)).all():
+            if row.location not in there["store"]:
+                if row.name == CHECKPOINT:
+                    session.execute(
+                        delete(ArtifactRow).where(ArtifactRow.job_id == row.job_id, ArtifactRow.name == row.name)
+                    )
+                else:
+                    missing.append(row.location)
+        missing += [row.location for row in session.scalars(select(BlobRow)) if row.location not in blobs]
+        if remote:
+            parts = session.scalars(select(UploadPartRow))
+            missing += [row.location for row in parts if row.location not in there["store"]]
+    return missing
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,22 @@
+"""Import what the programs import, so that its bytecode is in the image: its root is read-only where it runs."""
+
+from __future__ import annotations
+
+import importlib
+
+PROGRAMS = (
+    "api.cli.main",
+    "api.http.server",
+    "ray",
+    "service.inspection.process",
+    "service.prepare",
+    "service.scheduling.attempt_process",
+    "service.scheduling.dispatcher",
+    "torch.distributed",
+    "worker.execute",
+    "worker.prepare",
+    "worker.ranks.attempts",
+)
+
+for name in PROGRAMS:
+    importlib.import_module(name)

@@ -1,0 +1,1 @@
+PATH=/opt/sgsst/bin:$PATH

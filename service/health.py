@@ -1,0 +1,53 @@
+"""`python -m service.health api|dispatcher`: whether the process of this container works; exit status 1 where not.
+
+A dispatcher has no port. It is well as long as the database has heard of it within a lease's time; where the database
+itself does not answer, a restart would only lose the jobs that still run, so that the dispatcher counts as well.
+"""
+
+from __future__ import annotations
+
+import sys
+import urllib.request
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.scheduling.identity import is_of_this_machine
+from service.settings import ServiceSettings
+from service.store import Store
+
+_SECONDS = 8
+
+
+def main() -> int:
+    """Returns 0 where the process is well."""
+    settings = ServiceSettings()
+    match sys.argv[1:]:
+        case ["api"]:
+            return 0 if _answers(f"http://127.0.0.1:{settings.port}/livez") else 1
+        case ["dispatcher"]:
+            return 0 if dispatcher_is_well(Store(settings)) else 1
+    print("usage: python -m service.health api|dispatcher", file=sys.stderr)
+    return 2
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=_SECONDS) as answer:
+            return bool(answer.status == 200)
+    except OSError as error:
+        print(f"{url}: {error}", file=sys.stderr)
+        return False
+
+
+def dispatcher_is_well(store: Store) -> bool:
+    """Whether a dispatcher of this machine, or of this container, was heard of lately, or nobody can tell."""
+    try:
+        alive = store.operations.dispatchers()
+    except SQLAlchemyError as error:
+        print(f"the database does not answer: {type(error).__name__}", file=sys.stderr)
+        return True
+    return any(is_of_this_machine(row.name) for row in alive)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,52 @@
+"""`python -m service.prepare`: make what API and dispatchers share, the database's tables and the bucket for files.
+
+Once for an installation, and before the processes of a new version are started: its migrations only add, so that
+processes of the old version go on meanwhile (tests/service/store/test_migrations.py). Both the database and the store
+are waited for.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from sqlalchemy.exc import OperationalError
+
+from service.errors import StoreError
+from service.files.objects import ObjectStore
+from service.logs import set_up
+from service.settings import ServiceSettings
+from service.store import open_store
+
+_ASK_AGAIN_SECONDS = 2.0
+
+
+def main() -> int:
+    """Returns 0 where everything is there at the end."""
+    settings = ServiceSettings()
+    set_up(settings.log_format)
+    try:
+        open_store(settings, patience=settings.start_seconds).close()
+        _make_bucket(ObjectStore(settings.artifacts_url), settings.start_seconds)
+    except (OperationalError, StoreError) as error:
+        print(f"error: {error}\n{error.__cause__ or ''}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _make_bucket(objects: ObjectStore, patience: float) -> None:
+    """Make the bucket, of a store that may not answer yet."""
+    until = time.monotonic() + patience
+    while True:
+        try:
+            objects.make_bucket()
+        except StoreError:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(_ASK_AGAIN_SECONDS)
+        else:
+            return
+
+
+if __name__ == "__main__":
+    sys.exit(main())

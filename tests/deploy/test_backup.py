@@ -1,0 +1,108 @@
+"""`deploy/backup.py`: a service is saved while it works, lost with all that it had, and restored elsewhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.api.service import ROOT, Service, wait_for
+from tests.service.files.s3 import environment_of, s3_server
+from tests.service.store.test_store import _fresh_database, postgres  # noqa: F401 (a fixture)
+from tests.small_scenes import wall, write_files
+
+pytestmark = pytest.mark.slow
+PARAMETERS = {"steps_sos": 500, "steps_coarse": 0, "backbone": "vgg16", "keep_everything": True, "seed": 3}
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    with s3_server() as url:
+        yield url
+
+
+def bucket(s3: str, name: str) -> dict[str, str]:
+    """A new bucket as a service's store."""
+    assert httpx.put(f"{s3}/{name}").status_code == 200
+    return {**environment_of(s3), "SGSST_ARTIFACTS": f"s3://{name}/service"}
+
+
+def backup(environment: dict[str, str], *words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "deploy" / "backup.py"), *map(str, words)]
+    own = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    return subprocess.run(command, env=own, capture_output=True, text=True)
+
+
+def submit(client: httpx.Client, folder: Path) -> str:
+    files = zip(("scene", "cameras", "style"), write_files(folder, wall()), strict=True)
+    body = {role: (path.name, path.read_bytes()) for role, path in files}
+    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(PARAMETERS)})
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+def job(client: httpx.Client, job_id: str) -> dict[str, Any]:
+    return dict(client.get(f"/v1/jobs/{job_id}").json())
+
+
+def lose(service: Service) -> None:
+    """All processes at once."""
+    for process in service.survivors():
+        process.send_signal(signal.SIGKILL)
+    wait_for(lambda: not service.survivors(), "the end of all processes")
+
+
+@pytest.mark.parametrize("kind", ["local", "servers"])
+def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: Path, request: Any) -> None:
+    before: dict[str, str] = {}
+    after: dict[str, str] = {}
+    if kind == "servers":
+        if shutil.which("pg_dump") is None:
+            pytest.skip("pg_dump is missing: apt-get install -y postgresql-client")
+        server, s3 = request.getfixturevalue("postgres"), request.getfixturevalue("s3")
+        before = {**bucket(s3, "old"), "SGSST_DATABASE": _fresh_database(server)}
+        after = {**bucket(s3, "new"), "SGSST_DATABASE": _fresh_database(server)}
+    saved = tmp_path / "backup"
+    with Service(tmp_path / "before", **before) as service, service.client() as client:
+        done = submit(client, tmp_path)
+        wait_for(lambda: job(client, done)["status"] == "succeeded", "the first job", service.said)
+        expected = client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content
+        running = submit(client, tmp_path)
+        waiting = submit(client, tmp_path)
+        wait_for(lambda: (job(client, running)["progress"] or {}).get("step", 0) > 60, "steps", service.said)
+        for _ in range(2):  # the second adds to the first
+            ended = backup({"SGSST_DATA": str(service.data), **before}, "save", saved)
+            assert ended.returncode == 0, ended.stderr
+        assert job(client, running)["status"] == "running"
+        lose(service)
+    shutil.rmtree(tmp_path / "before")
+
+    restored = {"SGSST_DATA": str(tmp_path / "after"), **after}
+    ended = backup(restored, "restore", saved)
+    assert ended.returncode == 0, ended.stderr
+    assert "; 0 files are missing" in ended.stdout
+    assert "Restore into an empty one" in backup(restored, "restore", saved).stderr
+    with Service(tmp_path / "after", **after) as service, service.client() as client:
+        assert client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content == expected
+        for job_id in (running, waiting):
+            wait_for(lambda job_id=job_id: job(client, job_id)["status"] in ("succeeded", "failed"), "it", service.said)
+            assert job(client, job_id)["status"] == "succeeded", job(client, job_id)
+            assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content == expected
+        assert job(client, running)["attempt"] > 1
+        log = client.get(f"/v1/jobs/{running}/artifacts/log.txt").text
+        assert "resum" in log.lower() or "goes on" in log.lower(), log
+
+
+def test_a_folder_without_a_backup_is_refused(tmp_path: Path) -> None:
+    ended = backup({"SGSST_DATA": str(tmp_path / "data")}, "restore", tmp_path)
+    assert ended.returncode == 1
+    assert "holds no backup" in ended.stderr

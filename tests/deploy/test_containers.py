@@ -1,0 +1,218 @@
+"""`deploy/Dockerfile` and `deploy/compose.yaml`: built, brought up, used from outside, killed, and taken down again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.api.service import _free_port as free_port
+from tests.api.service import wait_for
+from tests.deploy.containers import COMPOSE, Containers, compose_program, containers
+from tests.small_scenes import wall, write_files
+
+pytestmark = pytest.mark.slow
+IMAGE = "docker.io/library/sgsst:cpu"
+PROJECT = "sgsst-test"
+OPTIONS = {"steps_coarse": 0, "backbone": "vgg16", "keep_everything": True, "seed": 1}
+
+
+@pytest.fixture(scope="module")
+def podman() -> Iterator[Containers]:
+    with containers() as made:
+        yield made
+
+
+class Composed:
+    """The compose file's services, under a name and a port of their own."""
+
+    def __init__(self, podman: Containers, weights: Path) -> None:
+        self.podman = podman
+        port = free_port()
+        self.url = f"http://127.0.0.1:{port}"
+        self.variables = {
+            "SGSST_ADDRESS": f"127.0.0.1:{port}",
+            "SGSST_WEIGHTS": str(weights),
+            "SGSST_MIN_FREE_BYTES": "0",
+            "SGSST_CHECKPOINT_SECONDS": "1",
+            "SGSST_LEASE_SECONDS": "10",
+        }
+        self.key = ""
+
+    def compose(self, *words: str) -> str:
+        """`podman-compose` with the file."""
+        command = [compose_program(), "--in-pod=0", "-p", PROJECT, "-f", COMPOSE, *words]
+        return self.podman.run(*command, **self.variables)
+
+    def name(self, service: str) -> str:
+        """Of a service's container."""
+        return f"{PROJECT}_{service}_1"
+
+    def kill(self, service: str) -> None:
+        """End a service's first process as a crash would: podman is not asked, and starts it again."""
+        pid = int(self.podman.run("podman", "inspect", "--format", "{{.State.Pid}}", self.name(service)))
+        os.kill(pid, signal.SIGKILL)
+
+    def said(self) -> str:
+        """The ends of all logs."""
+        names = self.podman.run("podman", "ps", "--all", "--format", "{{.Names}} {{.Status}}")
+        logs = [
+            subprocess.run(
+                ["podman", "logs", "--tail", "12", self.name(service)],
+                env=self.podman.environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            ).stdout
+            for service in ("setup", "api", "dispatcher", "database", "store")
+        ]
+        return "\n---\n".join([names, *logs])
+
+    def health(self) -> dict[str, Any]:
+        """Of `/readyz`; nothing where it does not answer."""
+        try:
+            return dict(httpx.get(f"{self.url}/readyz", timeout=5).json())
+        except (httpx.TransportError, ValueError):
+            return {}
+
+    def client(self) -> httpx.Client:
+        """With the key."""
+        return httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60)
+
+    def job(self, job_id: str) -> dict[str, Any]:
+        """A job as the API shows it; nothing where it does not answer."""
+        try:
+            with self.client() as client:
+                return dict(client.get(f"/v1/jobs/{job_id}").json())
+        except (httpx.TransportError, ValueError):
+            return {}
+
+
+@pytest.fixture(scope="module")
+def composed(podman: Containers, tiny_cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Composed]:
+    weights = tmp_path_factory.mktemp("weights")
+    shutil.copytree(tiny_cache, weights, dirs_exist_ok=True)
+    weights.chmod(0o777)  # kernels that were compiled are kept there, too
+    made = Composed(podman, weights)
+    made.compose("down", "--volumes")
+    try:
+        made.compose("up", "--detach", "--no-build", "api", "dispatcher", "setup")
+        time.sleep(3)  # what they need is not there yet
+        made.compose("up", "--detach", "--no-build")
+        wait_for(lambda: made.health().get("status") == "ok", "the composed service", made.said)
+        made.key = json.loads(
+            podman.run("podman", "exec", made.name("api"), "sgsst", "keys", "create", "alice", "--json")
+        )["key"]
+        yield made
+    finally:
+        made.compose("down", "--volumes")
+    assert PROJECT not in podman.run("podman", "ps", "--all", "--format", "{{.Names}}")
+    assert PROJECT not in podman.run("podman", "volume", "ls", "--format", "{{.Name}}")
+    assert PROJECT not in podman.run("podman", "network", "ls", "--format", "{{.Name}}")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    return write_files(tmp_path_factory.mktemp("files"), wall())
+
+
+def expected(files: tuple[Path, Path, Path], steps: int, cache: Path, out: Path) -> bytes:
+    """What `sgsst stylize` makes on this machine."""
+    ply, cameras, style = files
+    command = [sys.executable, "-m", "api.cli", "stylize", ply, "--cameras", cameras, "--style", style, "--out", out]
+    command += ["--steps-sos", str(steps), "--steps-coarse", "0", "--backbone", "vgg16", "--keep-everything"]
+    command += ["--seed", "1"]
+    # with as many threads as in the container: on another number, sums are added in another order
+    own = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment = {**own, "SGSST_CACHE": str(cache), "PYTHONPATH": str(COMPOSE.parents[1])}
+    ended = subprocess.run(list(map(str, command)), env=environment, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    return out.read_bytes()
+
+
+def test_the_image_is_small_and_has_no_rights(podman: Containers) -> None:
+    (image,) = json.loads(podman.run("podman", "image", "inspect", IMAGE))
+    assert image["Size"] < 1_600_000_000
+    assert image["Config"]["User"] == "10001:10001"
+    assert image["Labels"]["org.opencontainers.image.licenses"] == "GPL-3.0-or-later"
+    inside = ["podman", "run", "--rm", "--read-only", "--cap-drop=all", "--network=none", IMAGE, "sh", "-c"]
+    for compiler in ("cc", "gcc", "clang", "pip", "make"):
+        assert podman.run(*inside, f"command -v {compiler} || true") == ""
+    assert podman.run(*inside, "touch /opt/here 2> /dev/null || id -u").strip() == "10001"
+    # compiled beforehand: nothing has to be compiled, and kept nowhere, at each start
+    assert podman.run(*inside, "ls /opt/sgsst/lib/python3*/site-packages/api/http/__pycache__ | grep -c server").strip()
+
+
+def test_submit_from_outside_gives_what_stylize_gives(
+    composed: Composed, files: tuple[Path, Path, Path], tiny_cache: Path, tmp_path: Path
+) -> None:
+    ply, cameras, style = files
+    out = tmp_path / "stylized.ply"
+    command = [sys.executable, "-m", "api.cli", "submit", ply, "--cameras", cameras, "--style", style, "--out", out]
+    command += ["--url", composed.url, "--key", composed.key]
+    command += ["--steps-sos", "6", "--steps-coarse", "0", "--backbone", "vgg16", "--keep-everything", "--seed", "1"]
+    ended = subprocess.run(list(map(str, command)), cwd=COMPOSE.parents[1], capture_output=True, text=True)
+    assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}\n{composed.said()}"
+    assert out.read_bytes() == expected(files, 6, tiny_cache, tmp_path / "expected.ply")
+
+
+def test_without_a_key_nobody_gets_in(composed: Composed) -> None:
+    assert httpx.get(f"{composed.url}/v1/jobs").status_code == 401
+
+
+def test_health_is_that_of_the_process(composed: Composed) -> None:
+    for service in ("api", "dispatcher"):
+        assert composed.podman.succeeds("podman", "healthcheck", "run", composed.name(service)), composed.said()
+    inside = ["podman", "run", "--rm", "--network=none", "--env", "SGSST_DATABASE=sqlite:////data/x.db", IMAGE]
+    assert not composed.podman.succeeds(*inside, "python", "-m", "service.health", "api")
+
+
+def curl(composed: Composed, files: tuple[Path, Path, Path], parameters: dict[str, Any]) -> dict[str, Any]:
+    """Submit a job."""
+    ply, cameras, style = files
+    command = ["curl", "-sS", "-H", f"Authorization: Bearer {composed.key}", f"{composed.url}/v1/jobs"]
+    command += ["-F", f"scene=@{ply}", "-F", f"cameras=@{cameras}", "-F", f"style=@{style}"]
+    command += ["-F", f"parameters={json.dumps(parameters)}"]
+    return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+
+
+def seen(look: Callable[[], bool], composed: Composed, what: str) -> None:
+    wait_for(look, what, composed.said)
+
+
+@pytest.mark.parametrize("victims", [("dispatcher", "api"), ("database", "store")])
+def test_a_job_by_curl_outlives_its_containers(
+    composed: Composed, victims: tuple[str, ...], files: tuple[Path, Path, Path], tiny_cache: Path, tmp_path: Path
+) -> None:
+    if "store" in victims and "moto" in composed.podman.run("podman", "exec", composed.name("store"), "ls", "/opt"):
+        victims = ("database",)  # moto keeps everything in memory, which a store does not
+    submitted = curl(composed, files, {**OPTIONS, "steps_sos": 300})
+    assert "id" in submitted, submitted
+    job_id = submitted["id"]
+
+    def step() -> int:
+        progress = composed.job(job_id).get("progress") or {}
+        return int(progress.get("step") or 0) if progress.get("loss") else 0
+
+    seen(lambda: step() >= 20, composed, "the job's first steps")
+    for victim in victims:
+        composed.kill(victim)
+    assert step() < 300
+    seen(lambda: composed.job(job_id).get("status") in ("succeeded", "failed"), composed, "the job's end")
+    job = composed.job(job_id)
+    assert job["status"] == "succeeded", f"{job}\n{composed.said()}"
+    if "dispatcher" in victims:
+        assert job["attempt"] > 1
+    with composed.client() as client:
+        result = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
+    assert result == expected(files, 300, tiny_cache, tmp_path / "expected.ply")

@@ -1,0 +1,79 @@
+"""When a container's process counts as one that works, and what processes wait for at their start."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from service.health import dispatcher_is_well
+from service.prepare import main as prepare
+from service.scheduling.identity import is_dead, is_of_this_machine, own_name
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+
+
+def test_a_dispatcher_is_well_as_long_as_it_is_heard_of(tmp_path: Path) -> None:
+    now = 1000.0
+    store = open_store(ServiceSettings(data=tmp_path, lease_seconds=30), lambda: now)
+    assert not dispatcher_is_well(store)
+    store.operations.beat("elsewhere-01234567-1-1", 1, 1)
+    assert not dispatcher_is_well(store), "that is another machine's"
+    store.operations.beat(own_name(), 1, 1)
+    assert dispatcher_is_well(store)
+    now += 31
+    assert not dispatcher_is_well(store)
+    store.close()
+
+
+def test_a_dispatcher_is_not_to_blame_for_its_database() -> None:
+    url = "postgresql+psycopg://nobody@127.0.0.1:1/none"
+    pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
+    assert dispatcher_is_well(Store(ServiceSettings(database=url)))
+
+
+def test_names_tell_the_machine() -> None:
+    assert is_of_this_machine(own_name())
+    assert not is_dead(own_name())
+    for name in ("", "host", "host-01234567-1-1", "a-b-c-d-e"):
+        assert not is_of_this_machine(name)
+        assert not is_dead(name)
+
+
+def test_a_database_is_asked_again_for_as_long_as_the_settings_say() -> None:
+    pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
+    asked: list[float] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def refuse() -> None:
+            while True:
+                try:
+                    connection, _ = server.accept()
+                except OSError:
+                    return
+                asked.append(time.monotonic())
+                connection.close()
+
+        threading.Thread(target=refuse, daemon=True).start()
+        url = f"postgresql+psycopg://nobody@127.0.0.1:{server.getsockname()[1]}/none"
+        with pytest.raises(OperationalError):
+            open_store(ServiceSettings(database=url))
+        once = len(asked)
+        with pytest.raises(OperationalError):
+            open_store(ServiceSettings(database=url), patience=2.5)
+        assert len(asked) >= 3 * once
+
+
+def test_prepare_makes_the_tables_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path))
+    assert prepare() == prepare() == 0
+    store = Store(ServiceSettings())
+    assert store.database.is_up_to_date()
+    store.close()
+    monkeypatch.setenv("SGSST_DATABASE", "postgresql+psycopg://nobody@127.0.0.1:1/none")
+    monkeypatch.setenv("SGSST_START_SECONDS", "0")
+    assert prepare() == 1

@@ -1,0 +1,110 @@
+"""Migrations only add, so that processes of the version before go on, and start, while a new one takes over."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import Engine, inspect, text
+
+from service.store.database import MIGRATIONS, SCHEMA, Database
+from tests.api.service import ROOT, Service, wait_for
+from tests.small_scenes import wall, write_files
+
+VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9]*.py"))
+
+
+def columns(engine: Engine) -> dict[tuple[str, str], Any]:
+    """Of all tables, by table and name."""
+    found = inspect(engine)
+    return {(table, each["name"]): each for table in found.get_table_names() for each in found.get_columns(table)}
+
+
+def test_migrations_only_add(tmp_path: Path) -> None:
+    database = Database(f"sqlite:///{tmp_path / 'x.db'}")
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    config.attributes["engine"] = database.engine
+    before: dict[tuple[str, str], Any] = {}
+    for version in VERSIONS:
+        command.upgrade(config, version)
+        after = columns(database.engine)
+        tables = {table for table, _ in before}
+        for place, column in before.items():
+            assert place in after, f"{version} takes {place} away"
+            assert str(after[place]["type"]) == str(column["type"]), f"{version} changes {place}"
+            assert after[place]["nullable"] or not column["nullable"], f"{version} asks for a value of {place}"
+        for place in after.keys() - before.keys():
+            new = after[place]
+            bare = not new["nullable"] and new["default"] is None
+            assert place[0] not in tables or not bare, f"{version}: the version before writes rows without {place}"
+        before = after
+    database.close()
+
+
+def test_versions_are_numbered_in_their_order() -> None:
+    assert VERSIONS[-1] == SCHEMA
+    assert [f"{number:04d}" for number in range(1, len(VERSIONS) + 1)] == VERSIONS
+
+
+def next_version(folder: Path) -> Path:
+    """A copy of the project whose next version adds a table, a column and an index."""
+    for name in ("sgsst_core", "worker", "service"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    new = f"{int(SCHEMA) + 1:04d}"
+    source = folder / "service" / "store" / "database.py"
+    source.write_text(source.read_text().replace(f'SCHEMA = "{SCHEMA}"', f'SCHEMA = "{new}"'))
+    (folder / "service" / "store" / "migrations" / "versions" / f"{new}_next.py").write_text(
+        "import sqlalchemy as sa\nfrom alembic import op\n"
+        f'revision, down_revision = "{new}", "{SCHEMA}"\n\n\n'
+        "def upgrade():\n"
+        '    op.create_table("next", sa.Column("id", sa.Integer(), primary_key=True))\n'
+        '    op.add_column("jobs", sa.Column("next", sa.Integer(), nullable=False, server_default="7"))\n'
+        '    op.create_index("ix_jobs_next", "jobs", ["next"])\n'
+    )
+    return folder
+
+
+@pytest.mark.slow
+def test_this_version_goes_on_and_starts_on_the_next_ones_tables(tmp_path: Path, tiny_installed: Path) -> None:
+    code = next_version(tmp_path / "next")
+    files = dict(zip(("scene", "cameras", "style"), write_files(tmp_path, wall()), strict=True))
+
+    def submit(client: Any) -> str:
+        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+        parameters = {"steps_sos": 300, "steps_coarse": 0, "backbone": "vgg16", "keep_everything": True}
+        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["id"])
+
+    with Service(tmp_path / "data") as service, service.client() as client:
+        job = submit(client)
+
+        def shown(job_id: str) -> dict[str, Any]:
+            return dict(client.get(f"/v1/jobs/{job_id}").json())
+
+        wait_for(lambda: shown(job)["status"] == "running", "the job's start", service.said)
+        environment = {**os.environ, "PYTHONPATH": str(code), "SGSST_DATA": str(service.data)}
+        subprocess.run([sys.executable, "-m", "service.prepare"], env=environment, cwd=tmp_path, check=True)
+        database = Database(f"sqlite:///{service.data / 'sgsst.db'}")
+        with database.reading() as session:
+            assert session.execute(text("SELECT version_num FROM alembic_version")).scalar() > SCHEMA
+            assert session.execute(text("SELECT next FROM jobs")).scalar() == 7
+        wait_for(lambda: shown(job)["status"] in ("succeeded", "failed"), "the job's end", service.said)
+        assert shown(job)["status"] == "succeeded"
+        assert shown(job)["attempt"] == 1
+    with Service(tmp_path / "data") as service, service.client() as client:
+        second = submit(client)
+        wait_for(lambda: shown(second)["status"] in ("succeeded", "failed"), "the second job", service.said)
+        assert shown(second)["status"] == "succeeded"
+        first, other = (client.get(f"/v1/jobs/{each}/artifacts/stylized.ply").content for each in (job, second))
+        assert first == other
+    database.close()
