@@ -107,6 +107,18 @@ def test_what_one_host_takes_in_another_one_reads(fleet: Fleet) -> None:
     assert len(fleet.s3.asked) == asked
 
 
+def test_parts_are_read_without_a_copy_of_the_whole(fleet: Fleet) -> None:
+    data = os.urandom(2 * MB + 7)
+    one, two = fleet.host("one"), fleet.host("two")
+    row = fleet.store.inputs.blobs([fleet.take(one, data)]).popitem()[1]
+    for start, stop in ((0, len(data)), (MB - 1, MB + 2), (2 * MB, 2 * MB + 7), (5, 5)):
+        assert b"".join(two.read(row, start, stop)) == data[start:stop]
+    assert not [path for path in (fleet.folder / "two" / "cache").rglob("*") if path.is_file() and path.stat().st_size]
+    Artifacts(fleet.url).objects.remove(f"blobs/{row.location}")
+    with pytest.raises(FileNotFoundError):
+        list(two.read(row, 0, 5))
+
+
 def test_what_nobody_needs_leaves_the_store(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     host = fleet.host("one")
     sha256 = fleet.take(host, b"wanted by nobody")
