@@ -62,7 +62,13 @@ class Ending:
 
 
 def attempt_ending(
-    wish: Wish | None, last: Message | None, exit_code: int, log_tail: str | None, *, has_result: bool
+    wish: Wish | None,
+    last: Message | None,
+    exit_code: int,
+    log_tail: str | None,
+    *,
+    has_result: bool,
+    cluster: bool = False,
 ) -> Ending:
     """How an attempt has ended whose process is gone.
 
@@ -72,6 +78,8 @@ def attempt_ending(
         exit_code: of the process; negative for the signal that ended it.
         log_tail: what its log ends with; None where there is no log.
         has_result: whether the stylized scene is there.
+        cluster: the process only watches over ranks on a Ray cluster. Ray ends it, with a code and without a word, when
+            the cluster's head or the machine's own node dies: that is an outage.
     """
     if last is not None and last["kind"] == "done":
         if has_result:
@@ -83,7 +91,12 @@ def attempt_ending(
         return Ending(AttemptOutcome.RELEASED)
     if last is not None and last["kind"] == "failed":
         return Ending(AttemptOutcome.FAILED, last["error"], last["permanent"], last.get("detail"))
-    return Ending(AttemptOutcome.FAILED, _crash_error(exit_code, log_tail))
+    crash = _crash_error(exit_code, log_tail)
+    if cluster and exit_code > 0:
+        return Ending(
+            AttemptOutcome.FAILED, OUTAGE, detail="\n".join(text for text in (crash["message"], log_tail) if text)
+        )
+    return Ending(AttemptOutcome.FAILED, crash)
 
 
 def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:

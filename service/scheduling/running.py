@@ -142,6 +142,7 @@ class RunningAttempt:
             process.returncode,
             self._publisher.log_tail(),
             has_result=self._publisher.has_result(),
+            cluster=self._cluster,
         )
         self._conclude(found, {} if last is None else last.get("result", {}))
 

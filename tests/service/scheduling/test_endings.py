@@ -52,6 +52,17 @@ def test_an_end_that_was_wanted_is_no_failure(wish: Wish, outcome: str, last: Me
     assert ending(wish, last, code) == Ending(AttemptOutcome(outcome))
 
 
+def test_on_a_cluster_a_process_that_ray_ended_is_an_outage() -> None:
+    """When the cluster's head dies, Ray ends who is connected to it, with code 1 and without a word."""
+    found = ending(None, None, 1, "raylet has died", cluster=True)
+    assert (found.outcome, found.error, found.permanent) == (AttemptOutcome.FAILED, OUTAGE, False)
+    assert found.detail == "The process that ran the job ended with code 1.\nraylet has died"
+    for other in (ending(None, None, 1), ending(None, None, -signal.SIGKILL, cluster=True)):
+        assert other.error is not None
+        assert other.error["code"] == "crashed"
+    assert ending(None, FAILED, 1, cluster=True).error == ERROR
+
+
 @pytest.mark.parametrize("permanent", [False, True])
 def test_a_failure_is_told_as_its_process_tells_it(permanent: bool) -> None:
     last: Message = {"kind": "failed", "error": ERROR, "permanent": permanent}
