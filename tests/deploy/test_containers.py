@@ -24,6 +24,8 @@ from tests.small_scenes import wall, write_files
 pytestmark = pytest.mark.slow
 IMAGE = "docker.io/library/sgsst:cpu"
 PROJECT = "sgsst-test"
+#: Seconds.
+PATIENCE = 900.0
 OPTIONS = {"steps_coarse": 0, "backbone": "vgg16", "keep_everything": True, "seed": 1}
 
 
@@ -191,7 +193,11 @@ def curl(composed: Composed, files: tuple[Path, Path, Path], parameters: dict[st
 
 
 def seen(look: Callable[[], bool], composed: Composed, what: str) -> None:
-    wait_for(look, what, composed.said)
+    """Wait for something; kernels are compiled anew in a new container, which takes minutes on a busy machine."""
+    until = time.monotonic() + PATIENCE
+    while not look():
+        assert time.monotonic() < until, f"waited in vain for {what}\n{composed.said()}"
+        time.sleep(0.5)
 
 
 @pytest.mark.parametrize("victims", [("dispatcher", "api"), ("database", "store")])
