@@ -154,4 +154,5 @@ def containers() -> Iterator[Containers]:
             made.provide(STORE, "store")
             yield made
         finally:
+            made.run("podman", "volume", "prune", "--force", check=False)  # without a name, of images' own folders
             made.run("umount", str(Path(storage, "overlay")), check=False)
