@@ -53,8 +53,8 @@ class Composed:
 
     def compose(self, *words: str) -> str:
         """`podman-compose` with the file."""
-        command = [compose_program(), "--in-pod=0", "-p", PROJECT, "-f", COMPOSE, *words]
-        return self.podman.run(*command, **self.variables)
+        command: list[str | Path] = [compose_program(), "--in-pod=0", "-p", PROJECT, "-f", COMPOSE, *words]
+        return self.podman.run(*command, variables=self.variables)
 
     def name(self, service: str) -> str:
         """Of a service's container."""
