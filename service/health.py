@@ -6,26 +6,27 @@ itself does not answer, a restart would only lose the jobs that still run, so th
 
 from __future__ import annotations
 
+import os
 import sys
 import urllib.request
+from typing import TYPE_CHECKING
 
-from sqlalchemy.exc import SQLAlchemyError
-
-from service.scheduling.identity import is_of_this_machine
-from service.settings import ServiceSettings
-from service.store import Store
+if TYPE_CHECKING:  # asked several times a minute: what is not needed is not imported
+    from service.store import Store
 
 _SECONDS = 8
 
 
 def main() -> int:
     """Returns 0 where the process is well."""
-    settings = ServiceSettings()
     match sys.argv[1:]:
         case ["api"]:
-            return 0 if _answers(f"http://127.0.0.1:{settings.port}/livez") else 1
+            return 0 if _answers(f"http://127.0.0.1:{os.environ.get('SGSST_PORT', '8000')}/livez") else 1
         case ["dispatcher"]:
-            return 0 if dispatcher_is_well(Store(settings)) else 1
+            from service.settings import ServiceSettings
+            from service.store import Store
+
+            return 0 if dispatcher_is_well(Store(ServiceSettings())) else 1
     print("usage: python -m service.health api|dispatcher", file=sys.stderr)
     return 2
 
@@ -41,6 +42,10 @@ def _answers(url: str) -> bool:
 
 def dispatcher_is_well(store: Store) -> bool:
     """Whether a dispatcher of this machine, or of this container, was heard of lately, or nobody can tell."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from service.scheduling.identity import is_of_this_machine
+
     try:
         alive = store.operations.dispatchers()
     except SQLAlchemyError as error:

@@ -107,8 +107,8 @@ class _StoreCollector(Collector):
         for name, counter in _COUNTERS.items():
             family = CounterMetricFamily(name, counter.help, labels=[counter.label] if counter.label else None)
             values = found[f"{name}_total"]
-            for value in sorted({*counter.values, *values} if counter.label else {""}):
-                family.add_metric([value] if counter.label else [], values.get(value, 0.0))
+            for label in sorted({*counter.values, *values} if counter.label else {""}):
+                family.add_metric([label] if counter.label else [], values.get(label, 0.0))
             yield family
         for name, help_text in _HISTOGRAMS.items():
             buckets = found[f"{name}_bucket"]

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -68,10 +68,15 @@ class Containers:
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
         }
 
-    def run(self, *command: str | Path, check: bool = True, **variables: str) -> str:
+    def run(self, *command: str | Path, check: bool = True, variables: Mapping[str, str] | None = None) -> str:
         """What a command prints; it must not fail where `check` says so."""
         ended = subprocess.run(
-            command, env={**self.environment, **variables}, cwd=ROOT, capture_output=True, text=True, timeout=900
+            command,
+            env={**self.environment, **(variables or {})},
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=900,
         )
         assert ended.returncode == 0 or not check, f"{command}:\n{ended.stdout[-3000:]}\n{ended.stderr[-3000:]}"
         return ended.stdout
@@ -154,4 +159,5 @@ def containers() -> Iterator[Containers]:
             made.provide(STORE, "store")
             yield made
         finally:
+            made.run("podman", "volume", "prune", "--force", check=False)  # without a name, of images' own folders
             made.run("umount", str(Path(storage, "overlay")), check=False)

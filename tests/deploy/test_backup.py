@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,10 @@ def job(client: httpx.Client, job_id: str) -> dict[str, Any]:
     return dict(client.get(f"/v1/jobs/{job_id}").json())
 
 
+def has_ended(client: httpx.Client, job_id: str) -> bool:
+    return job(client, job_id)["status"] in ("succeeded", "failed")
+
+
 def lose(service: Service) -> None:
     """All processes at once."""
     for process in service.survivors():
@@ -63,8 +68,8 @@ def lose(service: Service) -> None:
 
 @pytest.mark.parametrize("kind", ["local", "servers"])
 def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: Path, request: Any) -> None:
-    before: dict[str, str] = {}
-    after: dict[str, str] = {}
+    before: dict[str, Any] = {}
+    after: dict[str, Any] = {}
     if kind == "servers":
         if shutil.which("pg_dump") is None:
             pytest.skip("pg_dump is missing: apt-get install -y postgresql-client")
@@ -94,7 +99,7 @@ def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: P
     with Service(tmp_path / "after", **after) as service, service.client() as client:
         assert client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content == expected
         for job_id in (running, waiting):
-            wait_for(lambda job_id=job_id: job(client, job_id)["status"] in ("succeeded", "failed"), "it", service.said)
+            wait_for(partial(has_ended, client, job_id), "its end", service.said)
             assert job(client, job_id)["status"] == "succeeded", job(client, job_id)
             assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content == expected
         assert job(client, running)["attempt"] > 1

@@ -96,7 +96,7 @@ def test_this_version_goes_on_and_starts_on_the_next_ones_tables(tmp_path: Path,
         subprocess.run([sys.executable, "-m", "service.prepare"], env=environment, cwd=tmp_path, check=True)
         database = Database(f"sqlite:///{service.data / 'sgsst.db'}")
         with database.reading() as session:
-            assert session.execute(text("SELECT version_num FROM alembic_version")).scalar() > SCHEMA
+            assert session.execute(text("SELECT version_num FROM alembic_version")).scalar_one() > SCHEMA
             assert session.execute(text("SELECT next FROM jobs")).scalar() == 7
         wait_for(lambda: shown(job)["status"] in ("succeeded", "failed"), "the job's end", service.said)
         assert shown(job)["status"] == "succeeded"
