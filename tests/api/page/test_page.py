@@ -26,7 +26,7 @@ from tests.small_scenes import cameras, wall, write_files
 pytestmark = pytest.mark.slow
 
 Visit = Callable[..., Watched]
-STEPS = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
+STEPS: dict[str, Any] = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
 #: Longer than a test looks at it.
 LONG = STEPS | {"steps_sos": 1_000_000}
 REFUSED = "the server responded with a status of 422"
