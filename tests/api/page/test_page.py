@@ -26,7 +26,7 @@ from tests.small_scenes import cameras, wall, write_files
 pytestmark = pytest.mark.slow
 
 Visit = Callable[..., Watched]
-STEPS = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
+STEPS: dict[str, Any] = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
 #: Longer than a test looks at it.
 LONG = STEPS | {"steps_sos": 1_000_000}
 REFUSED = "the server responded with a status of 422"
@@ -401,8 +401,9 @@ def test_nothing_moves_while_the_page_loads(visit: Visit) -> None:
 
 
 def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path: Path, tiny_installed: Path) -> None:
-    with Service(tmp_path / "data", SGSST_REQUIRE_KEYS="true") as service:
-        keys = [_new_key(service, name) for name in ("ann", "ben")]
+    service = Service(tmp_path / "data", SGSST_REQUIRE_KEYS="true")
+    keys = [_new_key(service, name) for name in ("ann", "ben")]
+    with service:
         job_id = submit(service, files, keys[0], name="of ann", **{"steps_sos": 10})
         ann, ben = (Watched(browser, service.url) for _ in keys)
         for watched, key in zip((ann, ben), keys, strict=True):
