@@ -58,7 +58,7 @@ def _fill(store: Store, queued: int) -> None:
 
 
 def _lease_query(store: Store) -> dict[str, float]:
-    """Milliseconds in which the next job is found: both statements together."""
+    """Milliseconds in which the next job is found: both statements together; `least` is what it takes undisturbed."""
     took: list[float] = []
     started = 0.0
 
@@ -79,7 +79,7 @@ def _lease_query(store: Store) -> dict[str, float]:
     event.remove(store.database.engine, "before_cursor_execute", before)
     event.remove(store.database.engine, "after_cursor_execute", after)
     found = sorted(took[10:])
-    return {"p50": _ms(statistics.median(found)), "p99": _ms(found[int(0.99 * len(found))])}
+    return {"least": _ms(found[0]), "p50": _ms(statistics.median(found)), "p99": _ms(found[int(0.99 * len(found))])}
 
 
 def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
