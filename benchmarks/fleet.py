@@ -71,14 +71,15 @@ def main() -> None:
     parser.add_argument("--database", action="store_true", help="measure PostgreSQL instead")
     parser.add_argument("--queued", type=int, default=10_000, help="jobs of 50 keys in the queue that is measured")
     arguments = parser.parse_args()
-    stored = _stored()
     if arguments.database:
         from benchmarks.fleet_parts.database import measure
 
-        found = stored["database"] = measure(arguments.queued, arguments.gpus, arguments.gpus // _GPUS_EACH)
+        found = measure(arguments.queued, arguments.gpus, arguments.gpus // _GPUS_EACH)
+        stored = _stored() | {"database": found}
     else:
         demand = Demand(arguments.gpus, arguments.load)
         found = simulate(demand, arguments.hours, arguments.host_days, arguments.seed, arguments.patience)
+        stored = _stored()
         stored["simulated"] = stored.get("simulated", {}) | {arguments.name: found}
     print(json.dumps(found, indent=1))
     print(write_result("fleet", stored))

@@ -38,8 +38,9 @@ from service.store.states import AttemptOutcome
 from service.store.tables import ArtifactRow, BlobRow
 from sgsst_core.errors import SettingsError
 
-#: Progress is written this often at most: more would be writes that nobody sees.
-_PROGRESS_SECONDS = 1.0
+#: Seconds between two writes of progress: in the first minute, and of a job that has run for long. More would be writes
+#: that nobody sees, and on a large fleet they are most of what the database has to do.
+_PROGRESS_SECONDS = (1.0, 5.0)
 #: A job that is canceled has so long to end its step.
 _CANCEL_SECONDS = 8.0
 #: Variables that say how many threads a process computes with; what the operator sets goes first.
@@ -74,7 +75,7 @@ class RunningAttempt:
         self._deadline: float | None = None
         self._stopped = False
         self._publisher = Publisher(lease, folder, store, artifacts, settings.preview_seconds)
-        self._progress_at = 0.0
+        self._begun_at, self._progress_at = time.monotonic(), 0.0
         self._pending: dict[str, Any] | None = None
         self._thread = threading.Thread(target=self._run, name=lease.job_id, daemon=True)
 
@@ -273,7 +274,9 @@ class RunningAttempt:
 
     def _write_progress(self, *, now: bool = False) -> None:
         moment = time.monotonic()
-        if self._pending is not None and (now or moment - self._progress_at >= _PROGRESS_SECONDS):
+        if self._pending is not None and (
+            now or moment - self._progress_at >= progress_seconds(moment - self._begun_at)
+        ):
             self._store.leases.report_progress(self.lease, self._pending)
             self._pending, self._progress_at = None, moment
 
@@ -310,6 +313,12 @@ class RunningAttempt:
     @property
     def _log_fields(self) -> dict[str, Any]:
         return {"job": self.lease.job_id, "attempt": self.lease.job.attempt}
+
+
+def progress_seconds(elapsed: float) -> float:
+    """Seconds between two writes of progress, of an attempt that has run for so long."""
+    least, most = _PROGRESS_SECONDS
+    return min(max(elapsed / 60, least), most)
 
 
 def progress_record(message: Message, attempt: int) -> dict[str, Any]:

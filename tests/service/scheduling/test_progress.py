@@ -10,7 +10,7 @@ import pytest
 
 from service.scheduling import attempt_process
 from service.scheduling.attempt_process import tell_planning, tell_prepared, tell_progress
-from service.scheduling.running import progress_record
+from service.scheduling.running import progress_record, progress_seconds
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.stylizing.loop import Progress
 from worker.description import Prepared
@@ -46,3 +46,7 @@ def test_steps_follow_where_the_job_goes_on(channel: io.StringIO, capsys: pytest
     assert (starting["stage"], starting["step"], starting["fraction"]) == ("starting", 3, 0.25)
     assert (step["stage"], step["fraction"], step["loss"], step["scales"]) == ("sos", 0.5, 0.5, [None, 0.5])
     assert "scene: 616 Gaussians" in capsys.readouterr().err
+
+
+def test_a_job_that_runs_for_long_writes_its_progress_less_often() -> None:
+    assert [progress_seconds(elapsed) for elapsed in (0, 30, 60, 120, 300, 1e6)] == [1, 1, 1, 2, 5, 5]

@@ -1,0 +1,67 @@
+"""A small fleet in simulation: nothing is lost, nobody is left waiting, and the same seed gives the same fleet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.fleet import simulate
+from benchmarks.fleet_parts.demand import KINDS, Demand, SimulatedJob
+from benchmarks.fleet_parts.simulation import Fleet
+from service.store.states import JobStatus
+
+
+def job(at: float, owner: str, factor: float = 1.0, **parameters: Any) -> SimulatedJob:
+    told = {"preset": "paper", "resolution": 980, **parameters}
+    return SimulatedJob(at, owner, "paper", told, 248_000_000, factor)
+
+
+def test_the_demand_makes_the_load_and_is_the_same_for_a_seed() -> None:
+    demand = Demand(1000, load=0.9)
+    jobs = demand.jobs(2.0, seed=3)
+    assert jobs == demand.jobs(2.0, seed=3)
+    assert len(jobs) == round(200_000 / 12)
+    asked = sum(each.seconds(1) + each.start_seconds() for each in jobs)
+    assert asked / (2 * 3600 * 1000) == pytest.approx(0.9, abs=0.12)
+    assert {each.kind for each in jobs} == {kind.name for kind in KINDS}
+    assert sum(each.owner == "key_000" for each in jobs) == round(0.05 * len(jobs))
+
+
+def test_a_small_fleet_does_all_that_it_is_asked_for() -> None:
+    found = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
+    assert found["jobs"] == found["attempts"] == round(200_000 * 0.016 / 48)
+    assert found["ended"] > 0.7 * found["jobs"]
+    assert 0.4 < found["utilisation"] <= 1
+    assert found["starved"] == found["host_failures"] == found["lost_gpu_hours"] == 0
+    again = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
+    for figures in (found, again):
+        del figures["simulated_in_seconds"]
+    assert again == found
+
+
+def test_hosts_that_fail_lose_time_and_no_job(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path, hosts=3, gpus_each=2, host_days=0.02, seed=2)
+    fleet.run([job(10.0 * number, f"key_{number % 3}") for number in range(12)], 40_000.0, 0.0)
+    records = fleet.records.values()
+    assert fleet.failures > 5
+    assert sum(record.attempts for record in records) > len(records) == 12
+    assert all(record.ended is not None for record in records)
+    assert {row.status for row in fleet.store.jobs.page(None)} == {JobStatus.SUCCEEDED}
+    assert all(0 < record.lost < record.held for record in records if record.attempts > 1)
+    fleet.store.close()
+
+
+def test_one_that_wants_a_whole_host_gets_it_and_the_others_work_on(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path, hosts=3, gpus_each=4, host_days=1e9, seed=0)
+    small = [job(float(number), "many", 0.2 + number % 5 / 2, workers=1) for number in range(60)]
+    fleet.run([*small, job(5.5, "one", workers=4)], 20_000.0, 0.0)
+    records = list(fleet.records.values())
+    (big,) = [record for record in records if record.job.owner == "one"]
+    assert big.offered == 4
+    assert big.started is not None
+    started = sorted(record.started or 0.0 for record in records if record.job.owner == "many")
+    assert big.started < started[-20], "it is not overtaken for ever"
+    assert sum(moment < big.started for moment in started) > 11, "nor do all hosts wait: two and a part were full"
+    fleet.store.close()
