@@ -17,8 +17,9 @@ import httpx
 import pytest
 
 from tests.api.service import ROOT, Service, wait_for
+from tests.postgres import fresh_database
 from tests.service.files.s3 import environment_of, s3_server
-from tests.service.store.test_store import _fresh_database, postgres  # noqa: F401 (a fixture)
+from tests.service.store.conftest import postgres  # noqa: F401 (a fixture)
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -74,8 +75,8 @@ def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: P
         if shutil.which("pg_dump") is None:
             pytest.skip("pg_dump is missing: apt-get install -y postgresql-client")
         server, s3 = request.getfixturevalue("postgres"), request.getfixturevalue("s3")
-        before = {**bucket(s3, "old"), "SGSST_DATABASE": _fresh_database(server)}
-        after = {**bucket(s3, "new"), "SGSST_DATABASE": _fresh_database(server)}
+        before = {**bucket(s3, "old"), "SGSST_DATABASE": fresh_database(server)}
+        after = {**bucket(s3, "new"), "SGSST_DATABASE": fresh_database(server)}
     saved = tmp_path / "backup"
     with Service(tmp_path / "before", **before) as service, service.client() as client:
         done = submit(client, tmp_path)
