@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,12 @@ def finished(service: Service, job_id: str) -> bool:
     return bool(job["status"] == "succeeded")
 
 
+def shown_step(page: Any) -> int:
+    """The step that a job's page tells of; 0 while it tells of something else."""
+    found = re.search(r"step (\d+)", page.locator(".state").inner_text())
+    return int(found[1]) if found else 0
+
+
 def take(
     service: Service, browser: Any, files: dict[str, Path], styles: list[Path], options: Any, folder: Path
 ) -> None:
@@ -68,10 +75,7 @@ def take(
     page.goto(f"{service.url}/#/jobs/{ids[0]}")
     page.locator(".preview img").wait_for()
     page.get_by_text("All scales · step").wait_for()
-    halfway = f"step {options.steps // 2}"
-    wait_for(
-        lambda: int(page.locator(".state").inner_text().split("step ")[1].split()[0]) >= options.steps // 2, halfway
-    )
+    wait_for(lambda: shown_step(page) >= options.steps // 2, "half of the steps")
     save(watched, "watch", folder)
     page.locator(".badge", has_text="Done").wait_for()
     page.get_by_label("Wipe", exact=True).wait_for()

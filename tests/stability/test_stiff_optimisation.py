@@ -29,7 +29,7 @@ def test_stays_within_its_bound(case: Case) -> None:
 def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
     """Why their colours run away: Adam's steps know no size."""
     stylizer = optimisation._stylizer(
-        optimisation._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05
+        optimisation._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05, bounded=False
     )
     weights = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
     before = stylizer.sh_dc.detach().clone()

@@ -27,6 +27,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.optimiser import constrained
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Loss and pixel gradient of the last picture against float64, relative.
@@ -127,7 +128,7 @@ def strain(situation: Situation) -> CaseResult:
         run(job)
     job = jobs[0]
     after = mean_loss(job.evaluate(job.evaluation_views), job.loss.weights)
-    colours, moved = job.stylized(), float((job.sh_dc.detach() - begun).abs().max())
+    colours, moved = job.stylized(), _moved(job, begun)
     judged = job.plan.surround == "background"  # else steps have another loss than what is judged
     most = job.total * job.settings.learning_rate * LONGEST_STEP
     broken = [
@@ -145,6 +146,14 @@ def strain(situation: Situation) -> CaseResult:
     error, bound, flips = twin_error(job)
     note = "; ".join(broken) or f"loss {before:.3g} to {after:.3g}; {flips} ReLU and pool decisions flipped"
     return CaseResult(math.inf if broken else error, bound, note)
+
+
+def _moved(job: Stylizer, begun: Tensor) -> float:
+    """How far a coefficient has moved at most, beside what brings colours that began beyond the bounds into them."""
+    found = job.sh_dc.detach()
+    chroma_of = begun if job.settings.keep_colours == "luminance" else None
+    within = constrained(begun, chroma_of, bounded=job.settings.bounded)
+    return float(torch.minimum((found - begun).abs(), (found - within).abs()).max())
 
 
 def twin_error(job: Stylizer) -> tuple[float, float, int]:

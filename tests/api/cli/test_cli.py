@@ -326,7 +326,7 @@ def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
 
 def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     """With next to no learning rate nothing falls: two windows of 24 steps, and the run ends."""
-    options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9"]
+    options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9", "--no-bounded"]
     assert main(files.stylize(*options)) == 0
     assert "has stopped falling" in capsys.readouterr().out
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
