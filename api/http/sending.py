@@ -64,25 +64,29 @@ class SentFile:
     read: Callable[[int, int], Iterator[bytes]]
 
 
-def file_answers(content: dict[str, Any], *, always_policy: bool = False) -> Responses:
+def file_answers(begins: dict[str, Any], *, always_policy: bool = False) -> Responses:
     """What the OpenAPI document says of answers with a file.
 
     Args:
-        content: the member `content`, by media type.
+        begins: how files of each media type begin, as examples.
         always_policy: every file has a Content-Security-Policy.
     """
+    content = {
+        kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
+        for kind, begin in begins.items()
+    }
     always = (*_SENT, "Content-Security-Policy") if always_policy else _SENT
     maybe = () if always_policy else ("Content-Security-Policy",)
     return {
         200: {
             "description": "The file. Its ETag is the SHA-256 of its content.",
             "headers": headers(*always, "Content-Length", maybe=maybe),
-            **content,
+            "content": content,
         },
         206: {
             "description": "The part that `Range` asks for.",
             "headers": headers(*always, "Content-Length", "Content-Range", maybe=maybe),
-            **content,
+            "content": content,
         },
         304: {"description": "`If-None-Match` names what is there.", "headers": headers(*always, maybe=maybe)},
     }

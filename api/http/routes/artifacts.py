@@ -6,7 +6,7 @@ import asyncio
 import re
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -65,14 +65,8 @@ _CONTENT = {
     "image/jpeg": "\xff\xd8\xff\xe0",
     "image/png": "\x89PNG\r\n\x1a\n",
 }
-_FILE: dict[str, Any] = {
-    "content": {
-        kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
-        for kind, begin in _CONTENT.items()
-    }
-}
 _ANSWERS: Responses = {
-    **file_answers(_FILE),
+    **file_answers(_CONTENT),
     **problems(
         NotFoundError(f"Job {JOB_ID} has no file 'stylized.ply' (yet). Its artifacts list has all there are."),
         NO_SUCH_RANGE,

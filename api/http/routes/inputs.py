@@ -41,14 +41,8 @@ _CONTENT: dict[str, Any] = {
     "image/png": "\x89PNG\r\n\x1a\n",
     "image/webp": "RIFF",
 }
-_FILE: dict[str, Any] = {
-    "content": {
-        kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
-        for kind, begin in _CONTENT.items()
-    }
-}
 _ANSWERS: Responses = {
-    **file_answers(_FILE, always_policy=True),
+    **file_answers(_CONTENT, always_policy=True),
     **problems(
         NotFoundError(f"Job {JOB_ID} has no input 'style:1' (any more). Its list of inputs has all there are."),
         NO_SUCH_RANGE,
