@@ -23,6 +23,7 @@ import re
 import secrets
 import shutil
 import signal
+import socket
 import statistics
 import subprocess
 import sys
@@ -97,7 +98,7 @@ class Cluster:
         self.start_services("pg")
         self.start_services("s3")
         _wait("S3", self._make_bucket)
-        _wait("PostgreSQL", lambda: self._answers("pg", PG_PORT))
+        _wait("PostgreSQL", self.database_answers)
         for name in (*APIS, "head", *NODES, *DISPATCHERS):
             self.start_services(name)
         _wait("the service", lambda: all(_ready(url) for url in self.urls))
@@ -168,10 +169,9 @@ class Cluster:
     def _make_bucket(self) -> bool:
         return httpx.put(f"{self.store['AWS_ENDPOINT_URL']}/files", trust_env=False, timeout=5).status_code == 200
 
-    def _answers(self, name: str, port: int) -> bool:
-        import socket
-
-        with socket.create_connection((self[name].address, port), timeout=2):
+    def database_answers(self) -> bool:
+        """Whether PostgreSQL takes connections."""
+        with socket.create_connection((self["pg"].address, PG_PORT), timeout=2):
             return True
 
 
@@ -235,7 +235,7 @@ class Run:
                 "GET", "/v1/jobs", params={"limit": 100, **({"cursor": cursor} if cursor else {})}
             ).json()
             found += answer["jobs"]
-            cursor = answer.get("next_cursor") or answer.get("cursor")
+            cursor = answer["next_cursor"]
             if not cursor:
                 return found
 
@@ -363,7 +363,7 @@ class Run:
         self.database_away = True
         self.cluster["pg"].call("pkill", "-INT", "-o", "postgres")
         time.sleep(1)
-        _wait("PostgreSQL", lambda: self.cluster._answers("pg", PG_PORT))
+        _wait("PostgreSQL", self.cluster.database_answers)
         time.sleep(3)
         self.database_away = False
         return {}
