@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= demo
 BIN := $(VENV)/bin
+TYPESCRIPT := $(VENV)/typescript
+TYPESCRIPT_VERSION := 5.9.3
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 # Tests run in processes of one thread each, which on small work get further than one process of several threads.
@@ -10,7 +12,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 TEST_PROCESSES ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-all test-slow lint docs clean
+.PHONY: demo test test-all test-slow lint lint-page docs clean
 
 # Stylize the built-in scene and say where the results are.
 demo: $(VENV)/installed
@@ -37,6 +39,15 @@ lint: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/pre-commit validate-config
+	@$(MAKE) --no-print-directory lint-page
+
+# The types that the page's scripts say in their comments. Only this check needs node and npm; the page does not.
+lint-page: $(VENV)/created
+	@if command -v npm > /dev/null; then \
+	  $(TYPESCRIPT)/node_modules/.bin/tsc --version 2> /dev/null | grep --quiet "$(TYPESCRIPT_VERSION)" || \
+	    npm install --silent --no-save --prefix $(TYPESCRIPT) typescript@$(TYPESCRIPT_VERSION); \
+	  $(TYPESCRIPT)/node_modules/.bin/tsc --project api/tsconfig.json; \
+	else echo "npm is not on this machine: the types of the page's scripts are not checked"; fi
 
 # The documentation as a site in site/; a link that leads nowhere is an error.
 docs: $(VENV)/installed-docs

@@ -43,6 +43,7 @@ export const whenKeyIsNeeded = (act) => void (onSignIn = act);
 export async function ask(method, path, { body, json, headers = {}, signal } = {}) {
   let answer;
   const sent = json === undefined ? body : JSON.stringify(json);
+  /** @type {Record<string, string>} */
   const kind = json === undefined ? {} : { "Content-Type": "application/json" };
   try {
     answer = await fetch(path, { method, body: sent, headers: { ...kind, ...headers }, signal, credentials: "same-origin" });

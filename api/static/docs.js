@@ -1,7 +1,8 @@
+// @ts-check
 // The API's documentation, shown by Swagger UI (vendor/swagger-ui).
 "use strict";
 
-/* global SwaggerUIBundle */
+const { SwaggerUIBundle } = /** @type {any} */ (window);
 SwaggerUIBundle({
   url: "/openapi.json",
   dom_id: "#api",

@@ -131,7 +131,9 @@ function give(rows, bytes, header) {
  * @returns {{centre: number[], radius: number, low: number[], high: number[]}}
  */
 function middle() {
-  const step = Math.max(1, Math.floor(count / 20000)), picked = [];
+  const step = Math.max(1, Math.floor(count / 20000));
+  /** @type {number[]} */
+  const picked = [];
   for (let i = 0; i < count; i += step) if (reach[i] > 0) picked.push(i);
   const along = [0, 1, 2].map((axis) => Float64Array.from(picked, (i) => centres[3 * i + axis]).sort());
   const quantile = (/** @type {ArrayLike<number>} */ values, /** @type {number} */ share) => values[Math.floor(share * (values.length - 1))] ?? 0;

@@ -16,6 +16,16 @@ const STILL = 160;
 const INK = [0.98, 0.6, 0.28, 0.55];
 
 export class Viewer {
+  /** A program for each degree of harmonics and depth of their textures. @type {Map<number, Program>} */
+  splatPrograms = new Map();
+  /** What is blended into. @type {WebGLFramebuffer | null} */
+  frame = null;
+  /** @type {WebGLTexture | null} */
+  picture = null;
+  pictureSize = [0, 0];
+  /** What the camera was last set to show whole. @type {SplatScene["middle"]} */
+  framed = null;
+
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {() => void} told the state has changed
@@ -57,7 +67,6 @@ export class Viewer {
     const { gl } = this;
     this.exact = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     gl.getExtension("OES_texture_float_linear");
-    /** @type {Map<number, Program>} */
     this.splatPrograms = new Map();
     this.compose = this.program(wholeVertex, overBackground);
     this.line = this.program(lineVertex, lineFragment);
@@ -294,9 +303,8 @@ export class Viewer {
     const own = scene.colours.get("own");
     if (!scene.drawn || !own) return;
     const key = scene.degree * 100 + scene.bits;
-    let splat = this.splatPrograms?.get(key);
-    if (!splat) this.splatPrograms?.set(key, (splat = this.program(splatVertex(scene.degree, scene.bits), splatFragment)));
-    const { program, at } = splat;
+    const { program, at } = this.splatPrograms.get(key) ?? this.program(splatVertex(scene.degree, scene.bits), splatFragment);
+    this.splatPrograms.set(key, { program, at });
     gl.useProgram(program);
     this.setView(at, width, height);
     gl.uniform2f(at("fade"), 1 - (left.fade ?? 0), 1 - (right.fade ?? 0));
@@ -390,7 +398,7 @@ export class Viewer {
   restore() {
     this.lost = false;
     this.prepare();
-    this.framed = undefined;
+    this.framed = null;
     const before = this.sides;
     this.sides = null;
     if (before) this.onReload?.(before);
