@@ -28,7 +28,8 @@ class Event(Protocol):
 
 
 class Timer:
-    """Adds up seconds by name. Nested blocks count for the inner name only, so that the sum is the whole.
+    """Adds up seconds by name. Nested blocks count for the inner name only, so that the sum is the whole; within a
+    whole block they count for its name.
 
     A GPU works behind the program: what is measured there is when it began and ended a block's work, not when the
     program gave it. Nothing waits for it until `read`.
@@ -47,21 +48,26 @@ class Timer:
             event = partial(torch.cuda.Event, enable_timing=True)
         self._event = event
         self._open: list[str] = []
+        self._whole: str | None = None
         self._since: Event | None = None
         self._since_clock = 0.0
         #: Name, begin and end of what was marked and not yet read.
         self._marked: list[tuple[str, Event, Event]] = []
 
     @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Time a block."""
+    def __call__(self, name: str, *, whole: bool = False) -> Iterator[None]:
+        """Time a block; whole: with the blocks in it."""
         self._switch()
-        self._open.append(name)
+        outer = self._whole
+        self._open.append(outer or name)
+        if whole:
+            self._whole = self._open[-1]
         try:
             yield
         finally:
             self._switch()
             self._open.pop()
+            self._whole = outer
 
     def clear(self) -> None:
         """Forget everything that was measured so far; blocks that are open count from here."""

@@ -77,7 +77,7 @@ export class ResultStage {
       this.original = scene;
       this.choices.set("original", { name: say.original, side: { scene, colours: "own" } });
     } catch {
-      scene.end(); // compressed: what came out of it is shown alone
+      scene.end(); // a form that cannot be shown: what came out of it is shown alone
       viewer.sides = null;
     }
   }

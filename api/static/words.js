@@ -41,10 +41,11 @@ export const words = {
     status: (/** @type {number} */ status) => `The service answered ${status}.`,
   },
   scene: {
+    notScene: "This is no scene: no PLY, SPZ or .splat file.",
     notPly: "This is not a PLY file.",
     notBinary: "Only binary little-endian PLY can be shown here. The service may still read it.",
     notGaussians: "This PLY holds no 3D Gaussians that can be shown here.",
-    packed: "A compressed scene is shown once it is stylized. It can be sent as it is.",
+    newSpz: "SPZ of this version cannot be shown here. It can be sent as it is, and is shown once it is stylized.",
     cut: "The file ends too early.",
     unreadable: "The scene could not be read.",
     notThere: "The scene could not be fetched.",

@@ -3,7 +3,8 @@
 On GPUs a job has its GPUs to itself. One that names no number of `workers` is offered its part of those that are free,
 all of them where no other job waits, one where many do, but never more than a job of its size is worth
 (`service.scheduling.job_size`). The plan, made with measured times, then takes as many as make the job faster, and the
-rest are given back (see `service.scheduling.running`).
+rest are given back (see `service.scheduling.running`). Memory of the machine is counted too: a job waits where those that
+run leave too little for its scene. A Ray cluster's machines are Ray's to look after.
 
 Without GPUs, places stand for parts of the processor and of the memory. There is one, unless the operator wants several
 jobs side by side: one job uses all cores well. A job that needs more memory than a place has takes several.
@@ -27,6 +28,10 @@ _MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
 #: had 5.8 GB at its peak, one of 50,000 had 0.95 GB.
 _LEAST_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
+#: On GPUs, memory of the machine that a rank takes beside the scene (CUDA's and PyTorch's libraries, pinned buffers),
+#: and how often the bytes of the scene's file: as it was read, and as it is laid out for all ranks.
+_RANK_MEMORY = 3_000_000_000
+_SCENE_COPIES_BESIDE_GPUS = 2
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,7 @@ class Grant:
         places: of those for jobs side by side.
         threads: of the processor; None for all.
         memory: bytes to plan with; None for what a job that is alone takes.
+        scene: bytes that the scene of a job on GPUs takes in the machine's memory, once for all ranks.
     """
 
     ranks: int
@@ -46,6 +52,12 @@ class Grant:
     places: int = 1
     threads: int | None = None
     memory: int | None = None
+    scene: int = 0
+
+    @property
+    def beside_gpus(self) -> int:
+        """Bytes of the machine's memory that a job on GPUs is counted with."""
+        return self.ranks * _RANK_MEMORY + self.scene if self.gpus else 0
 
 
 class Room:
@@ -83,7 +95,7 @@ class Room:
             return None
         asked = _asked(job, "workers")
         if self._machine.gpus:
-            return self._on_gpus(job, asked, self._free_gpus(held), min(max(waiting, 1), places))
+            return self._on_gpus(job, asked, held, min(max(waiting, 1), places))
         return self._on_cores(job, asked or 1, places)
 
     def _free_gpus(self, held: list[Grant]) -> list[str]:
@@ -93,26 +105,38 @@ class Room:
     def _free_places(self, held: list[Grant]) -> int:
         return self._places - sum(grant.places for grant in held)
 
-    def _on_gpus(self, job: JobRow, asked: int, free: list[str], sharers: int) -> Grant | None:
+    def _on_gpus(self, job: JobRow, asked: int, held: list[Grant], sharers: int) -> Grant | None:
+        free = self._free_gpus(held)
         if asked:
             ranks = min(asked, len(self._machine.gpus))
         else:
             share = max(1, len(free) // sharers)
             ranks = estimated_size(job.parameters, job.inputs).gpus(share) if share > 1 else 1
-        return Grant(ranks, tuple(free[:ranks])) if ranks <= len(free) else None
+        if ranks > len(free):
+            return None
+        scene = 0 if self._machine.cluster else _SCENE_COPIES_BESIDE_GPUS * _scene_bytes(job)
+        grant = Grant(ranks, tuple(free[:ranks]), scene=scene)
+        if not held or self._machine.cluster:  # one that is alone may try
+            return grant
+        together = sum(each.beside_gpus for each in (grant, *held))
+        return grant if together <= _MEMORY_SHARE * self._machine.memory else None
 
     def _on_cores(self, job: JobRow, ranks: int, free: int) -> Grant | None:
         if self._places == 1 or self._machine.cluster:
             return Grant(ranks)
         share = _MEMORY_SHARE * self._machine.memory / self._places
         asked = _asked(job, "memory_limit")
-        scene = _SCENE_COPIES * sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
+        scene = _SCENE_COPIES * _scene_bytes(job)
         places = min(math.ceil((scene + (asked or _LEAST_MEMORY)) / share), self._places)
         if places > free:
             return None
         limit = max(int(min(_JOB_SHARE * self._machine.memory, places * share - scene)), _LEAST_MEMORY)
         threads = max(1, self._machine.cores * places // self._places)
         return Grant(ranks, (), places, threads, min(asked or limit, limit))
+
+
+def _scene_bytes(job: JobRow) -> int:
+    return sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
 
 
 def _asked(job: JobRow, name: str) -> int:

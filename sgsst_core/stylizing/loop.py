@@ -178,10 +178,12 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
     """Make a step and count what it took, but for the style, which comes once."""
-    before = stylizer.seconds - stylizer.style_seconds
+    before, style_before = stylizer.seconds, stylizer.style_seconds
     record = stylizer.run_step()
-    seconds = stylizer.seconds - stylizer.style_seconds - before
-    pace.add_step(record.stage, stylizer.latest, seconds, record.parts.get("prepare", 0.0))
+    style = stylizer.style_seconds - style_before
+    seconds = stylizer.seconds - before - style
+    prepared = max(record.parts.get("prepare", 0.0) - style, 0.0)
+    pace.add_step(record.stage, stylizer.latest, seconds, prepared)
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:

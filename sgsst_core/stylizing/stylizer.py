@@ -411,7 +411,7 @@ class Stylizer:
         for place, index in enumerate(own_views):
             scales = phase.scales(self.scales(index))
             behind = self.behind(index)
-            with self.timer("prepare"):
+            with self.timer("prepare", whole=True):
                 target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])

@@ -86,6 +86,17 @@ def test_nested_blocks_count_for_the_inner_name(monkeypatch: pytest.MonkeyPatch)
     assert timer.read() == SECONDS
 
 
+def test_blocks_within_a_whole_one_count_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(float(2**step) for step in range(12))
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    timer = Timer()
+    with timer("outer"), timer("whole", whole=True), timer("inner"), timer("innermost"):
+        pass
+    with timer("inner"):
+        pass
+    assert timer.seconds == {"outer": 2**1 - 2**0 + 2**7 - 2**6, "whole": 2**6 - 2**1, "inner": 2**9 - 2**8}
+
+
 def test_a_devices_seconds_are_its_own() -> None:
     """The program gives the work at once: by its clock hardly any time passes."""
     stream = Stream()

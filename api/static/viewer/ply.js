@@ -1,94 +1,98 @@
 // @ts-check
-/** The header of a PLY as the code of 3D Gaussian Splatting writes it. */
+/** PLY: its header, and Gaussians as the code of 3D Gaussian Splatting writes them. */
+import { SceneError } from "./byte_reader.js";
+import { BATCH } from "./packing.js";
 import { words } from "../words.js";
 
+/** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
+/** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 /**
  * @typedef {{offset: number, type: string}} Column where a value stands in a row, bytes
- * @typedef {{count: number, degree: number, stride: number, begin: number, columns: Record<string, Column>,
- *   floats: boolean}} Header
- *   `begin`: bytes of the header; `floats`: every value is a float32
+ * @typedef {{name: string, count: number, stride: number, columns: Record<string, Column>}} Element `stride`: bytes of a row
+ * @typedef {{begin: number, elements: Element[]}} Header `begin`: bytes of the header
  */
-
-/** A file that cannot be shown; the message is for people. */
-export class SceneError extends Error {}
 
 const SIZES = /** @type {Record<string, number>} */ ({
   char: 1, uchar: 1, int8: 1, uint8: 1, short: 2, ushort: 2, int16: 2, uint16: 2,
   int: 4, uint: 4, int32: 4, uint32: 4, float: 4, float32: 4, double: 8, float64: 8,
 });
 const NEEDED = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
-const DEGREES = /** @type {Record<number, number>} */ ({ 0: 0, 9: 1, 24: 2, 45: 3 });
+/** Degree by the number of coefficients above degree 0. */
+export const DEGREES = /** @type {Record<number, number>} */ ({ 0: 0, 9: 1, 24: 2, 45: 3 });
 /** No header is longer. */
-export const LONGEST_HEADER = 1 << 16;
+const LONGEST_HEADER = 1 << 16;
 
 /**
- * @param {Uint8Array} bytes the beginning of a file
- * @returns {Header | null} null where the header goes on behind them
+ * @param {ByteReader} reader at the beginning of a PLY; behind its header afterwards
+ * @returns {Promise<Header>}
  */
-export function readHeader(bytes) {
-  const text = new TextDecoder("latin1").decode(bytes.subarray(0, LONGEST_HEADER));
-  if (!text.startsWith("ply".slice(0, text.length))) throw new SceneError(words.scene.notPly);
-  const end = /end_header\r?\n/.exec(text);
-  if (!end) {
-    if (text.length >= LONGEST_HEADER) throw new SceneError(words.scene.notPly);
-    return null;
+export async function readHeader(reader) {
+  for (let size = 4096; ; size *= 2) {
+    const text = new TextDecoder("latin1").decode(await reader.peek(size));
+    const end = /end_header\r?\n/.exec(text);
+    if (end) {
+      const begin = end.index + end[0].length;
+      await reader.take(begin);
+      return { begin, elements: elementsOf(text.slice(0, end.index).split(/\r?\n/)) };
+    }
+    if (text.length < size) throw new SceneError(words.scene.cut);
+    if (size >= LONGEST_HEADER) throw new SceneError(words.scene.notPly);
   }
-  return parseHeader(text.slice(0, end.index).split(/\r?\n/), end.index + end[0].length);
 }
 
 /**
  * @param {string[]} lines
- * @param {number} begin
- * @returns {Header}
+ * @returns {Element[]}
  */
-function parseHeader(lines, begin) {
+function elementsOf(lines) {
   if (!lines.includes("format binary_little_endian 1.0")) throw new SceneError(words.scene.notBinary);
-  const columns = /** @type {Record<string, Column>} */ ({});
-  let count = -1, stride = 0, rest = 0, floats = true, element = "";
+  /** @type {Element[]} */
+  const elements = [];
   for (const line of lines) {
-    const [keyword, kind, name] = line.trim().split(/\s+/);
-    if (keyword === "element") {
-      if (kind === "vertex") count = Number(name);
-      else if (count < 0) throw new SceneError(words.scene.notGaussians);
-      element = kind;
-    } else if (keyword === "property" && element === "vertex") {
-      if (!SIZES[kind]) throw new SceneError(words.scene.notGaussians);
-      columns[name] = { offset: stride, type: kind };
-      stride += SIZES[kind];
-      floats &&= kind === "float" || kind === "float32";
-      if (name.startsWith("f_rest_")) rest++;
+    const [keyword, kind, name] = line.trim().split(/\s+/), element = elements[elements.length - 1];
+    if (keyword === "element") elements.push({ name: kind, count: Number(name), stride: 0, columns: {} });
+    else if (keyword === "property" && element) {
+      element.columns[name] = { offset: element.stride, type: kind };
+      element.stride += SIZES[kind] ?? NaN; // a list: its rows have no size
     }
   }
-  if (columns.packed_position) throw new SceneError(words.scene.packed);
-  if (!(count > 0) || NEEDED.some((name) => !columns[name]) || !(rest in DEGREES)) throw new SceneError(words.scene.notGaussians);
-  return { count, degree: DEGREES[rest], stride, begin, columns, floats };
+  return elements;
 }
 
-/** Float32 values of rows, whatever types they are stored as. */
-export class Rows {
-  /** @param {Header} header */
-  constructor(header) {
-    this.header = header;
-    this.names = Object.keys(header.columns);
-    /** Values of a row. */
-    this.width = this.names.length;
-    this.at = Object.fromEntries(this.names.map((name, place) => [name, place]));
-  }
+/**
+ * @param {ByteReader} reader behind the header
+ * @param {Header} header
+ * @returns {SceneFile}
+ */
+export function plainPly(reader, { elements }) {
+  const [vertex] = elements, names = Object.keys(vertex?.columns ?? {}), rest = names.filter((name) => name.startsWith("f_rest_")).length;
+  const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name]);
+  if (wrong || !(rest in DEGREES)) throw new SceneError(words.scene.notGaussians);
+  return {
+    count: vertex.count, degree: DEGREES[rest], width: names.length,
+    at: Object.fromEntries(names.map((name, place) => [name, place])),
+    async *batches() {
+      for (let begin = 0; begin < vertex.count; begin += BATCH) {
+        yield floats(vertex, await reader.take(Math.min(BATCH, vertex.count - begin) * vertex.stride));
+      }
+    },
+  };
+}
 
-  /**
-   * @param {Uint8Array} bytes whole rows, beginning at a multiple of 4 of their buffer
-   * @returns {Float32Array}
-   */
-  values(bytes) {
-    if (this.header.floats) return new Float32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4);
-    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength), { stride, columns } = this.header;
-    const count = bytes.byteLength / stride, found = new Float32Array(count * this.width);
-    this.names.forEach((name, place) => {
-      const { offset, type } = columns[name];
-      for (let row = 0; row < count; row++) found[row * this.width + place] = stored(view, row * stride + offset, type);
-    });
-    return found;
-  }
+/**
+ * Rows as float32, whatever types they are stored as.
+ *
+ * @param {Element} element
+ * @param {Uint8Array} bytes whole rows, at the beginning of their buffer
+ */
+export function floats({ stride, columns }, bytes) {
+  const all = Object.values(columns);
+  if (all.every(({ type }) => type === "float" || type === "float32")) return new Float32Array(bytes.buffer, 0, bytes.length / 4);
+  const view = new DataView(bytes.buffer), count = bytes.length / stride, found = new Float32Array(count * all.length);
+  all.forEach(({ offset, type }, place) => {
+    for (let row = 0; row < count; row++) found[row * all.length + place] = stored(view, row * stride + offset, type);
+  });
+  return found;
 }
 
 /**

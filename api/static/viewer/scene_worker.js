@@ -1,11 +1,12 @@
 // @ts-check
 /** Reads a scene as it arrives, hands it over in batches, and sorts it for the viewer. */
+import { ByteReader, SceneError } from "./byte_reader.js";
 import { depthOrder } from "./depth_order.js";
-import { BATCH, pack } from "./packing.js";
-import { LONGEST_HEADER, readHeader, Rows, SceneError } from "./ply.js";
+import { pack } from "./packing.js";
+import { openScene } from "./scene_file.js";
 import { words } from "../words.js";
 
-/** @typedef {import("./ply.js").Header} Header */
+/** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 const port = /** @type {any} */ (self);
 let centres = new Float32Array(0), reach = new Float32Array(0), count = 0, degree = 0;
@@ -29,21 +30,14 @@ port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
  * @param {{texels: number, bytes: number}} room texels of a texture, and bytes of all, at most
  */
 async function load(source, room) {
-  const [stream, size] = await opened(source);
-  const reader = stream.getReader();
-  let head = new Uint8Array(0), header = /** @type {Header | null} */ (null);
-  while (!header) {
-    const { value, done } = await reader.read();
-    if (done) throw new SceneError(words.scene.cut);
-    head = joined(head, value);
-    header = readHeader(head);
-    if (!header && head.length > LONGEST_HEADER) throw new SceneError(words.scene.notPly);
-  }
-  degree = keptDegree(header, room);
-  centres = new Float32Array(header.count * 3);
-  reach = new Float32Array(header.count);
-  port.postMessage({ kind: "header", header: { count: header.count, degree: header.degree, size }, degree });
-  await readRows(reader, header, head.subarray(header.begin));
+  const [stream, size] = await opened(source), reader = new ByteReader(stream);
+  const file = await openScene(reader, size);
+  degree = keptDegree(file, room);
+  centres = new Float32Array(file.count * 3);
+  reach = new Float32Array(file.count);
+  port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size }, degree });
+  for await (const rows of file.batches()) give(rows, file);
+  reader.end();
   port.postMessage({ kind: "done", middle: middle() });
 }
 
@@ -61,60 +55,26 @@ async function opened(source) {
 /**
  * The degree of which all fits.
  *
- * @param {Header} header
+ * @param {SceneFile} file
  * @param {{texels: number, bytes: number}} room
  */
-function keptDegree(header, { texels, bytes }) {
+function keptDegree(file, { texels, bytes }) {
   const fits = (/** @type {number} */ d) => {
     const each = Math.ceil((((d + 1) ** 2 - 1) * 3) / 8);
-    return header.count * Math.max(each, 2) <= texels && header.count * (48 + 16 * each) <= bytes;
+    return file.count * Math.max(each, 2) <= texels && file.count * (48 + 16 * each) <= bytes;
   };
-  let kept = header.degree;
+  let kept = file.degree;
   while (kept > 0 && !fits(kept)) kept--;
-  if (header.count * 2 > texels) throw new SceneError(words.scene.tooMany(header.count));
+  if (file.count * 2 > texels) throw new SceneError(words.scene.tooMany(file.count));
   return kept;
 }
 
 /**
- * @param {ReadableStreamDefaultReader<Uint8Array>} reader
- * @param {Header} header
- * @param {Uint8Array} rest behind the header
+ * @param {Float32Array} rows
+ * @param {SceneFile} file
  */
-async function readRows(reader, header, rest) {
-  const rows = new Rows(header);
-  let batch = batchOf(header, 0), filled = 0, chunk = rest;
-  for (;;) {
-    while (chunk.length && count < header.count) {
-      const taken = Math.min(chunk.length, batch.length - filled);
-      batch.set(chunk.subarray(0, taken), filled);
-      chunk = chunk.subarray(taken);
-      filled += taken;
-      if (filled < batch.length) break;
-      give(rows, batch, header);
-      batch = batchOf(header, count);
-      filled = 0;
-    }
-    if (count >= header.count) break;
-    const { value, done } = await reader.read();
-    if (done) throw new SceneError(words.scene.cut);
-    chunk = value;
-  }
-  reader.cancel().catch(() => {});
-}
-
-/**
- * @param {Header} header
- * @param {number} begin
- */
-const batchOf = (header, begin) => new Uint8Array(Math.min(BATCH, header.count - begin) * header.stride);
-
-/**
- * @param {Rows} rows
- * @param {Uint8Array} bytes
- * @param {Header} header
- */
-function give(rows, bytes, header) {
-  const packed = pack(rows.values(bytes), rows.width, rows.at, header.degree, degree);
+function give(rows, file) {
+  const packed = pack(rows, file.width, file.at, file.degree, degree);
   centres.set(packed.centres, count * 3);
   reach.set(packed.reach, count);
   const begin = count;
@@ -143,15 +103,4 @@ function middle() {
     centre, radius: Math.max(quantile(away, 0.9), 1e-6),
     low: along.map((values) => quantile(values, 0.05)), high: along.map((values) => quantile(values, 0.95)),
   };
-}
-
-/**
- * @param {Uint8Array} a
- * @param {Uint8Array} b
- */
-function joined(a, b) {
-  const both = new Uint8Array(a.length + b.length);
-  both.set(a);
-  both.set(b, a.length);
-  return both;
 }

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+import torch
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.ply import read_scene, write_packed
+from sgsst_core.files.quantised import SH_C0
+from sgsst_core.files.scene_headers import SPLAT_BYTES, splat_rows
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
@@ -56,6 +60,72 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
         found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
         assert psnr(found, rendered(tmp_path / "scene.ply", camera)) >= FAITHFUL, camera.name
     watched.check()
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [("compressed.ply", "playbot_synthetic_sh2"), ("spz", "snowmiku_plush"), ("splat", "biker")],
+)
+def test_packed_scenes_are_shown(
+    visit: Visit, shared_data: Path, tmp_path: Path, form: Literal["compressed.ply", "spz", "splat"], name: str
+) -> None:
+    scene, views = real_scene(shared_data, name)
+    ply, _, _ = write_files(tmp_path, scene, views)
+    ply.unlink()  # the browser and `sgsst render` see the packed scene alone; its name tells nothing
+    if form == "splat":
+        ply.write_bytes(splat_bytes(scene))
+    else:
+        write_packed(tmp_path / f"scene.{form}", scene, form)
+        (tmp_path / f"scene.{form}").rename(ply)
+    watched = visit("/#/jobs")
+    for camera in views[:2]:
+        found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
+        assert psnr(found, rendered(ply, camera)) >= FAITHFUL, camera.name
+    watched.check()
+
+
+def splat_bytes(scene: Scene) -> bytes:
+    """A .splat, of which there is no writer."""
+    rows = splat_rows(np.zeros(len(scene) * SPLAT_BYTES, np.uint8))
+    rows.flags.writeable = True
+    quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
+    shown = torch.cat([scene.sh_dc * SH_C0 + 0.5, scene.opacities.sigmoid()[:, None]], dim=1)
+    rows["position"], rows["scale"] = scene.means.numpy(), scene.scales.exp().numpy()
+    rows["colour"] = (shown * 255).round().clamp(0, 255).numpy()
+    rows["rotation"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
+    return rows.tobytes()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int) -> None:
+    scene = wall()
+    ply, _, _ = write_files(tmp_path, scene)
+    ply.write_bytes(old_spz(scene, version))
+    watched, camera = visit("/#/jobs"), cameras()[0]
+    found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
+    assert psnr(found, rendered(ply, camera)) >= FAITHFUL
+    watched.check()
+
+
+def old_spz(scene: Scene, version: int) -> bytes:
+    """SPZ as the first two versions had it, without spherical harmonics; y up."""
+    flip = np.array([1, -1, -1])
+    means = scene.means.double().numpy() * flip
+    fixed = np.rint(means * 2**12).astype("<i4")
+    position = (
+        means.astype("<f2").tobytes() if version == 1 else fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].tobytes()
+    )
+    quats = (scene.quats / scene.quats.norm(dim=1, keepdim=True)).double().numpy()
+    vectors = quats[:, 1:] * np.where(quats[:, :1] < 0, -1, 1) * flip
+    parts = [
+        scene.opacities.sigmoid().numpy() * 255,
+        (scene.sh_dc.numpy() * 0.15 + 0.5) * 255,
+        (scene.scales.numpy() + 10) * 16,
+        (vectors + 1) * 127.5,
+    ]
+    packed = [np.clip(np.rint(part), 0, 255).astype(np.uint8).tobytes() for part in parts]
+    head = struct.pack("<4sIIBBBB", b"NGSP", version, len(scene), 0, 12, 0, 0)
+    return gzip.compress(b"".join([head, position, *packed]))
 
 
 def test_less_memory_shows_fewer_harmonics_and_says_so(visit: Visit, tmp_path: Path) -> None:
@@ -183,7 +253,10 @@ def test_nothing_is_drawn_while_nothing_changes(visit: Visit, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"no ply at all", "This is not a PLY file."),
+        (b"no scene at all", "This is no scene"),
+        (b"ply" + bytes(70_000), "This is not a PLY file."),
+        (b"NGSP" + bytes(60), "SPZ of this version"),
+        (gzip.compress(b"no scene, but text that somebody has packed"), "This is no scene"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
             "Only binary little-endian PLY",

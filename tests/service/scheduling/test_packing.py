@@ -172,6 +172,34 @@ def test_no_more_jobs_than_the_operator_wants(tmp_path: Path) -> None:
     queue.store.close()
 
 
+def test_jobs_on_gpus_wait_for_memory_of_the_machine() -> None:
+    room = Room(machine(8), None)
+    alone = room.grant(job(200 * GB, workers=1), [], 1)
+    assert alone is not None, "were it too big: it may try"
+    assert alone.beside_gpus == 3 * GB + 400 * GB
+    first = room.grant(job(20 * GB, workers=4), [], 9)
+    assert first is not None
+    assert first.beside_gpus == 4 * 3 * GB + 40 * GB
+    assert room.grant(job(15 * GB, workers=1), [first], 9) is None, "52 + 33 GB are more than four fifths of 100 GB"
+    second = room.grant(job(10 * GB, workers=1), [first], 9)
+    assert second is not None
+    assert second.gpus == ("gpu4",)
+    fewer = replace(first, ranks=1, gpus=first.gpus[:1])
+    assert fewer.beside_gpus == 3 * GB + 40 * GB, "what the plan does without counts no more"
+
+
+@given(st.lists(st.tuples(st.integers(1, 60 * GB), st.integers(1, 8)), max_size=12))
+def test_jobs_on_gpus_never_take_more_memory_than_there_is(jobs: list[tuple[int, int]]) -> None:
+    held: list[Any] = []
+    room = Room(machine(8), None)
+    for scene, workers in jobs:
+        grant = room.grant(job(scene, workers=workers), held, len(jobs))
+        if grant is not None:
+            held.append(grant)
+    assert bool(held) == bool(jobs), "the first one always runs, were it too big"
+    assert len(held) < 2 or sum(grant.beside_gpus for grant in held) <= 80 * GB
+
+
 def test_without_gpus_one_job_at_a_time_has_the_machine(tmp_path: Path) -> None:
     queue = Queue(tmp_path, gpus=0)
     first = queue.add()

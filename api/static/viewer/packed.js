@@ -1,0 +1,240 @@
+// @ts-check
+/**
+ * Packed scenes: PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 3) and antimatter15's .splat.
+ *
+ * Layouts are those of github.com/playcanvas/splat-transform, github.com/nianticlabs/spz and
+ * github.com/antimatter15/splat. All become rows of a PLY's values.
+ */
+import { SceneError } from "./byte_reader.js";
+import { BATCH } from "./packing.js";
+import { DEGREES, floats } from "./ply.js";
+import { words } from "../words.js";
+
+/** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
+/** @typedef {import("./scene_file.js").SceneFile} SceneFile */
+
+const SH_C0 = 0.28209479177387814;
+const NAMES = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
+const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOUR = 11, HARMONICS = NAMES.length;
+/** Logits of opacities of so many 255ths; none and full are a quarter of a step from it. */
+const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
+  const share = Math.min(Math.max(i / 255, 0.25 / 255), 1 - 0.25 / 255);
+  return Math.log(share / (1 - share));
+});
+const OTHERS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
+
+/**
+ * A scene whose rows are made by a function.
+ *
+ * @param {number} count
+ * @param {number} degree
+ * @param {(begin: number, rows: Float32Array, width: number, count: number) => void | Promise<void>} unpack fills so many rows
+ * @returns {SceneFile}
+ */
+function unpacked(count, degree, unpack) {
+  const rest = ((degree + 1) ** 2 - 1) * 3, width = HARMONICS + rest;
+  const at = Object.fromEntries([...NAMES, ...Array.from({ length: rest }, (_, i) => `f_rest_${i}`)].map((name, place) => [name, place]));
+  async function* batches() {
+    for (let begin = 0; begin < count; begin += BATCH) {
+      const some = Math.min(BATCH, count - begin), rows = new Float32Array(some * width);
+      await unpack(begin, rows, width, some);
+      yield rows;
+    }
+  }
+  return { count, degree, width, at, batches };
+}
+
+/**
+ * A unit quaternion of which the largest part is left out.
+ *
+ * @param {Float32Array} row
+ * @param {number} o where the quaternion begins
+ * @param {number} largest its index
+ * @param {number[]} three the others
+ * @param {number} [turn] places that the parts are moved on
+ */
+function setRotation(row, o, largest, three, turn = 0) {
+  const [a, b, c] = three;
+  OTHERS[largest].forEach((part, i) => { row[o + ((part + turn) & 3)] = three[i]; });
+  row[o + ((largest + turn) & 3)] = Math.sqrt(Math.max(0, 1 - a * a - b * b - c * c));
+}
+
+// --- compressed PLY --------------------------------------------------------------------------------------------------
+
+/** Gaussians that share their bounds. */
+const CHUNK = 256;
+const BOUNDS = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
+/** What a byte of spherical harmonics stands for. */
+const STEPS = Float32Array.from({ length: 256 }, (_, i) => (i === 0 ? -4 : i === 255 ? 4 : (i + 0.5) / 32 - 4));
+
+/**
+ * @param {ByteReader} reader behind the header
+ * @param {import("./ply.js").Header} header
+ * @returns {SceneFile}
+ */
+export function compressedPly(reader, { elements }) {
+  const [chunk, vertex, sh] = elements, rest = sh ? Object.keys(sh.columns).length : 0;
+  const wrong = chunk.name !== "chunk" || vertex?.name !== "vertex" || !(vertex.count > 0) || vertex.stride !== 16
+    || chunk.count !== Math.ceil(vertex.count / CHUNK) || !(chunk.stride > 0) || !("packed_position" in vertex.columns)
+    || (sh && (sh.name !== "sh" || sh.count !== vertex.count || sh.stride !== rest)) || !(rest in DEGREES);
+  if (wrong) throw new SceneError(words.scene.notGaussians);
+  /** @type {{bounds: Float32Array, rows: Uint32Array} | null} */
+  let read = null;
+  return unpacked(vertex.count, DEGREES[rest], async (begin, into, width, count) => {
+    read ??= await chunksAndRows(reader, chunk, vertex);
+    const order = ["packed_position", "packed_rotation", "packed_scale", "packed_color"].map((name) => vertex.columns[name].offset / 4);
+    for (let i = 0; i < count; i++) unpackRow(read, begin + i, order, into, i * width);
+    if (!rest) return;
+    const bytes = await reader.take(count * rest);
+    for (let i = 0; i < count; i++) for (let n = 0; n < rest; n++) into[i * width + HARMONICS + n] = STEPS[bytes[i * rest + n]];
+  });
+}
+
+/**
+ * Bounds of all chunks, low and high of each of 9 values (colours are in 0..1 where the file has none), and all rows.
+ *
+ * @param {ByteReader} reader
+ * @param {import("./ply.js").Element} chunk
+ * @param {import("./ply.js").Element} vertex
+ */
+async function chunksAndRows(reader, chunk, vertex) {
+  const values = floats(chunk, await reader.take(chunk.count * chunk.stride)), names = Object.keys(chunk.columns);
+  const bounds = new Float32Array(chunk.count * 18).fill(1);
+  BOUNDS.forEach((name, part) => ["min", "max"].forEach((side, high) => {
+    const place = names.indexOf(`${side}_${name}`);
+    if (place < 0 && part < 6) throw new SceneError(words.scene.notGaussians);
+    for (let i = 0; i < chunk.count; i++) bounds[18 * i + 2 * part + high] = place < 0 ? high : values[i * names.length + place];
+  }));
+  return { bounds, rows: new Uint32Array((await reader.take(vertex.count * vertex.stride)).buffer) };
+}
+
+/**
+ * @param {{bounds: Float32Array, rows: Uint32Array}} read
+ * @param {number} i which Gaussian
+ * @param {number[]} order of the four packed values
+ * @param {Float32Array} into
+ * @param {number} o where its row begins
+ */
+function unpackRow({ bounds, rows }, i, order, into, o) {
+  const [position, rotation, scale, colour] = order.map((place) => rows[4 * i + place]), b = 18 * Math.floor(i / CHUNK);
+  const between = (/** @type {number} */ part, /** @type {number} */ share) => bounds[b + 2 * part] * (1 - share) + bounds[b + 2 * part + 1] * share;
+  [[position, 0, 0], [scale, 3, SCALES]].forEach(([packed, part, place]) => {
+    into[o + place] = between(part, (packed >>> 21) / 2047);
+    into[o + place + 1] = between(part + 1, ((packed >>> 11) & 1023) / 1023);
+    into[o + place + 2] = between(part + 2, (packed & 2047) / 2047);
+  });
+  for (let c = 0; c < 3; c++) into[o + COLOUR + c] = (between(6 + c, ((colour >>> (24 - 8 * c)) & 255) / 255) - 0.5) / SH_C0;
+  into[o + OPACITY] = LOGITS[colour & 255];
+  setRotation(into, o + ROTATION, rotation >>> 30, [20, 10, 0].map((shift) => (((rotation >>> shift) & 1023) / 1023 - 0.5) * Math.SQRT2));
+}
+
+// --- SPZ -------------------------------------------------------------------------------------------------------------
+
+/** Half a turn about x: SPZ has y up and z backwards. Of harmonics, coefficient by coefficient of degree 1 to 3. */
+const TURNED = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
+
+/**
+ * @param {ByteReader} zipped
+ * @returns {Promise<SceneFile>}
+ */
+export async function spz(zipped) {
+  const reader = zipped.piped(/** @type {any} */ (new DecompressionStream("gzip")));
+  const head = new DataView((await reader.take(16)).buffer), count = head.getUint32(8, true), degree = head.getUint8(12);
+  if (head.getUint32(0, true) !== 0x5053474e) throw new SceneError(words.scene.notScene);
+  const version = head.getUint32(4, true), unit = 2 ** -head.getUint8(13);
+  if (version < 1 || version > 3) throw new SceneError(words.scene.newSpz);
+  if (!count || degree > 3) throw new SceneError(words.scene.notGaussians);
+  const rest = ((degree + 1) ** 2 - 1) * 3;
+  /** @type {Uint8Array<ArrayBuffer>[] | null} */
+  let sections = null;
+  return unpacked(count, degree, async (begin, into, width, some) => {
+    if (!sections) {
+      sections = [];
+      for (const each of [version === 1 ? 6 : 9, 1, 3, 3, version < 3 ? 3 : 4]) sections.push(await reader.take(each * count));
+    }
+    for (let i = 0; i < some; i++) unpackSpz(sections, begin + i, version, unit, into, i * width);
+    if (!rest) return;
+    const bytes = await reader.take(some * rest), coefficients = rest / 3;
+    for (let i = 0; i < some; i++) for (let n = 0; n < rest; n++) {
+      const coefficient = Math.floor(n / 3);
+      into[i * width + HARMONICS + (n % 3) * coefficients + coefficient] = (TURNED[coefficient] * (bytes[i * rest + n] - 128)) / 128;
+    }
+  });
+}
+
+/**
+ * @param {Uint8Array<ArrayBuffer>[]} sections positions, opacities, colours, scales, rotations
+ * @param {number} i which Gaussian
+ * @param {number} version
+ * @param {number} unit of a position
+ * @param {Float32Array} into
+ * @param {number} o where its row begins
+ */
+function unpackSpz([positions, opacities, colours, scales, rotations], i, version, unit, into, o) {
+  for (let axis = 0; axis < 3; axis++) {
+    const sign = axis ? -1 : 1, p = 9 * i + 3 * axis;
+    into[o + axis] = sign * (version === 1
+      ? fromHalf(positions[6 * i + 2 * axis] | (positions[6 * i + 2 * axis + 1] << 8))
+      : (((positions[p] | (positions[p + 1] << 8) | (positions[p + 2] << 16)) << 8) >> 8) * unit);
+    into[o + SCALES + axis] = scales[3 * i + axis] / 16 - 10;
+    into[o + COLOUR + axis] = (colours[3 * i + axis] / 255 - 0.5) / 0.15;
+  }
+  into[o + OPACITY] = LOGITS[opacities[i]];
+  if (version < 3) setRotation(into, o + ROTATION, 0, [0, 1, 2].map((part) => rotations[3 * i + part] / 127.5 - 1));
+  else {
+    const r = 4 * i, packed = rotations[r] | (rotations[r + 1] << 8) | (rotations[r + 2] << 16) | (rotations[r + 3] << 24);
+    const part = (/** @type {number} */ bits) => ((bits & 512 ? -1 : 1) * (bits & 511) * Math.SQRT1_2) / 511;
+    setRotation(into, o + ROTATION, packed >>> 30, [20, 10, 0].map((shift) => part((packed >>> shift) & 1023)), 1);
+  }
+  into[o + ROTATION + 2] *= -1;
+  into[o + ROTATION + 3] *= -1;
+}
+
+/** @param {number} half bits */
+function fromHalf(half) {
+  const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
+}
+
+// --- .splat ----------------------------------------------------------------------------------------------------------
+
+/** Bytes of a Gaussian: place and size (float32), colour and opacity, rotation (bytes). */
+const RECORD = 32;
+
+/**
+ * Whether records fit, since there is no header: nearly all have a place, a size that is not absurd, and a rotation.
+ *
+ * @param {Uint8Array} start
+ * @param {number} size of the file
+ */
+export function isSplat(start, size) {
+  const count = Math.floor(start.length / RECORD), view = new DataView(start.buffer, start.byteOffset, start.length);
+  let fit = 0;
+  for (let o = 0; o < count * RECORD; o += RECORD) {
+    const values = [0, 4, 8, 12, 16, 20].map((part) => view.getFloat32(o + part, true));
+    const length = Math.hypot(...[28, 29, 30, 31].map((part) => (start[o + part] - 128) / 128));
+    if (values.every(Number.isFinite) && values.slice(3).every((scale) => scale >= 0 && scale < 1e9) && Math.abs(length - 1) < 0.05) fit++;
+  }
+  return size % RECORD === 0 && fit > 0.9 * count;
+}
+
+/**
+ * @param {ByteReader} reader
+ * @param {number} size of the file
+ * @returns {SceneFile}
+ */
+export function splat(reader, size) {
+  return unpacked(size / RECORD, 0, async (_begin, into, width, count) => {
+    const bytes = await reader.take(count * RECORD), values = new Float32Array(bytes.buffer);
+    for (let i = 0, o = 0, r = 0; i < count; i++, o += width, r += RECORD) {
+      for (let axis = 0; axis < 3; axis++) {
+        into[o + axis] = values[r / 4 + axis];
+        into[o + SCALES + axis] = Math.log(values[r / 4 + 3 + axis]);
+        into[o + COLOUR + axis] = (bytes[r + 24 + axis] / 255 - 0.5) / SH_C0;
+      }
+      into[o + OPACITY] = LOGITS[bytes[r + 27]];
+      for (let part = 0; part < 4; part++) into[o + ROTATION + part] = (bytes[r + 28 + part] - 128) / 128;
+    }
+  });
+}
