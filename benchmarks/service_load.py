@@ -1,10 +1,13 @@
 """What the API holds while a job is running on the same machine: submissions, status, watchers, a large upload.
 
-python -m benchmarks.service_load [--upload-mb 2000] [--watchers 1000] [--seconds 20]
+python -m benchmarks.service_load [--upload-mb 2000] [--watchers 1000] [--seconds 20] [--postgresql]
 
 Aims: 100 submissions a second by reference to uploads; status at 200 requests a second with a 99th percentile under
 50 ms; 1000 watchers of server-sent events; an API that grows by less than 64 MB during an upload of 2 GB. The client
 runs on the same machine and takes a share of its processors: it is part of what is measured, and told.
+
+With --postgresql the database is a PostgreSQL server whose commits are on the disk before they are answered, and two
+API processes on it get every other request and watcher each; the running job's events pass from one to the other.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +32,8 @@ import psutil
 import uvloop
 
 from benchmarks.machine import write_result
-from tests.api.service import Service, wait_for
+from tests.api.service import Service
+from tests.postgres import fresh_database, server
 from tests.small_scenes import wall, write_files
 
 #: A job that outlasts the benchmark; the others never get its place.
@@ -105,14 +109,14 @@ class Connection:
         return f"{method} {path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\n{kind}\r\n".encode()
 
 
-async def submissions(url: str, body: dict[str, Any], seconds: float, made: list[str]) -> dict[str, Any]:
+async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float, made: list[str]) -> dict[str, Any]:
     """Jobs by reference to uploads, by some clients at once, as fast as they are accepted; their ids go into `made`."""
     took: list[float] = []
     failures: Counter[str] = Counter()
     end = time.perf_counter() + seconds
 
     async def submit(number: int) -> None:
-        connection = Connection(url)
+        connection = Connection(urls[number % len(urls)])
         while time.perf_counter() < end:
             parameters = body["parameters"] | {"seed": number * 1_000_000 + len(made)}
             text = json.dumps(body | {"parameters": parameters}).encode()
@@ -135,7 +139,7 @@ async def submissions(url: str, body: dict[str, Any], seconds: float, made: list
     return {"per_second": round(len(made) / elapsed, 1), "accepted": len(made), "failures": failures, **spread(took)}
 
 
-async def at_a_rate(url: str, path: Callable[[int], str], rate: float, seconds: float) -> dict[str, Any]:
+async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float, seconds: float) -> dict[str, Any]:
     """Requests that are due at fixed moments, whether or not earlier ones have been answered.
 
     A request that waits for a free connection waits on our clock: the time counts from when it was due.
@@ -143,8 +147,8 @@ async def at_a_rate(url: str, path: Callable[[int], str], rate: float, seconds: 
     took: list[float] = []
     failures: Counter[str] = Counter()
     free: asyncio.LifoQueue[Connection] = asyncio.LifoQueue()
-    for _ in range(_STATUS_CONNECTIONS):
-        free.put_nowait(Connection(url))
+    for number in range(_STATUS_CONNECTIONS):
+        free.put_nowait(Connection(urls[number % len(urls)]))
     start = time.perf_counter()
 
     async def one(number: int) -> None:
@@ -173,21 +177,30 @@ async def at_a_rate(url: str, path: Callable[[int], str], rate: float, seconds: 
     }
 
 
-async def with_processor(api: psutil.Process, work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
+async def with_processor(apis: list[psutil.Process], work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
     """Figures with the processor time of API and client for each request, which other work does not change much."""
-    processes = {"api": api, "client": psutil.Process()}
-    before = {name: process.cpu_times() for name, process in processes.items()}
+    processes = {"api": apis, "client": [psutil.Process()]}
+    before = {name: _processor_seconds(some) for name, some in processes.items()}
     figures = await work
-    for name, process in processes.items():
-        after = process.cpu_times()
-        used = after.user + after.system - before[name].user - before[name].system
+    for name, some in processes.items():
+        used = _processor_seconds(some) - before[name]
         figures[f"{name}_cpu_ms_each"] = round(1000 * used / max(1, figures[count]), 2)
     return figures
 
 
-async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.Process) -> dict[str, Any]:
+def _processor_seconds(processes: list[psutil.Process]) -> float:
+    return sum(times.user + times.system for times in (process.cpu_times() for process in processes))
+
+
+def _memory(processes: list[psutil.Process]) -> int:
+    return sum(int(process.memory_info().rss) for process in processes)
+
+
+async def watch(
+    urls: Sequence[str], job_id: str, count: int, seconds: float, apis: list[psutil.Process]
+) -> dict[str, Any]:
     """Watchers of one running job: how many are connected, and how late they learn what happens."""
-    before = api.memory_info().rss
+    before = _memory(apis)
     late: list[float] = []
     events = [0] * count
     connected = 0
@@ -196,7 +209,7 @@ async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.P
     async def one(number: int) -> None:
         nonlocal connected
         await asyncio.sleep(number / 200)  # not all of them in one moment
-        connection = Connection(url)
+        connection = Connection(urls[number % len(urls)])
         try:
             async for line in connection.lines(f"/v1/jobs/{job_id}/events"):
                 if line.startswith(b"HTTP/1.1 200"):
@@ -214,7 +227,7 @@ async def watch(url: str, job_id: str, count: int, seconds: float, api: psutil.P
     while connected < count and time.monotonic() < deadline and not any(task.done() for task in tasks):
         await asyncio.sleep(0.1)
     opened = time.time()
-    grown = api.memory_info().rss - before
+    grown = _memory(apis) - before
     await asyncio.sleep(seconds)
     alive = sum(not task.done() for task in tasks)
     for task in tasks:
@@ -274,11 +287,11 @@ def spread(values: list[float]) -> dict[str, float]:
 
 
 async def measure(
-    service: Service, files: dict[str, Path], arguments: argparse.Namespace, large: Path
+    services: Sequence[Service], files: dict[str, Path], arguments: argparse.Namespace, large: Path
 ) -> dict[str, Any]:
-    """All figures, one after the other."""
-    api = service.process(_API)
-    assert api is not None
+    """All figures, one after the other; the first service has the dispatcher."""
+    service, urls = services[0], [each.url for each in services]
+    apis = [process for each in services for process in each.processes(_API)]
     async with httpx.AsyncClient(base_url=service.url, timeout=120) as client:
         ids = {role: await upload(client, path) for role, path in files.items()}
         body = {"scene": ids["scene"], "style": ids["style"], "cameras": [ids["cameras"]], "parameters": LONG}
@@ -287,24 +300,22 @@ async def measure(
         figures: dict[str, Any] = {"job_steps_per_second_alone": await _speed(client, running, arguments.seconds / 2)}
         print(figures, flush=True)
         # first, as what watchers leave free in the API's heap would hide its growth
-        figures["upload"] = await large_upload(client, large, api)
+        figures["upload"] = await large_upload(client, large, apis[0])
         print(figures["upload"], flush=True)
-        asking = at_a_rate(service.url, lambda number: f"/v1/jobs/{running}", 200, arguments.seconds)
-        figures["status"] = await with_processor(api, asking, "requests")
+        asking = at_a_rate(urls, lambda number: f"/v1/jobs/{running}", 200, arguments.seconds)
+        figures["status"] = await with_processor(apis, asking, "requests")
         print(figures["status"], flush=True)
-        figures["watchers"] = await watch(service.url, running, arguments.watchers, arguments.seconds, api)
+        figures["watchers"] = await watch(urls, running, arguments.watchers, arguments.seconds, apis)
         print(figures["watchers"], flush=True)
         made: list[str] = []
-        submitting = submissions(service.url, body, arguments.seconds, made)
-        figures["submissions"] = await with_processor(api, submitting, "accepted")
+        submitting = submissions(urls, body, arguments.seconds, made)
+        figures["submissions"] = await with_processor(apis, submitting, "accepted")
         print(figures["submissions"], flush=True)
-        asking = at_a_rate(
-            service.url, lambda number: f"/v1/jobs/{made[number % len(made)]}", 200, arguments.seconds / 2
-        )
-        figures["status_of_queued_jobs"] = await with_processor(api, asking, "requests")
+        asking = at_a_rate(urls, lambda number: f"/v1/jobs/{made[number % len(made)]}", 200, arguments.seconds / 2)
+        figures["status_of_queued_jobs"] = await with_processor(apis, asking, "requests")
         print(figures["status_of_queued_jobs"], flush=True)
         figures["job_still_running"] = (await client.get(f"/v1/jobs/{running}")).json()["status"] == "running"
-    figures["api_memory_mb"] = round(api.memory_info().rss / 1e6, 1)
+    figures["api_memory_mb"] = round(_memory(apis) / 1e6, 1)
     return figures
 
 
@@ -325,16 +336,26 @@ async def _speed(client: httpx.AsyncClient, job_id: str, seconds: float) -> floa
     return round((steps[1] - steps[0]) / seconds, 1)
 
 
+def _services(folder: Path, stack: contextlib.ExitStack, postgresql: bool) -> list[Service]:
+    """What is asked; none of them runs yet."""
+    if not postgresql:
+        return [Service(folder / "data", **SETTINGS)]
+    database = fresh_database(stack.enter_context(server(durable=True)))
+    settings = SETTINGS | {"SGSST_DATABASE": database}
+    return [Service(folder / "data", **settings), Service(folder / "data", alone=True, **settings)]
+
+
 def main() -> None:
     """Measure, print and store."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--upload-mb", type=int, default=2000)
     parser.add_argument("--watchers", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--postgresql", action="store_true", help="two API processes on a PostgreSQL server")
     arguments = parser.parse_args()
     load = [round(value, 2) for value in psutil.getloadavg()]  # of what else the machine does
-    with tempfile.TemporaryDirectory(prefix="sgsst-load-") as name:
-        folder = Path(name)
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sgsst-load-")))
         (folder / "inputs").mkdir()
         ply, cameras, style = write_files(folder / "inputs", wall())
         large = folder / "large"
@@ -346,12 +367,11 @@ def main() -> None:
 
             _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-        with Service(folder / "data", **SETTINGS) as service:
-            wait_for(service.ready, "the service", service.said)
-            files = {"scene": ply, "cameras": cameras, "style": style}
-            figures = uvloop.run(measure(service, files, arguments, large))
+        services = [stack.enter_context(each) for each in _services(folder, stack, arguments.postgresql)]
+        files = {"scene": ply, "cameras": cameras, "style": style}
+        figures = uvloop.run(measure(services, files, arguments, large))
     measured = {"processors": os.cpu_count(), "load_average_at_start": load, **figures}
-    print(write_result("service_load", measured))
+    print(write_result("service_load_postgresql" if arguments.postgresql else "service_load", measured))
 
 
 if __name__ == "__main__":

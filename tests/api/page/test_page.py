@@ -21,7 +21,7 @@ from sgsst_core.files.ply import read_scene, write_scene
 from sgsst_core.scene.camera import resized
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import ball, cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
 
@@ -437,3 +437,82 @@ def _new_key(service: Service, name: str) -> str:
     command = [sys.executable, "-m", "api.cli", "keys", "create", name]
     made = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
     return made.stdout.split()[-1]
+
+
+def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+    """Two paintings in shares, and a half that is kept: what the page sends is what the job has."""
+    night = tmp_path / "night.png"
+    Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
+    watched = visit()
+    page = watched.page
+    choose(watched, {role: path for role, path in files.items() if role != "style"})
+    page.get_by_label("Style", exact=True).set_input_files([files["style"], night])
+    page.get_by_label("style.png", exact=True).fill("3")
+    set_options(watched, **STEPS, name="two styles")
+    page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
+    page.get_by_role("button", name="Add a region").click()
+    region = page.get_by_role("group", name="Region 1")
+    region.get_by_label("Name").fill("left")
+    region.get_by_label("Select").fill("half-space=1,0,0,0")
+    region.get_by_label("Keep").check()
+    page.get_by_role("button", name="Start").click()
+    page.locator(".badge", has_text="Done").wait_for()
+    job_id = page.url.rsplit("/", 1)[1]
+    parameters = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]
+    assert parameters["style_weights"] == [3.0, 1.0]
+    (kept,) = parameters["regions"]
+    assert (kept["name"], kept["select"], kept["keep"]) == ("left", "half-space=1,0,0,0", True)
+    result = tmp_path / "stylized.ply"
+    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    before, after = read_scene(files["scene"]).scene, read_scene(result).scene
+    moved = (before.sh_dc != after.sh_dc).any(dim=1)
+    side = before.means[:, 0] > 0
+    assert moved[side].float().mean() in (0, 1)
+    assert moved[~side].float().mean() == 1 - moved[side].float().mean()
+    watched.check()
+
+
+def test_fingers_turn_and_approach(browser: Any, service: Service, tmp_path: Path) -> None:
+    """On a telephone: one finger turns the scene, two fingers that part bring it nearer; the page stays where it is."""
+    watched = Watched(browser, service.url, width=360, height=640, has_touch=True, is_mobile=True)
+    page = watched.page
+    page.goto(service.url)
+    ply, _, _ = write_files(tmp_path, ball())
+    page.get_by_label("Scene", exact=True).set_input_files(ply)
+    page.locator("canvas").scroll_into_view_if_needed()
+    first = watched.pixels()
+    box = page.locator("canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    scrolled = page.evaluate("() => scrollY")
+    touch(watched, [[(x - 40 + 8 * i, y)] for i in range(10)])
+    turned = watched.pixels()
+    assert np.abs(turned - first).mean() > 1
+    touch(watched, [[(x - 20 - 4 * i, y), (x + 20 + 4 * i, y)] for i in range(10)])
+    nearer = watched.pixels()
+    assert shown(nearer) > 1.5 * shown(turned) > 0
+    assert page.evaluate("() => scrollY") == scrolled
+    watched.check()
+    watched.context.close()
+
+
+def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
+    """Fingers that come down, move from place to place, and leave."""
+    device = watched.context.new_cdp_session(watched.page)
+    for number, fingers in enumerate(places):
+        points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(fingers)]
+        device.send(
+            "Input.dispatchTouchEvent", {"type": "touchMove" if number else "touchStart", "touchPoints": points}
+        )
+    device.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def shown(pixels: NDArray[np.float64]) -> int:
+    """Pixels in which something other than the background stands, which is the same in every corner."""
+    return int((np.abs(pixels - pixels[2, 2]).max(axis=2) > 20).sum())
+
+
+def test_documentation_of_the_api_needs_no_internet(visit: Visit) -> None:
+    watched = visit("/docs")
+    watched.page.get_by_text("/v1/jobs/{job_id}", exact=True).first.wait_for()
+    watched.page.get_by_text("/v1/jobs/{job_id}/events").first.wait_for()
+    watched.check()
