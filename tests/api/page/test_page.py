@@ -472,8 +472,8 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     watched.check()
 
 
-def test_fingers_turn_and_approach(browser: Any, service: Service, tmp_path: Path) -> None:
-    """On a telephone: one finger turns the scene, two fingers that part bring it nearer; the page stays where it is."""
+def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) -> None:
+    """On a telephone: one finger turns the scene, two that close move it away; the page stays where it is."""
     watched = Watched(browser, service.url, width=360, height=640, has_touch=True, is_mobile=True)
     page = watched.page
     page.goto(service.url)
@@ -487,9 +487,8 @@ def test_fingers_turn_and_approach(browser: Any, service: Service, tmp_path: Pat
     touch(watched, [[(x - 40 + 8 * i, y)] for i in range(10)])
     turned = watched.pixels()
     assert np.abs(turned - first).mean() > 1
-    touch(watched, [[(x - 20 - 4 * i, y), (x + 20 + 4 * i, y)] for i in range(10)])
-    nearer = watched.pixels()
-    assert shown(nearer) > 1.5 * shown(turned) > 0
+    touch(watched, [[(x - 60 + 4 * i, y), (x + 60 - 4 * i, y)] for i in range(10)])
+    assert 0 < shown(watched.pixels()) < 0.6 * shown(turned)
     assert page.evaluate("() => scrollY") == scrolled
     watched.check()
     watched.context.close()
@@ -507,8 +506,8 @@ def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
 
 
 def shown(pixels: NDArray[np.float64]) -> int:
-    """Pixels in which something other than the background stands, which is the same in every corner."""
-    return int((np.abs(pixels - pixels[2, 2]).max(axis=2) > 20).sum())
+    """Pixels in which something stands: the background is black."""
+    return int((pixels.max(axis=2) > 20).sum())
 
 
 def test_documentation_of_the_api_needs_no_internet(visit: Visit) -> None:
