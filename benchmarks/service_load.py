@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -215,10 +216,10 @@ async def watch(
                 if line.startswith(b"HTTP/1.1 200"):
                     connected += 1
                 elif line.startswith(b"data: ") and time.time() > opened:
-                    data = json.loads(line[6:])
-                    if data.get("updated_at", 0) > opened:
+                    updated = _moment(json.loads(line[6:]).get("updated_at"))
+                    if updated > opened:
                         events[number] += 1
-                        late.append(time.time() - data["updated_at"])
+                        late.append(time.time() - updated)
         finally:
             connection.close()
 
@@ -232,7 +233,9 @@ async def watch(
     alive = sum(not task.done() for task in tasks)
     for task in tasks:
         task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+    for ended in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(ended, Exception) and not isinstance(ended, OSError):
+            raise ended
     return {
         "wanted": count,
         "connected": connected,
@@ -242,6 +245,11 @@ async def watch(
         "watchers_without_an_event": sum(not each for each in events),
         "delay": spread(late) if late else None,
     }
+
+
+def _moment(told: str | None) -> float:
+    """Seconds since 1970 of a time as the API tells it; 0 for none."""
+    return datetime.fromisoformat(told).timestamp() if told else 0.0
 
 
 async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
