@@ -75,7 +75,7 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     artifacts = Artifacts(settings.artifacts_url)
     grant = Grant(3, ("5", "6", "7"))
     attempt = RunningAttempt(held, grant, tmp_path, store, blobs, artifacts, settings, cluster=False)
-    room = Room(Machine(grant.gpus, 2, 10**10), None)
+    room = Room(Machine(grant.gpus, 2, 10**11), None)
     assert room.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
         attempt._take_in({"kind": "left-out", "gpus": [gpu]})
