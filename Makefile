@@ -43,11 +43,14 @@ lint: $(VENV)/installed-dev
 
 # The types that the page's scripts say in their comments. Only this check needs node and npm; the page does not.
 lint-page: $(VENV)/created
-	@if command -v npm > /dev/null; then \
-	  $(TYPESCRIPT)/node_modules/.bin/tsc --version 2> /dev/null | grep --quiet "$(TYPESCRIPT_VERSION)" || \
-	    npm install --silent --no-save --prefix $(TYPESCRIPT) typescript@$(TYPESCRIPT_VERSION); \
-	  $(TYPESCRIPT)/node_modules/.bin/tsc --project api/tsconfig.json; \
-	else echo "npm is not on this machine: the types of the page's scripts are not checked"; fi
+	@if ! command -v npm > /dev/null; then echo "npm is not on this machine: the page's types are not checked"; \
+	elif ! $(MAKE) --silent $(TYPESCRIPT)/$(TYPESCRIPT_VERSION); then \
+	  echo "npm could not fetch TypeScript: the page's types are not checked"; \
+	else $(TYPESCRIPT)/node_modules/.bin/tsc --project api/tsconfig.json; fi
+
+$(TYPESCRIPT)/$(TYPESCRIPT_VERSION): $(VENV)/created
+	npm install --silent --no-save --prefix $(TYPESCRIPT) typescript@$(TYPESCRIPT_VERSION)
+	@touch $@
 
 # The documentation as a site in site/; a link that leads nowhere is an error.
 docs: $(VENV)/installed-docs
