@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.files.ply import read_scene, write_packed, write_scene
 from sgsst_core.scene.camera import resized
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
@@ -323,6 +323,23 @@ def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service
     watched.wipe("End")
     assert np.abs(watched.pixels() - right).mean() > 5
     watched.check("status of 404")  # that there are no colours alone is asked first
+
+
+def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """Geometry comes from the packed file, colours from the result: in the file's order."""
+    packed = files["scene"].with_name("scene.spz")
+    write_packed(packed, read_scene(files["scene"]).scene, "spz")
+    job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
+    result = files["scene"].with_name("stylized.ply")
+    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
+    watched.page.get_by_label("Camera", exact=True).select_option("1")
+    camera = resized(read_cameras(files["cameras"])[1], 384)
+    for key, path in (("End", packed), ("Home", result)):
+        wanted = rendered(path, camera)
+        watched.wipe(key)
+        assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered picture
+    watched.check()
 
 
 def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) -> None:
