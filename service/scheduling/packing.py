@@ -3,8 +3,8 @@
 On GPUs a job has its GPUs to itself. One that names no number of `workers` is offered its part of those that are free,
 all of them where no other job waits, one where many do, but never more than a job of its size is worth
 (`service.scheduling.job_size`). The plan, made with measured times, then takes as many as make the job faster, and the
-rest are given back (see `service.scheduling.running`). Memory of the machine is counted too: a job waits where those that
-run leave too little for its scene. A Ray cluster's machines are Ray's to look after.
+rest are given back (see `service.scheduling.running`). Memory of the machine is counted too: a job waits where those
+that run leave too little for its scene. A Ray cluster's machines are Ray's to look after.
 
 Without GPUs, places stand for parts of the processor and of the memory. There is one, unless the operator wants several
 jobs side by side: one job uses all cores well. A job that needs more memory than a place has takes several.
