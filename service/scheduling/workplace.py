@@ -32,6 +32,7 @@ from service.scheduling.publishing import put_patiently
 from service.settings import ServiceSettings
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
+from worker.ranks import sweeper
 from worker.workplace import Stored
 
 #: Seconds between two looks for what a job has made.
@@ -119,7 +120,10 @@ class StoreWorkplace:
 
 
 class RankFolder:
-    """A rank's folder: it is locked as long as the rank lives, so that others can tell what was left behind."""
+    """A rank's folder: it is locked as long as the rank lives, so that others can tell what was left behind.
+
+    A process beside it removes it when the rank is killed; others do so where that one was killed, too.
+    """
 
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
         settings = node_settings()
@@ -131,6 +135,7 @@ class RankFolder:
             self._above.mkdir()
             self._lock = (self._above / "lock").open("w")
             fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self._sweeper = sweeper.beside(self._above)
         self.folder = self._above / "job"
         self._shipper: _Shipper | None = None
         try:
@@ -176,6 +181,7 @@ class RankFolder:
             self._shipper.stop()
         shutil.rmtree(self._above, ignore_errors=True)
         self._lock.close()
+        sweeper.dismiss(self._sweeper)
 
 
 class _Shipper:

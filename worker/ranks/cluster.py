@@ -11,7 +11,6 @@ import os
 import secrets
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 from pathlib import Path
@@ -106,13 +105,7 @@ class Cluster:
         parent = tempfile.gettempdir()
         self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir=parent if len(parent) < 24 else "/tmp"))
         assert len(str(self._folder)) <= _LONGEST_FOLDER
-        self._sweeper = subprocess.Popen(
-            [sys.executable, "-I", "-S", sweeper.__file__, str(self._folder)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the owner
-        )
+        self._sweeper = sweeper.beside(self._folder, users=True)
         earlier = set(psutil.Process().children())
         try:
             ray.init(
@@ -150,7 +143,7 @@ class Cluster:
             sweeper.sweep(self._folder)
             self._folder = None
         if self._sweeper is not None:
-            self._sweeper.communicate(sweeper.DONE)
+            sweeper.dismiss(self._sweeper)
             self._sweeper = None
 
 

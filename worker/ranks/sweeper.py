@@ -1,8 +1,8 @@
-"""Leaves nothing of a local Ray behind: ends what still uses its folder, then removes the folder.
+"""Leaves nothing of a killed process behind: of a local Ray, or of a rank.
 
-Runs as a process of its own beside the one that owns Ray (`python sweeper.py FOLDER`, with a pipe as standard input),
-so that it outlives it: when the pipe closes without a word, the owner was killed. Uses the standard library alone, so
-that it starts in no time and takes next to no memory.
+Runs as a process of its own beside the owner of a folder, with a pipe as standard input, so that it outlives it: when
+the pipe closes without a word, the owner was killed. Uses the standard library alone, so that it starts in no time and
+takes next to no memory.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -18,6 +19,27 @@ from pathlib import Path
 DONE = b"done"
 #: Seconds for processes to go by themselves, and in all.
 _PATIENCE, _LIMIT = 1.0, 20.0
+
+
+def beside(folder: Path, *, users: bool = False) -> subprocess.Popen[bytes]:
+    """Start one that removes a folder when this process is killed; `dismiss` ends it.
+
+    Args:
+        users: processes that still use the folder are ended first.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-I", "-S", __file__, str(folder), *(["users"] if users else [])],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the owner
+    )
+
+
+def dismiss(process: subprocess.Popen[bytes]) -> None:
+    """The owner has removed the folder itself; once is enough."""
+    if process.stdin and not process.stdin.closed:
+        process.communicate(DONE)
 
 
 def sweep(folder: Path) -> None:
@@ -61,4 +83,6 @@ def _uses(process: Path, folder: str) -> bool:
 
 if __name__ == "__main__":
     if sys.stdin.buffer.read() != DONE:
-        sweep(Path(sys.argv[1]))
+        if sys.argv[2:] == ["users"]:
+            sweep(Path(sys.argv[1]))
+        shutil.rmtree(sys.argv[1], ignore_errors=True)

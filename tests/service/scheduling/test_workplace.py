@@ -15,6 +15,7 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 from safetensors.numpy import save_file
 
@@ -187,7 +188,9 @@ def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
     rank.close()
 
 
-def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Path) -> None:
+@pytest.mark.parametrize("alone", [True, False])
+def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Path, alone: bool) -> None:
+    """By the process beside it; or, where that one was killed with it, by the next one on this machine."""
     spawned = multiprocessing.get_context("spawn")
     ready = spawned.Event()
     process = spawned.Process(target=_open_and_wait, args=(job, ready))
@@ -199,9 +202,15 @@ def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Pat
         return sum(path.is_dir() for path in (tmp_path / "node" / "ranks").iterdir())
 
     assert folders() == 2, "who lives is left alone"
+    if alone:
+        (beside,) = (child for child in psutil.Process(process.pid).children() if "sweeper" in str(child.cmdline()))
+        beside.kill()
     process.kill()
     process.join()
-    job.tidy()
-    assert folders() == 1
+    if alone:
+        assert folders() == 2
+        job.tidy()
+        assert folders() == 1
+    wait_for(lambda: folders() == 1, "the killed rank's folder to go")
     assert (own.folder / "scene" / "my.ply").exists()
     own.close()
