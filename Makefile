@@ -46,7 +46,7 @@ lint-page: $(VENV)/created
 	@if ! command -v npm > /dev/null; then echo "npm is not on this machine: the page's types are not checked"; \
 	elif ! $(MAKE) --silent $(TYPESCRIPT)/$(TYPESCRIPT_VERSION); then \
 	  echo "npm could not fetch TypeScript: the page's types are not checked"; \
-	else $(TYPESCRIPT)/node_modules/.bin/tsc --project api/tsconfig.json; fi
+	else $(TYPESCRIPT)/node_modules/.bin/tsc --project .ci/tsconfig.json; fi
 
 $(TYPESCRIPT)/$(TYPESCRIPT_VERSION): $(VENV)/created
 	npm install --silent --no-save --prefix $(TYPESCRIPT) typescript@$(TYPESCRIPT_VERSION)
