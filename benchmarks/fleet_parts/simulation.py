@@ -22,6 +22,7 @@ from sqlalchemy import event, select
 
 from benchmarks.fleet_parts.demand import SimulatedJob
 from service.files.names import CHECKPOINT
+from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant
@@ -70,6 +71,15 @@ class Attempt:
     begun: float
     since: float
     stepping_since: float | None = None
+    ends: float | None = None
+
+    @property
+    def holding(self) -> Holding:
+        """As a real attempt tells it: nothing before its steps, and then what is right."""
+        if self.ends is None:
+            return Holding(self.grant)
+        pace = None if self.record.attempts > 1 else self.record.job.factor
+        return Holding(self.grant, _EPOCH + self.ends, pace)
 
 
 @dataclass
@@ -84,14 +94,14 @@ class Host:
     keeps_room_for: str | None = None
 
     @property
-    def grants(self) -> list[Grant]:
-        """What its jobs hold."""
-        return [attempt.grant for attempt in self.running.values()]
+    def held(self) -> list[Holding]:
+        """What its jobs have."""
+        return [attempt.holding for attempt in self.running.values()]
 
     @property
     def free(self) -> int:
         """GPUs that no job holds."""
-        return self.gpus - sum(len(grant.gpus) for grant in self.grants) if self.up else 0
+        return self.gpus - sum(len(attempt.grant.gpus) for attempt in self.running.values()) if self.up else 0
 
 
 class Fleet:
@@ -209,7 +219,7 @@ class Fleet:
         """A dispatcher takes what it finds room for, as the real one does in each round."""
         while host.free and self._waiting:
             self._do("lease")
-            found = host.dispatcher.next_job(host.grants)
+            found = host.dispatcher.next_job(host.held)
             if found is None:
                 self._do("look")
                 host.keeps_room_for = self._reserved(host)
@@ -250,8 +260,8 @@ class Fleet:
             attempt.grant = Grant(record.planned, attempt.grant.gpus[: record.planned])
             self._at(self._soon(), lambda: self._look(host))
         attempt.stepping_since = self.now
-        left = (1 - record.done) * record.job.seconds(record.planned)
-        self._at(self.now + left, lambda: self._done(host, life, attempt))
+        attempt.ends = self.now + (1 - record.done) * record.job.seconds(record.planned)
+        self._at(attempt.ends, lambda: self._done(host, life, attempt))
 
     def _done(self, host: Host, life: int, attempt: Attempt) -> None:
         if host.life != life:

@@ -14,6 +14,7 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Callable, Sequence
 from types import FrameType
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -22,6 +23,7 @@ from service.errors import LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.logs import set_up
+from service.scheduling.backfill import Backfill, Holding
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
@@ -63,6 +65,7 @@ class Dispatcher:
         self._blobs = open_blobs(settings, store.inputs, self._artifacts)
         self._machine = machine or Machine.find(settings)
         self._room = Room(self._machine, settings.parallel_jobs)
+        self._backfill = Backfill(self._room)
         self._running: dict[str, RunningAttempt] = {}
         self._stop = threading.Event()
         self.name = own_name()
@@ -114,21 +117,23 @@ class Dispatcher:
                 del self._running[job_id]
         self._renew_leases()
         self._announce_alive()
-        while not self._stop.is_set() and (found := self.next_job(self._grants())) is not None:
+        while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
             self._start_attempt(*found)
 
     # --- room ------------------------------------------------------------------------------------------------------
 
-    def _grants(self) -> list[Grant]:
-        return [attempt.grant for attempt in self._running.values()]
+    def _held(self) -> list[Holding]:
+        return [attempt.holding for attempt in self._running.values()]
 
-    def next_job(self, held: list[Grant]) -> tuple[Lease, Grant] | None:
+    def next_job(self, held: Sequence[Holding]) -> tuple[Lease, Grant] | None:
         """Lease the next job of the queue, and decide what it gets; None where there is none, or no room for it.
 
         Args:
             held: what running jobs have.
         """
-        if self._room.free(held) < 1:  # nothing is asked, and no row is locked that others want
+        self._backfill.learn(held)
+        grants = [each.grant for each in held]
+        if self._room.free(grants) < 1:  # nothing is asked, and no row is locked that others want
             return None
         dispatchers = max(1, self._store.operations.alive())
         if not (waiting := self._store.leases.waiting(self._room.size * dispatchers)):
@@ -138,10 +143,20 @@ class Dispatcher:
 
         def fits(job: JobRow) -> bool:
             nonlocal grant
-            grant = self._room.grant(job, held, share)
+            grant = self._room.grant(job, grants, share)
             return grant is not None
 
-        lease = self._store.leases.take(self.name, fits)
+        def before(kept: JobRow) -> Callable[[JobRow], bool] | None:
+            harmless = self._backfill.before(kept, held, share, self._store.database.clock())
+
+            def fits(job: JobRow) -> bool:
+                nonlocal grant
+                grant = harmless(job) if harmless else None
+                return grant is not None
+
+            return fits if harmless else None
+
+        lease = self._store.leases.take(self.name, fits, before)
         return (lease, grant) if lease is not None and grant is not None else None
 
     def _start_attempt(self, lease: Lease, grant: Grant) -> None:
@@ -157,7 +172,9 @@ class Dispatcher:
     def _announce_alive(self) -> None:
         """Let everybody know that this dispatcher is alive."""
         if time.monotonic() - self._announced_at >= _RENEW_SHARE * self._settings.lease_seconds:
-            self._store.operations.beat(self.name, self._room.size, self._room.free(self._grants()))
+            self._store.operations.beat(
+                self.name, self._room.size, self._room.free([each.grant for each in self._held()])
+            )
             self._announced_at = time.monotonic()
 
     def _renew_leases(self) -> None:

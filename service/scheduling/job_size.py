@@ -31,6 +31,8 @@ _LINK_BYTES, _LINK_SECONDS = 3e11, 1e-5
 #: Of what a GPU could do, the least that it does where it is worth having; and seconds of steps that are not worth
 #: dividing further: a job takes as long to start. Cautious on either side, since the plan gives back what is too much.
 _LEAST_SHARE, _LEAST_SECONDS = 0.6, 10.0
+#: Seconds before a job's first step: process, CUDA, network and plan; bytes of its files a second from the store.
+_START_SECONDS, _STAGING_BYTES = 18.0, 1e9
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,12 @@ def estimated_size(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, 
         settings.steps_sos * steps,
         settings.precision,
     )
+
+
+def estimated_seconds(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, Any]], gpus: int = 1) -> float:
+    """From a job's start to its end, by its record; as `estimated_size` otherwise."""
+    staging = float(sum(entry["size"] for entry in inputs)) / _STAGING_BYTES
+    return _START_SECONDS + staging + estimated_size(parameters, inputs).seconds(max(gpus, 1))
 
 
 def _settings(parameters: Mapping[str, Any]) -> Settings:

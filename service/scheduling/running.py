@@ -25,7 +25,9 @@ from service.files.staging import Staged, layout, stage
 from service.files.stored_blobs import BLOBS
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.attempt_process import Task
+from service.scheduling.backfill import Holding
 from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
+from service.scheduling.job_size import estimated_seconds
 from service.scheduling.messages import Message
 from service.scheduling.packing import Grant
 from service.scheduling.publishing import Publisher
@@ -77,6 +79,7 @@ class RunningAttempt:
         self._publisher = Publisher(lease, folder, store, artifacts, settings.preview_seconds)
         self._begun_at, self._progress_at = time.monotonic(), 0.0
         self._pending: dict[str, Any] | None = None
+        self._ends_at: float | None = None
         self._thread = threading.Thread(target=self._run, name=lease.job_id, daemon=True)
 
     @property
@@ -88,6 +91,18 @@ class RunningAttempt:
     def abandoned(self) -> bool:
         """Whether it has ended, or was told to at once."""
         return self._wish == Wish.ABANDON or not self.alive
+
+    @property
+    def holding(self) -> Holding:
+        """What it has of the machine, and until when by what its process told last."""
+        ends_at, grant, job = self._ends_at, self.grant, self.lease.job
+        if ends_at is None:
+            return Holding(grant)
+        until = self._store.database.clock() + ends_at - time.monotonic()
+        if job.attempt > 1:  # it may have gone on from a checkpoint
+            return Holding(grant, until)
+        pace = (ends_at - self._begun_at) / estimated_seconds(job.parameters, job.inputs, grant.ranks)
+        return Holding(grant, until, pace)
 
     def start(self) -> None:
         """Begin."""
@@ -256,6 +271,8 @@ class RunningAttempt:
             self._publisher.publish([Published(**message["file"])])
         if message["kind"] == "prepared":
             self._store.leases.begin(self.lease)
+        if message["kind"] == "progress" and (left := message.get("seconds_left")) is not None:
+            self._ends_at = time.monotonic() + left
         if message["kind"] in ("stage", "prepared", "progress"):
             self._pending = progress_record(message, self.lease.job.attempt)
 

@@ -18,7 +18,7 @@ from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
 from service.store.history import keep_point
-from service.store.queue import LOST, WAITING, mine, next_job, reserve
+from service.store.queue import LOST, WAITING, mine, next_job, next_jobs, reserve
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
@@ -29,6 +29,8 @@ from sgsst_core.errors import InfrastructureError
 KEPT_PROGRESS = 200
 #: Attempts that are looked back at for how long to wait: by then the wait is as long as it gets.
 _OUTAGES = 20
+#: Jobs of different owners that are looked at for one that may run in kept room.
+_BACKFILLED = 16
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,12 @@ class Leases:
 
     # --- taking and holding ----------------------------------------------------------------------------------------
 
-    def take(self, dispatcher: str, fits: Callable[[JobRow], bool] = lambda job: True) -> Lease | None:
+    def take(
+        self,
+        dispatcher: str,
+        fits: Callable[[JobRow], bool] = lambda job: True,
+        before: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda kept: None,
+    ) -> Lease | None:
         """Take the next job: the highest priority, then the owner who has waited longest, then the oldest job.
 
         Jobs whose lease has run out come with the queued ones. One that has used up its attempts ends as failed
@@ -81,11 +88,13 @@ class Leases:
 
         A job that there is no room for is reserved: this dispatcher takes no other one of its priority until it fits,
         so that smaller jobs do not overtake it for ever. Other dispatchers take it where it fits them first, and pass
-        it over where it does not: one big job holds up one of them and not all.
+        it over where it does not: one big job holds up one of them and not all. What may go `before` the job that room
+        is kept for is taken meanwhile, and the room stays kept.
 
         Args:
             dispatcher: its name.
             fits: whether there is room for a job.
+            before: of a job that room is kept for, tells which jobs are no hindrance to it; None for no job.
         """
         passed: list[str] = []
         while True:
@@ -102,7 +111,7 @@ class Leases:
                 if lost:  # else the same loss would count again the next time that somebody looks
                     self._requeue(session, job, now, now)
                 if reserve(session, job.id, dispatcher, now, self._seconds):
-                    return None
+                    return self._backfill(session, dispatcher, now, [*passed, job.id], before(job))
                 passed.append(job.id)
 
     def waiting(self, most: int = 1_000_000) -> int:
@@ -114,7 +123,24 @@ class Leases:
                 found += connection.execute(query, {"now": now, "most": most - found}).scalar_one()
         return found
 
-    def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
+    def _backfill(
+        self,
+        session: Session,
+        dispatcher: str,
+        now: float,
+        passed: Sequence[str],
+        harmless: Callable[[JobRow], bool] | None,
+    ) -> Lease | None:
+        """The first of the next jobs that is no hindrance to the one that room is kept for."""
+        if harmless is None:
+            return None
+        for job in next_jobs(session, dispatcher, now, passed, _BACKFILLED):
+            if job.status == JobStatus.QUEUED and harmless(job):
+                return self._lease(session, job, dispatcher, now, keep=True)
+        return None
+
+    def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep: bool = False) -> Lease:
+        """`keep`: the room that the dispatcher keeps for another job."""
         job.attempt += 1
         job.lease_epoch += 1
         job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
@@ -122,7 +148,8 @@ class Leases:
         attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
         attempt.started_at = now
         session.add(attempt)
-        session.execute(delete(ReservationRow).where(or_(mine(dispatcher), ReservationRow.job_id == job.id)))
+        of_job = ReservationRow.job_id == job.id
+        session.execute(delete(ReservationRow).where(of_job if keep else or_(mine(dispatcher), of_job)))
         served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))

@@ -72,12 +72,19 @@ def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str
     Args:
         passed: jobs that are not to be looked at.
     """
+    return next(iter(next_jobs(session, dispatcher, now, passed, most=1)), None)
+
+
+def next_jobs(session: Session, dispatcher: str, now: float, passed: Sequence[str], most: int) -> Sequence[JobRow]:
+    """As `next_job`: the first ones of their owners in the order in which they are next, at `most` so many."""
     told = {"dispatcher": dispatcher, "now": now, "passed": list(passed)}
     candidates = [found for found in session.scalars(_candidates(), told) if found is not None]
     if not candidates:
-        return None
+        return []
     # as a statement of its own: within one, PostgreSQL expects more candidates than there are, and reads all jobs
-    return session.scalar(_first(), {"dispatcher": dispatcher, "now": now, "candidates": candidates})
+    return session.scalars(
+        _first(), {"dispatcher": dispatcher, "now": now, "candidates": candidates, "most": most}
+    ).all()
 
 
 @cache
@@ -92,7 +99,7 @@ def _candidates() -> Select[Any] | CompoundSelect[Any]:
 
 @cache
 def _first() -> Select[JobRow]:
-    """The first of them."""
+    """The first of them, at `most` so many."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
     kept = case((mine(dispatcher), 0), else_=1)
@@ -105,7 +112,7 @@ def _first() -> Select[JobRow]:
         .where(or_(queued_now(now), expired(now)))
     )
     order = (JobRow.priority.desc(), kept, turn, JobRow.queued_at, JobRow.id)
-    return query.order_by(*order).limit(1).with_for_update(skip_locked=True, of=JobRow)
+    return query.order_by(*order).limit(bindparam("most", type_=Integer)).with_for_update(skip_locked=True, of=JobRow)
 
 
 def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) -> Select[Any]:

@@ -14,6 +14,7 @@ import pytest
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
+from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
@@ -132,7 +133,7 @@ def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, mo
         """An attempt that runs for ever."""
 
         def __init__(self, lease: Lease, grant: Grant, *others: object) -> None:
-            self.lease, self.grant = lease, grant
+            self.lease, self.holding = lease, Holding(grant)
 
         alive = True
 

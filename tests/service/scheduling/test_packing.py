@@ -10,15 +10,16 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sqlalchemy import event
+from sqlalchemy import event, select
 
+from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.tables import JobRow
+from service.store.tables import JobRow, ReservationRow
 
 GB = 1_000_000_000
 SHA = "a" * 64
@@ -40,6 +41,9 @@ class Queue:
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
         self.dispatcher = Dispatcher(settings, self.store, machine(gpus))
         self.held: dict[str, Grant] = {}
+        #: Of jobs that tell it: when they will have ended, and seconds over those estimated.
+        self.ends: dict[str, float] = {}
+        self.pace = 1.0
 
     def add(self, owner: str = "local", priority: int = 0, **parameters: Any) -> str:
         self.now += 1
@@ -47,10 +51,17 @@ class Queue:
         parameters = LARGE | parameters
         return self.store.jobs.create(NewJob(owner, "", priority, parameters, [scene]), limit=100)[0].id
 
+    def holdings(self) -> list[Holding]:
+        ends = [self.ends.get(job_id) for job_id in self.held]
+        return [
+            Holding(grant, end, None if end is None else self.pace)
+            for grant, end in zip(self.held.values(), ends, strict=True)
+        ]
+
     def start(self) -> list[str]:
         """Start what there is room for, as the dispatcher does; ids in the order of their start."""
         started = []
-        while (found := self.dispatcher.next_job(list(self.held.values()))) is not None:
+        while (found := self.dispatcher.next_job(self.holdings())) is not None:
             lease, grant = found
             self.held[lease.job_id] = grant
             started.append(lease.job_id)
@@ -61,6 +72,12 @@ class Queue:
     def ranks(self) -> list[int]:
         assert all(len(grant.gpus) == grant.ranks for grant in self.held.values())
         return [grant.ranks for grant in self.held.values()]
+
+
+def kept_for(queue: Queue) -> list[str]:
+    """Jobs that room is kept for."""
+    with queue.store.database.reading() as session:
+        return list(session.scalars(select(ReservationRow.job_id)))
 
 
 @pytest.fixture
@@ -146,6 +163,66 @@ def test_a_big_job_holds_up_one_machine_and_not_all(tmp_path: Path) -> None:
     assert here.start() == [later], "and who kept its room has it back"
     for queue in (here, there):
         queue.store.close()
+
+
+def test_what_ends_in_time_uses_the_room_that_is_kept_for_a_big_job(eight: Queue) -> None:
+    long = [eight.add("a", workers=1) for _ in range(8)]
+    assert eight.start() == long
+    big = eight.add("b", workers=8)
+    short = [eight.add(f"c{number}", preset="preview", resolution=640) for number in range(3)]
+    for job_id in long[:2]:
+        del eight.held[job_id]
+    eight.ends = dict.fromkeys(long, eight.now + 600)
+    assert eight.start() == short[:2]  # as many as are free, in their order
+    assert kept_for(eight) == [big]
+    for job_id in short[:2]:
+        del eight.held[job_id]
+    eight.now += 575  # the third would end too late now
+    assert eight.start() == []
+    eight.held.clear()
+    assert eight.start() == [big]
+
+
+def test_nothing_is_let_in_before_a_pace_is_known_nor_what_takes_too_long_at_it(eight: Queue) -> None:
+    long = [eight.add("a", workers=1) for _ in range(8)]
+    assert eight.start() == long
+    big, short = eight.add("b", workers=8), eight.add("c", preset="preview", resolution=640)
+    del eight.held[long[0]]
+    assert eight.start() == []
+    eight.ends = dict.fromkeys(long, eight.now + 100)
+    eight.pace = 10.0
+    assert eight.start() == []
+    eight.pace = 1.0
+    assert eight.start() == [short]
+    assert kept_for(eight) == [big]
+
+
+def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> None:
+    """Running jobs that take ever longer than they told do not keep the door open for others."""
+    long = [eight.add("a", workers=1) for _ in range(8)]
+    assert eight.start() == long
+    eight.add("b", workers=8)
+    del eight.held[long[0]]
+    eight.ends = dict.fromkeys(long, eight.now + 100)
+    first = eight.add("c", preset="preview", resolution=640)
+    assert eight.start() == [first]
+    del eight.held[first]
+    eight.add("d", preset="preview", resolution=640)
+    eight.now += 90
+    eight.ends = dict.fromkeys(long, eight.now + 100)
+    assert eight.start() == []
+
+
+def test_a_job_of_more_than_the_usual_priority_takes_kept_room(eight: Queue) -> None:
+    long = [eight.add("a", workers=1) for _ in range(8)]
+    assert eight.start() == long
+    big = eight.add("b", workers=8)
+    del eight.held[long[0]]
+    assert eight.start() == []
+    urgent = eight.add("c", priority=1, workers=1)
+    assert eight.start() == [urgent]
+    eight.held.clear()
+    assert eight.start() == [big]
 
 
 def test_keys_take_turns_whatever_they_get(eight: Queue) -> None:

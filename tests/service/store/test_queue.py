@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 
 import pytest
 
@@ -58,6 +59,31 @@ def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store,
     assert store.leases.take("one", full) is None, "it is kept, however often others were served"
     assert lease(store, "one").job_id == big
     assert lease(store, "one").job_id == small[2]
+
+
+def test_what_is_no_hindrance_is_taken_before_what_room_is_kept_for(store: Store, clock: Clock) -> None:
+    big = queue(store, "a", priority=1)
+    others = []
+    for owner in "bcbd":
+        clock.now += 1
+        others.append(queue(store, owner))
+    told: list[str] = []
+
+    def full(job: JobRow) -> bool:
+        return job.id != big
+
+    def before(kept: JobRow) -> Callable[[JobRow], bool]:
+        told.append(kept.id)
+        return lambda job: job.id != others[1]
+
+    taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, before))]
+    assert taken == [others[0], others[3], others[2]], "in turns, but for the one that is in the way"
+    assert told == [big] * 4
+    found = store.leases.take("two", full, before)
+    assert found is not None
+    assert found.job_id == others[1], "which another dispatcher has room for: it is kept by the first alone"
+    assert store.leases.take("two", full, before) is None
+    assert lease(store, "one").job_id == big
 
 
 def test_a_job_that_room_is_kept_for_goes_where_it_fits_first(store: Store) -> None:
