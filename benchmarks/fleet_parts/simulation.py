@@ -33,6 +33,8 @@ from service.store.leases import Lease, Published
 from service.store.tables import ReservationRow
 
 LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
+#: Seconds after which a host looks again that has room, but for none of the jobs that wait (`POLL_SECONDS` in truth).
+_LOOK_AGAIN = 10.0
 #: A failed host is back after so many seconds, at least and at most.
 _REPAIR_SECONDS = (600.0, 3600.0)
 _EPOCH = 1_700_000_000.0
@@ -92,6 +94,7 @@ class Host:
     life: int = 0
     up: bool = True
     keeps_room_for: str | None = None
+    looks_again: bool = False
 
     @property
     def held(self) -> list[Holding]:
@@ -223,9 +226,17 @@ class Fleet:
             if found is None:
                 self._do("look")
                 host.keeps_room_for = self._reserved(host)
+                if host.keeps_room_for is None and not host.looks_again:
+                    host.looks_again = True
+                    self._at(self.now + _LOOK_AGAIN, lambda: self._look_again(host))
                 return
             host.keeps_room_for = None
             self._start(host, *found)
+
+    def _look_again(self, host: Host) -> None:
+        host.looks_again = False
+        if host.keeps_room_for is None:
+            self._look(host)
 
     def _reserved(self, host: Host) -> str | None:
         with self.store.database.reading() as session:

@@ -56,6 +56,15 @@ class Backfill:
         if paces := [each.pace for each in held if each.pace is not None]:
             self._pace = median(paces)
 
+    def is_near(self, job: JobRow, held: Sequence[Holding], waiting: int, now: float) -> bool:
+        """Whether room is to be kept here for a job that other machines might have room for sooner.
+
+        Nobody knows what the others foresee. So a job has to have waited for as long as it would have to wait here: the
+        machine that has room first is the first to keep it.
+        """
+        begins = self._foreseen(job, held, waiting)
+        return job.id == self._kept or begins is None or begins - now <= now - job.queued_at
+
     def before(
         self, kept: JobRow, held: Sequence[Holding], waiting: int, now: float
     ) -> Callable[[JobRow], Grant | None] | None:

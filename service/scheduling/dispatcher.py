@@ -146,6 +146,9 @@ class Dispatcher:
             grant = self._room.grant(job, grants, share)
             return grant is not None
 
+        def keeps(job: JobRow) -> bool:
+            return dispatchers == 1 or self._backfill.is_near(job, held, share, self._store.database.clock())
+
         def before(kept: JobRow) -> Callable[[JobRow], bool] | None:
             harmless = self._backfill.before(kept, held, share, self._store.database.clock())
 
@@ -156,7 +159,7 @@ class Dispatcher:
 
             return fits if harmless else None
 
-        lease = self._store.leases.take(self.name, fits, before)
+        lease = self._store.leases.take(self.name, fits, keeps, before)
         return (lease, grant) if lease is not None and grant is not None else None
 
     def _start_attempt(self, lease: Lease, grant: Grant) -> None:

@@ -79,6 +79,7 @@ class Leases:
         self,
         dispatcher: str,
         fits: Callable[[JobRow], bool] = lambda job: True,
+        keeps: Callable[[JobRow], bool] = lambda job: True,
         before: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda kept: None,
     ) -> Lease | None:
         """Take the next job: the highest priority, then the owner who has waited longest, then the oldest job.
@@ -94,6 +95,7 @@ class Leases:
         Args:
             dispatcher: its name.
             fits: whether there is room for a job.
+            keeps: whether room is to be kept for a job that there is none for; one that is not is passed over.
             before: of a job that room is kept for, tells which jobs are no hindrance to it; None for no job.
         """
         passed: list[str] = []
@@ -110,7 +112,7 @@ class Leases:
                     return self._lease(session, job, dispatcher, now)
                 if lost:  # else the same loss would count again the next time that somebody looks
                     self._requeue(session, job, now, now)
-                if reserve(session, job.id, dispatcher, now, self._seconds):
+                if keeps(job) and reserve(session, job.id, dispatcher, now, self._seconds):
                     return self._backfill(session, dispatcher, now, [*passed, job.id], before(job))
                 passed.append(job.id)
 

@@ -213,6 +213,38 @@ def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> 
     assert eight.start() == []
 
 
+def test_the_machine_that_has_room_first_keeps_it(tmp_path: Path) -> None:
+    """Where room comes late, a big job is left to other machines until it has waited as long as it would have to."""
+    late, soon = (Queue(tmp_path, gpus=8) for _ in range(2))
+    soon.dispatcher.name = "soon"
+    for queue in (late, soon):
+        queue.store.operations.beat(queue.dispatcher.name, 8, 0)
+    running = [late.add("a", workers=1) for _ in range(14)]
+    soon.now = late.now
+    for queue, some in ((late, running[:7]), (soon, running[7:])):
+        queue.held = {job_id: Grant(1, (f"gpu{number}",)) for number, job_id in enumerate(some)}
+    late.ends = dict.fromkeys(running, late.now + 3600)
+    soon.ends = dict.fromkeys(running, late.now + 60)
+    for job_id in running:
+        late.store.jobs.cancel(job_id, None)
+    big = late.add("b", workers=8)
+    assert late.start() == []
+    assert kept_for(late) == []
+    soon.now = late.now
+    assert soon.start() == []
+    assert kept_for(soon) == []
+    soon.now = late.now = late.now + 60
+    for queue in (late, soon):
+        queue.store.operations.beat(queue.dispatcher.name, 8, 0)
+    assert late.start() == []
+    assert soon.start() == []
+    assert kept_for(soon) == [big]
+    with soon.store.database.reading() as session:
+        assert session.scalars(select(ReservationRow.dispatcher)).all() == ["soon"]
+    for queue in (late, soon):
+        queue.store.close()
+
+
 def test_a_job_of_more_than_the_usual_priority_takes_kept_room(eight: Queue) -> None:
     long = [eight.add("a", workers=1) for _ in range(8)]
     assert eight.start() == long

@@ -61,6 +61,16 @@ def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store,
     assert lease(store, "one").job_id == small[2]
 
 
+def test_a_job_that_no_room_is_kept_for_is_passed_over(store: Store) -> None:
+    big, small = queue(store, "a"), queue(store, "b")
+    found = store.leases.take("one", lambda job: job.id == small, keeps=lambda job: False)
+    assert found is not None
+    assert found.job_id == small
+    assert store.leases.take("one", lambda job: False, keeps=lambda job: False) is None
+    queue(store, "c")
+    assert store.leases.take("one", lambda job: job.id != big) is None, "and now it is kept"
+
+
 def test_what_is_no_hindrance_is_taken_before_what_room_is_kept_for(store: Store, clock: Clock) -> None:
     big = queue(store, "a", priority=1)
     others = []
@@ -76,13 +86,13 @@ def test_what_is_no_hindrance_is_taken_before_what_room_is_kept_for(store: Store
         told.append(kept.id)
         return lambda job: job.id != others[1]
 
-    taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, before))]
+    taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, before=before))]
     assert taken == [others[0], others[3], others[2]], "in turns, but for the one that is in the way"
     assert told == [big] * 4
-    found = store.leases.take("two", full, before)
+    found = store.leases.take("two", full, before=before)
     assert found is not None
     assert found.job_id == others[1], "which another dispatcher has room for: it is kept by the first alone"
-    assert store.leases.take("two", full, before) is None
+    assert store.leases.take("two", full, before=before) is None
     assert lease(store, "one").job_id == big
 
 
