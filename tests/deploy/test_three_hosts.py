@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.features.network_weights import BackboneWeights
-from tests.deploy.test_two_hosts import ROOT, problem
+from tests.deploy.test_two_hosts import ROOT, problem, run
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +33,7 @@ def test_a_job_needs_no_folder_that_machines_share(how: str, tmp_path: Path, vgg
         pytest.skip(reason)
     environment = {**os.environ, "BIN": str(Path(sys.executable).parent)}
     command = [str(ROOT / "deploy" / "three_hosts.sh"), str(tmp_path / "out"), how]
-    ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
+    ended = run(command, environment)
     assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
     assert "computed on: host-node" in ended.stdout
     assert "the result is that of sgsst stylize, byte for byte" in ended.stdout

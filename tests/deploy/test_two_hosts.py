@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ def problem() -> str | None:
     """Why this machine cannot pretend to be two; None where it can."""
     if sys.platform != "linux" or os.geteuid() != 0:
         return "network namespaces are made by root, on Linux"
-    for tool in ("ip", "unshare", "nsenter"):
+    for tool in ("ip", "unshare", "nsenter", "setpriv"):
         if shutil.which(tool) is None:
             return f"{tool} is missing: apt-get install -y iproute2 util-linux"
     commands = [
@@ -41,6 +42,22 @@ def problem() -> str | None:
     return None
 
 
+def run(command: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """A script of `deploy/` to its end. Where the tests are broken off, it is asked to end and not killed: it removes
+    its hosts then.
+    """
+    held = ["setpriv", "--pdeathsig", "TERM", *command]
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(held, env=environment, cwd=ROOT, **pipes) as process:
+        try:
+            out, err = process.communicate()
+        except BaseException:
+            process.terminate()
+            process.wait()
+            raise
+    return subprocess.CompletedProcess(held, process.returncode, out, err)
+
+
 def test_one_job_on_two_hosts_from_a_cold_cache(tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
     if reason := problem():
         pytest.skip(reason)
@@ -50,9 +67,7 @@ def test_one_job_on_two_hosts_from_a_cold_cache(tmp_path: Path, vgg16_weights: B
         "BIN": str(Path(sys.executable).parent),
         "NUMBA_CACHE_DIR": str(kernels),  # takes the place of the __pycache__ folders
     }
-    ended = subprocess.run(
-        [ROOT / "deploy" / "two_hosts.sh", out], env=environment, cwd=ROOT, capture_output=True, text=True
-    )
+    ended = run([str(ROOT / "deploy" / "two_hosts.sh"), str(out)], environment)
     assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
     assert "Two hosts: 10.77.81.2 and 10.77.81.3" in ended.stdout
     assert re.search(r"^ranks: host-a \(cpu, \d+ threads\), host-b \(cpu, \d+ threads\)$", ended.stdout, flags=re.M)
