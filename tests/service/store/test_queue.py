@@ -61,8 +61,11 @@ def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store,
     assert lease(store, "one").job_id == small[2]
 
 
-def test_a_job_that_no_room_is_kept_for_is_passed_over(store: Store) -> None:
-    big, small = queue(store, "a"), queue(store, "b")
+def test_a_job_that_no_room_is_kept_for_is_passed_over(store: Store, clock: Clock) -> None:
+    big = queue(store, "a")
+    clock.now += 1
+    small = queue(store, "b")
+    clock.now += 1
     found = store.leases.take("one", lambda job: job.id == small, keeps=lambda job: False)
     assert found is not None
     assert found.job_id == small
