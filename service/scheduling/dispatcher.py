@@ -150,14 +150,16 @@ class Dispatcher:
             return dispatchers == 1 or self._backfill.is_near(job, held, share, self._store.database.clock())
 
         def before(kept: JobRow) -> Callable[[JobRow], bool] | None:
-            harmless = self._backfill.before(kept, held, share, self._store.database.clock())
+            granted = self._backfill.before(kept, held, share, self._store.database.clock())
+            if granted is None:
+                return None
 
-            def fits(job: JobRow) -> bool:
+            def is_harmless(job: JobRow) -> bool:
                 nonlocal grant
-                grant = harmless(job) if harmless else None
+                grant = granted(job)
                 return grant is not None
 
-            return fits if harmless else None
+            return is_harmless
 
         lease = self._store.leases.take(self.name, fits, keeps, before)
         return (lease, grant) if lease is not None and grant is not None else None

@@ -17,6 +17,7 @@ from service.files.blobs import BlobFolder
 from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.identity import is_dead, own_name
+from service.scheduling.job_size import estimated_seconds
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
 from service.scheduling.running import RunningAttempt
@@ -70,12 +71,33 @@ def test_it_is_known_while_it_is_at_work(settings: ServiceSettings, store: Store
     assert store.operations.dispatchers() == []
 
 
-def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
-    held = leased(store, "one")
+def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Store, folder: Path) -> RunningAttempt:
+    """One that was not started."""
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     artifacts = Artifacts(settings.artifacts_url)
+    return RunningAttempt(held, grant, folder, store, blobs, artifacts, settings, cluster=False)
+
+
+def test_an_attempt_tells_when_it_will_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+    held = leased(store, "one")
+    attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
+    for stage in ("planning", "preparing"):  # seconds of these are not the job's
+        attempt._take_in({"kind": "stage", "stage": stage, "seconds_left": 3.0})
+    assert attempt.holding == Holding(attempt.grant)
+    attempt._take_in({"kind": "progress", "step": 1, "total": 2, "seconds_left": 1000.0})
+    told = attempt.holding
+    assert told.until is not None
+    assert told.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
+    estimated = estimated_seconds(held.job.parameters, held.job.inputs)
+    assert told.pace == pytest.approx(1000.0 / estimated, rel=0.06)
+    held.job.attempt = 2  # its seconds may be those that a checkpoint has left
+    assert attempt.holding.pace is None
+
+
+def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+    held = leased(store, "one")
     grant = Grant(3, ("5", "6", "7"))
-    attempt = RunningAttempt(held, grant, tmp_path, store, blobs, artifacts, settings, cluster=False)
+    attempt = attempt_of(held, grant, settings, store, tmp_path)
     room = Room(Machine(grant.gpus, 2, 10**11), None)
     assert room.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
