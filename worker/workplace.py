@@ -36,6 +36,10 @@ class OpenWorkplace(Protocol):
 class Workplace(Protocol):
     """What a machine needs to make such a folder. It is pickled, and travels to every rank."""
 
+    @property
+    def scene_bytes(self) -> int:
+        """Bytes of the job's scene once it is read, as its file tells."""
+
     def open(self, rank: int, stored: Stored) -> OpenWorkplace:
         """Lay out the job's files; on the first rank, store what the job makes from then on.
 

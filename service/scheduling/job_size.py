@@ -13,10 +13,8 @@ from typing import Any
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Settings, make_settings
+from worker.ranks.host_memory import GAUSSIAN_BYTES, scene_bytes
 
-#: Bytes of a Gaussian by the file's suffix, the longest first: 62 float32 of SH 3; chunks of 16 bytes and SH in bytes;
-#: a .splat's 32; SPZ is zipped besides.
-_GAUSSIAN_BYTES = ((".compressed.ply", 61.0), (".ply", 248.0), (".splat", 32.0), (".spz", 25.0))
 #: Bytes of a pixel of a photo as cameras save them (JPEG, 3 bits).
 _PHOTO_BYTES = 0.35
 #: Longer side of views of which nothing is known, and height to width of those of which only that is known.
@@ -116,9 +114,7 @@ def _settings(parameters: Mapping[str, Any]) -> Settings:
 
 
 def _gaussians(entry: Mapping[str, Any]) -> float:
-    name = str(entry.get("name", "")).lower()
-    each = next((size for suffix, size in _GAUSSIAN_BYTES if name.endswith(suffix)), 248.0)
-    return float(entry["size"] / each)
+    return scene_bytes(str(entry.get("name", "")), entry["size"]) / GAUSSIAN_BYTES
 
 
 def _view_pixels(parameters: Mapping[str, Any], settings: Settings, inputs: Sequence[Mapping[str, Any]]) -> float:

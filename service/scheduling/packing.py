@@ -4,7 +4,7 @@ On GPUs a job has its GPUs to itself. One that names no number of `workers` is o
 all of them where no other job waits, one where many do, but never more than a job of its size is worth
 (`service.scheduling.job_size`). The plan, made with measured times, then takes as many as make the job faster, and the
 rest are given back (see `service.scheduling.running`). Memory of the machine is counted too: a job waits where those
-that run leave too little for its scene. A Ray cluster's machines are Ray's to look after.
+that run leave too little for its scene. On a Ray cluster Ray counts it, machine by machine (`worker.ranks.placement`).
 
 Without GPUs, places stand for parts of the processor and of the memory. There is one, unless the operator wants several
 jobs side by side: one job uses all cores well. A job that needs more memory than a place has takes several.
@@ -19,19 +19,16 @@ from dataclasses import dataclass
 from service.scheduling.job_size import estimated_size
 from service.scheduling.machine import Machine
 from service.store.tables import JobRow
+from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
 #: Of all memory, what jobs side by side plan with together at most, and what one of them does: as a job that is alone
 #: plans (`sgsst_core.budget`), so that it rounds the same beside another one.
 _MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
-#: What a job needs at least beside its scene, and how often the bytes of the scene's file: as it was read, as it is
+#: What a job needs at least beside its scene, and how often the bytes of the scene: as it was read, as it is
 #: rendered, and twice for what the views and the optimiser keep of each Gaussian. A job of 4 million Gaussians (1 GB)
 #: had 5.8 GB at its peak, one of 50,000 had 0.95 GB.
 _LEAST_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
-#: On GPUs, memory of the machine that a rank takes beside the scene (CUDA's and PyTorch's libraries, pinned buffers),
-#: and how often the bytes of the scene's file: as it was read, and as it is laid out for all ranks.
-_RANK_MEMORY = 3_000_000_000
-_SCENE_COPIES_BESIDE_GPUS = 2
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class Grant:
         places: of those for jobs side by side.
         threads: of the processor; None for all.
         memory: bytes to plan with; None for what a job that is alone takes.
-        scene: bytes that the scene of a job on GPUs takes in the machine's memory, once for all ranks.
+        scene: bytes of its scene, once it is read.
     """
 
     ranks: int
@@ -57,7 +54,7 @@ class Grant:
     @property
     def beside_gpus(self) -> int:
         """Bytes of the machine's memory that a job on GPUs is counted with."""
-        return self.ranks * _RANK_MEMORY + self.scene if self.gpus else 0
+        return memory_beside_gpus(self.ranks, self.scene) if self.gpus else 0
 
 
 class Room:
@@ -114,8 +111,7 @@ class Room:
             ranks = estimated_size(job.parameters, job.inputs).gpus(share) if share > 1 else 1
         if ranks > len(free):
             return None
-        scene = 0 if self._machine.cluster else _SCENE_COPIES_BESIDE_GPUS * _scene_bytes(job)
-        grant = Grant(ranks, tuple(free[:ranks]), scene=scene)
+        grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
         if not held or self._machine.cluster:  # one that is alone may try
             return grant
         together = sum(each.beside_gpus for each in (grant, *held))
@@ -136,7 +132,11 @@ class Room:
 
 
 def _scene_bytes(job: JobRow) -> int:
-    return sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
+    """Of its scene, once it is read and refined."""
+    files = [entry for entry in job.inputs if entry["role"] == "scene"]
+    growth = job.parameters.get("refine")
+    size = sum(scene_bytes(str(entry.get("name", "")), entry["size"]) for entry in files)
+    return int(size * growth) if isinstance(growth, int | float) and growth > 1 else size
 
 
 def _asked(job: JobRow, name: str) -> int:

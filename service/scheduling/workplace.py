@@ -33,6 +33,7 @@ from service.settings import ServiceSettings
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from worker.ranks import sweeper
+from worker.ranks.host_memory import scene_bytes
 from worker.workplace import Stored
 
 #: Seconds between two looks for what a job has made.
@@ -64,7 +65,7 @@ class StoreWorkplace:
     Attributes:
         url: of the store.
         job_id, epoch: under which the job's files are stored.
-        inputs: `role`, `name` and `sha256` of each, for `stage`.
+        inputs: `role`, `name`, `sha256` and `size` of each, for `stage`.
         files: the inputs by digest.
         checkpoint: to go on from; None for none.
         weights: of feature networks, by the names of their files; empty for those that the machine has itself.
@@ -95,6 +96,12 @@ class StoreWorkplace:
             StoredFile(**checkpoint) if checkpoint else None,
             {name: StoredFile(**file) for name, file in values["weights"].items()},
         )
+
+    @property
+    def scene_bytes(self) -> int:
+        """Bytes of the scene, once it is read."""
+        files = [entry for entry in self.inputs if entry["role"] == "scene"]
+        return sum(scene_bytes(entry["name"], entry["size"]) for entry in files)
 
     def open(self, rank: int, stored: Stored) -> RankFolder:
         """Fetch what is not in this machine's cache, and link the rest: once for all ranks of a machine.

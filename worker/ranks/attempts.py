@@ -18,6 +18,7 @@ from worker.options import RunOptions
 from worker.ranks.cluster import Cluster
 from worker.ranks.ending import end_rank, end_ranks
 from worker.ranks.failure_policy import FailedAttempt, Failure, GiveUp, RaiseError, decide, first_line
+from worker.ranks.host_memory import scene_bytes
 from worker.ranks.listener import Listener, Relay
 from worker.ranks.polling import look_for_losses, poll_ranks
 from worker.ranks.rank import RankProcess, RankTask
@@ -195,7 +196,7 @@ class _Attempts:
                 self._cluster.close()
                 self._cluster.open()
                 self._let_go = False
-            start_ranks(self._group, self._workers, self._options.actor, self._task)
+            start_ranks(self._group, self._workers, self._scene_bytes(), self._options.actor, self._task)
             return self._watch()
         except (ray.exceptions.RayError, ConnectionError) as error:
             raise AttemptFailedError(Failure("loss", f"Ray failed: {first_line(error)}", error)) from error
@@ -243,6 +244,15 @@ class _Attempts:
             seconds_since_loss=time.monotonic() - self._lost_at,
             workplace=self._workplace(),
         )
+
+    def _scene_bytes(self) -> int:
+        """Of the scene once it is read and refined; 0 where nothing is known of it before ranks look."""
+        workplace, scene = self._options.workplace, self._request.source.scene
+        try:
+            size = workplace.scene_bytes if workplace else scene_bytes(scene.name, scene.stat().st_size)
+        except OSError:
+            return 0
+        return int(size * self._request.settings.refine)
 
     def _resume(self) -> Resume:
         """The first attempt does what the user asked for; later ones go on from what this job has saved."""

@@ -6,6 +6,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from worker.ranks.host_memory import memory_beside_gpus
+
 #: What Ray calls a machine by, in labels.
 NODE_LABEL = "ray.io/node-id"
 #: Seconds to wait for places that are taken; what lost ranks held is free again after a moment.
@@ -59,11 +61,15 @@ def give_back(group: Any) -> None:
     remove_placement_group(group)
 
 
-def reserve(workers: int) -> Reservation:
+def reserve(workers: int, scene: int = 0) -> Reservation:
     """Places for as many of the ranks as there is room for now.
 
-    GPUs, where the cluster has any, are given out one for each rank, on as few machines as possible; otherwise ranks
-    are spread over the machines, and share the cores.
+    GPUs, where the cluster has any, are given out one for each rank, on as few machines as possible, with the memory of
+    the machine that the rank takes; otherwise ranks are spread over the machines, and share the cores.
+
+    Args:
+        workers: ranks at most.
+        scene: bytes of the job's scene once it is read.
 
     Raises:
         NoRoomError: for none.
@@ -76,14 +82,22 @@ def reserve(workers: int) -> Reservation:
     wanted = min(wanted, sum(count // threads for count in cores))
     deadline = time.monotonic() + PLACE_SECONDS
     while wanted > 0:
-        groups = _places(wanted, threads, 1 if gpus else 0, deadline)
+        groups = _places(wanted, _bundle(nodes, wanted, threads, scene), deadline)
         if groups:
             return Reservation(groups, threads, 1 if gpus else 0)
         if threads > 1 and not gpus:  # other work may hold a part of the cores
             threads = 1
         else:
             wanted -= 1
-    raise NoRoomError("Ray has no free place for a worker")
+    raise NoRoomError(f"Ray has no free place for a worker, which takes {_told(_bundle(nodes, 1, threads, scene))}")
+
+
+def _told(bundle: dict[str, int]) -> str:
+    """What a place has, in words."""
+    parts = [f"{bundle['CPU']} cores" if bundle["CPU"] > 1 else "a core"]
+    parts += ["a GPU"] if "GPU" in bundle else []
+    parts += [f"{bundle['memory'] / 1e9:.1f} GB of memory"] if "memory" in bundle else []
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
 
 
 def _nodes() -> list[dict[str, float]]:
@@ -101,7 +115,19 @@ def _threads(cores: list[int], ranks: int) -> int:
     )
 
 
-def _places(ranks: int, threads: int, gpus: int, deadline: float) -> tuple[Any, ...]:
+def _bundle(nodes: list[dict[str, float]], ranks: int, threads: int, scene: int) -> dict[str, int]:
+    """What each of so many ranks asks Ray for."""
+    with_gpus = [node for node in nodes if node.get("GPU")]
+    if not with_gpus:
+        return {"CPU": threads}
+    sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))  # on few machines: they share the scene there
+    # A job for which no machine has enough may try on one that nobody else is on.
+    most = max(int(node.get("memory", 0)) for node in with_gpus)
+    memory = min(memory_beside_gpus(sharing, scene), most) // sharing
+    return {"CPU": threads, "GPU": 1, **({"memory": memory} if memory else {})}
+
+
+def _places(ranks: int, bundle: dict[str, int], deadline: float) -> tuple[Any, ...]:
     """A placement group for each rank, once all are there; empty where that takes too long.
 
     Ray gives the bundles of a group back together only. So it is asked for all of them at once, which it puts where
@@ -110,8 +136,7 @@ def _places(ranks: int, threads: int, gpus: int, deadline: float) -> tuple[Any, 
     """
     from ray.util import placement_group, placement_group_table
 
-    bundle = {"CPU": threads, **({"GPU": gpus} if gpus else {})}
-    together = placement_group([bundle] * ranks, strategy="PACK" if gpus else "SPREAD")
+    together = placement_group([bundle] * ranks, strategy="PACK" if "GPU" in bundle else "SPREAD")
     found = together.wait(max(deadline - time.monotonic(), 1.0))
     nodes = dict(placement_group_table(together)["bundles_to_node_id"]) if found else {}
     give_back(together)

@@ -19,12 +19,13 @@ START_SECONDS = 60.0
 MakeTask = Callable[[int, str], RankTask]
 
 
-def start_ranks(group: RankGroup, workers: int, actor: type[RankProcess], make_task: MakeTask) -> None:
+def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProcess], make_task: MakeTask) -> None:
     """Start as many ranks as there is room for, and begin their work.
 
     Args:
         group: an empty one; it holds what has been started even where an error is raised.
         workers: ranks at most.
+        scene: bytes of the job's scene, for which GPUs' machines need room.
         actor: what runs a rank.
 
     Raises:
@@ -34,7 +35,7 @@ def start_ranks(group: RankGroup, workers: int, actor: type[RankProcess], make_t
     import ray
 
     try:
-        group.reservation = reserve(workers)
+        group.reservation = reserve(workers, scene)
     except NoRoomError as error:
         raise AttemptFailedError(Failure("loss", str(error), ClusterAwayError(f"{error}."))) from error
     kind = ray.remote(actor)

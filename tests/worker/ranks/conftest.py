@@ -1,0 +1,57 @@
+"""A Ray cluster for those tests that join one."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from worker.ranks import cluster, sweeper
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A Ray cluster of one node, which was there before and stays: told of two GPUs that are not there, and 10 GB."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", cluster._SECRET)
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")  # or Ray would not believe that there are any
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    folder = tempfile.mkdtemp(prefix="sgsst-head-", dir="/tmp")
+    import ray
+
+    here, port = ray.util.get_node_ip_address(), free_port()  # Ray takes 127.0.0.1 for this address when it joins
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", f"--port={port}"]
+    command += [f"--node-ip-address={here}", "--num-cpus=2", "--num-gpus=2", "--memory=10000000000"]
+    command += [
+        "--include-dashboard=false",
+        "--object-store-memory=100000000",
+        f"--temp-dir={folder}",
+        "--disable-usage-stats",
+    ]
+    head = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    assert head.stdout is not None
+    monkeypatch.setenv("RAY_ADDRESS", f"{here}:{port}")
+    try:
+        assert any("Ray runtime started" in line for line in head.stdout), "Ray's head has not come up"
+        yield
+    finally:
+        head.terminate()
+        head.wait(30)
+        sweeper.sweep(Path(folder))
+
+
+def free_port() -> int:
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        return int(listening.getsockname()[1])
