@@ -2,9 +2,10 @@
 
 python -m benchmarks.surround SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
 
-A way is a surround (background, random, palette), with "+warm" from the style's mean and spread. All of them have the
-same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`) on views between
-those. Rows are added to the file benchmarks/results/surround.json, under NAME; the figures of more seeds are means.
+A way is a surround (background, random, palette), with "+warm" from the style's distribution of colours. All of them
+have the same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`) on
+views between those. Rows are added to the file benchmarks/results/surround.json, under NAME; the figures of more seeds
+are means.
 """
 
 from __future__ import annotations

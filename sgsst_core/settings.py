@@ -200,7 +200,7 @@ class Settings(BaseModel):
     )
     warm_start: Annotated[
         bool | None, Option(flags="--warm-start/--cold-start", default="on for scans without background")
-    ] = Field(None, description="Begin with the style's mean colour and spread.")
+    ] = Field(None, description="Begin with colours that are distributed as the style's.")
     revive: bool = Field(
         False, description="Let colours that fell below black come back, by gradients that would raise them."
     )

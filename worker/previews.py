@@ -21,7 +21,7 @@ _SIDE = 960
 class Previews:
     """Writes the first evaluation view with its present colours now and then; for `loop.Callbacks.preview`.
 
-    Before the first step there is one, too, with the closed-form colours of a warm start: it shows in seconds where the
+    Before the first step there is one, too, with the colours of a warm start: it shows in seconds where the
     job goes.
 
     Args:

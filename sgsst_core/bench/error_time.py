@@ -96,7 +96,7 @@ VARIANTS = {
         Variant("coarse-only", "the coarsest scale alone", _coarse_only),
         Variant("one-scale", "the paper's loss at full size alone", _full_size_only),
         Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
-        Variant("warm-start", "standard, from the style's mean colour and spread", settings={"warm_start": True}),
+        Variant("warm-start", "standard, from the style's distribution of colours", settings={"warm_start": True}),
         Variant("cold-start", "standard, from the scene's own colours", settings={"warm_start": False}),
         Variant(
             "fixed-surround", "standard, with the background behind every step", settings={"surround": "background"}

@@ -1,8 +1,8 @@
 """How good the results of several ways to run one job are, after the same seconds each.
 
 Variants are those of `error_time`. What they have reached is judged by a network that none of them optimises (`Judge`),
-on views between the job's cameras, beside the loss that is left, and beside the unstylized scene and a closed-form
-colour transfer alone. A variant on the front has no other with both more style and more content.
+on views between the job's cameras, beside the loss that is left, and beside the unstylized scene and a transfer of
+colours alone. A variant on the front has no other with both more style and more content.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def compare_quality(
     transferred = warm_start(scene.sh_dc, blend_weights, style)
     outcomes = [
         outcome(UNSTYLIZED, "the scene as it came", scene.sh_dc),
-        outcome(TRANSFER, "the style's mean colour and spread in closed form, no step", transferred),
+        outcome(TRANSFER, "the style's distribution of colours, no step", transferred),
     ]
     curves = error_time(scene, cameras, style, variants, seconds, weights=weights, progress=progress, **settings)
     for curve in curves:

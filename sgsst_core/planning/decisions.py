@@ -146,11 +146,11 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
         decisions.append(Decision("surround", f"{colour} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
         reason = f"{share}: nothing beside the object tells how bright it should be"
-        begins = "luminance begins" if settings.keep_colours == "luminance" else "colours begin"
+        by_luminance = settings.keep_colours == "luminance"
         decisions.append(
             Decision(
                 "start",
-                f"{begins} with the style's mean and spread",
+                "luminance begins with the style's mean and spread" if by_luminance else "colours begin as the style's",
                 reason if settings.warm_start is None else "asked for",
                 error="it is another start than the paper's",
             )

@@ -84,7 +84,7 @@ class Plan:
         covered: indices of the views that are stylized.
         weighted: statistics are weighted by coverage.
         surround: what is behind the Gaussians in a step.
-        warm_start: the job begins with the style's mean colour and spread.
+        warm_start: the job begins with the style's colours.
         steps_coarse: of phase 1; 0 where it is left out.
         memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
         device: on which the feature network computes.

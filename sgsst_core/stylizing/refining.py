@@ -36,7 +36,7 @@ from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
 from sgsst_core.scene.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
-from sgsst_core.stylizing.warm_start import warm_start
+from sgsst_core.stylizing.warm_start import with_moments
 
 #: Views whose gradient is taken, evenly spread: each costs an iteration.
 GRADIENT_VIEWS = 24
@@ -183,7 +183,7 @@ class _Refining:
         device = self._workshop.network.device
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
         style = style.map(lambda picture: picture.to(device))
-        scene = replace(self._scene, sh_dc=warm_start(self._scene.sh_dc, total, style))
+        scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
         loss = SosLoss(
             self._workshop.network,
             content_weight=0.0,

@@ -211,7 +211,7 @@ class Stylizer:
         )
 
     def transferred(self) -> Tensor:
-        """Colours [N, 3] of the Gaussians that are rendered, with the style's mean and spread in closed form."""
+        """The style's colours before any step, [N, 3], of the Gaussians that are rendered: see `warm_start`."""
         seen, own = self.plan.seen, self.scene.sh_dc[self.plan.seen]
         weights = self.plan.survey.total_blend_weights[seen]
         found = self.styles.transferred(own, weights, seen, keep_chroma=self._keeps_chroma)

@@ -1,11 +1,13 @@
-"""Warm start: colours whose mean and covariance are the style's, in closed form.
+"""Warm start: colours that are the style's before any step, with each Gaussian's weight in the views.
 
-The map is the linear one that moves colours least (optimal transport between Gaussian distributions; Pitié and
+`warm_start` gives them the distribution of the style's colours (see `colour_transport`); `with_moments` only its mean
+and covariance, by the linear map that moves colours least (optimal transport between Gaussian distributions; Pitié and
 Kokaram, "The Linear Monge-Kantorovitch Linear Colour Mapping for Example-Based Colour Transfer", 2007):
 
     A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2,   c -> A (c - m) + m_style
 
-with S, m the scene's covariance and mean, weighted by what each Gaussian contributes to the views, and T the style's.
+with S, m the scene's covariance and mean and T the style's. What it moves out of 0..1 is cut off: of a dark object and
+a bright style of two colours, a pale grey was left.
 """
 
 from __future__ import annotations
@@ -15,25 +17,51 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.loss.mixture import StyleMixture, mixed_moments
+from sgsst_core.loss.nearest import chosen_places
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
+from sgsst_core.stylizing.colour_transport import transported
 
 #: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
 #: could be stretched to the style's: it is left flat instead of blowing rounding up.
 _FLAT = 1e-9
 
 
+#: Pixels of a style that stand for all of them, at most.
+_PIXELS = 1 << 16
+
+
 def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
-    """DC coefficients with the style's colours, clamped to what a picture can show (0..1).
+    """DC coefficients with the distribution of the style's colours, all of which a picture can show (0..1).
 
     Args:
         sh_dc: [N, 3] float32.
         weights: [N] float64, total blend weights, at least one positive.
-        style: pictures [H, W, 3] in 0..1; of several, the moments are the mixture's.
+        style: pictures [H, W, 3] in 0..1; of several, colours are as frequent as in the mixture.
 
     Returns:
         [N, 3] float32.
     """
+    colours = COLOUR_OFFSET + SH_C0 * sh_dc.double()
+    wanted = _some_pixels(StyleMixture.of(style)).to(colours)
+    moved = transported(colours, weights.double() / weights.double().amax(), wanted)
+    return on_screen(((moved.clamp(0, 1) - COLOUR_OFFSET) / SH_C0).to(sh_dc.dtype))
+
+
+def _some_pixels(style: StyleMixture) -> Tensor:
+    """Pixels [n, 3] of a style, evenly spread, as many of each picture as it weighs."""
+    parts = []
+    for picture, weight in zip(style.pictures, style.weights, strict=True):
+        pixels, count = picture.reshape(-1, 3), max(1, round(_PIXELS * weight))
+        places = chosen_places(len(pixels), count)
+        if len(style.pictures) > 1 and len(places) < count:  # of a small picture, each comes several times
+            places = torch.arange(count) * len(pixels) // count
+        parts.append(pixels[places])
+    return torch.cat(parts)
+
+
+def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
+    """DC coefficients with the style's mean and covariance, cut off at 0..1; arguments as of `warm_start`."""
     colours = 0.5 + SH_C0 * sh_dc.double()
     mean, covariance = _moments(colours, weights.double() / weights.double().amax())
     wanted_mean, wanted = _style_moments(StyleMixture.of(style))

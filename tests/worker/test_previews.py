@@ -16,7 +16,7 @@ from tests.small_scenes import cameras, wall
 from worker.previews import Previews
 
 
-def test_the_first_preview_shows_the_closed_form_colours_before_any_step(
+def test_the_first_preview_shows_the_colours_of_a_warm_start_before_any_step(
     tiny_weights: BackboneWeights, tmp_path: Path
 ) -> None:
     settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)

@@ -1,0 +1,122 @@
+"""Colours that get the distribution of others: against a plain transport without samples, and on what is degenerate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.stylizing import colour_transport
+from sgsst_core.stylizing.colour_transport import _drawn, _turns, transported
+
+Array = NDArray[np.float64]
+
+
+def colours(count: int, seed: int) -> Tensor:
+    """Two heaps of colours, one of them long and thin."""
+    generator = torch.Generator().manual_seed(seed)
+    heap = 0.2 + 0.05 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    long = 0.7 + 0.2 * torch.randn(count, 1, generator=generator, dtype=torch.float64) * torch.tensor([0.6, 0.3, -0.7])
+    chosen = torch.rand(count, 1, generator=generator) < 0.3
+    return torch.where(chosen, heap, long + 0.01 * torch.randn(count, 3, generator=generator)).clamp(0, 1)
+
+
+def weights(count: int, seed: int) -> Tensor:
+    return torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 4
+
+
+def plain(moved: Array, weight: Array, wanted: Array) -> Array:
+    """The same with all colours and without knots: each value becomes the one at its own share of the weight."""
+    moved = moved.copy()
+    for axes in (turn.numpy() for turn in _turns()):
+        turned, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
+        for axis in range(3):
+            order = np.argsort(turned[:, axis])
+            share = np.cumsum(weight[order]) - 0.5 * weight[order]
+            places = np.linspace(0, weight.sum(), len(targets))
+            turned[order, axis] = np.interp(share, places, targets[:, axis])
+        moved = turned @ axes.T
+    return moved
+
+
+def distance(first: Tensor, second: Tensor) -> float:
+    """Mean distance of the distributions' quantiles along many directions."""
+    directions = torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    shares = torch.linspace(0, 1, 300, dtype=torch.float64)
+    parts = [
+        (torch.quantile(first @ direction, shares) - torch.quantile(second @ direction, shares)).abs().mean()
+        for direction in directions / directions.norm(dim=1, keepdim=True)
+    ]
+    return float(torch.stack(parts).mean())
+
+
+def test_turns_are_turns_and_all_differ() -> None:
+    turns = list(_turns())
+    assert len(turns) == colour_transport.ROUNDS
+    for turn in turns:
+        torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
+        assert torch.linalg.det(turn) == pytest.approx(1)
+    angles = [torch.arccos(((a.T @ b).trace() - 1) / 2) for i, a in enumerate(turns) for b in turns[:i]]
+    assert min(angles) > 0.2
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
+def test_weighted_colours_get_the_distribution_that_is_wanted(scale: float) -> None:
+    own, count, wanted = colours(4000, 0), scale * weights(4000, 1), 1 - colours(3000, 2)
+    found = transported(own, count, wanted)
+    assert distance(own[_drawn(count)], wanted) > 0.1
+    assert distance(found[_drawn(count)], wanted) < 0.01
+
+
+def test_samples_and_knots_are_near_a_transport_without_them() -> None:
+    own, count, wanted = colours(3000, 3), weights(3000, 4), 1 - colours(2000, 5)
+    expected = torch.from_numpy(plain(own.numpy(), count.numpy(), wanted.numpy()))
+    error = (transported(own, count, wanted) - expected).norm(dim=1)
+    seen = count > 0.01  # what hardly counts lies anywhere between its neighbours
+    assert float(error[seen].median()) < 0.01
+    assert float(error[seen].quantile(0.95)) < 0.06
+    assert float((own - expected).norm(dim=1).median()) > 0.2
+
+
+def test_a_distribution_that_is_there_already_stays() -> None:
+    own = colours(5000, 6)
+    error = (transported(own, torch.ones(5000, dtype=torch.float64), own) - own).norm(dim=1)
+    assert float(error.mean()) < 1e-3
+    assert float(error.max()) < 0.06, "of the outermost ones, between which there is nothing"
+
+
+def test_equal_colours_stay_equal_and_what_has_no_weight_changes_nothing() -> None:
+    own, count, wanted = colours(500, 7), weights(500, 8), colours(500, 9)
+    more = torch.cat([own, own[:100], 5 - own])
+    less = torch.cat([count, torch.zeros(600, dtype=torch.float64)])
+    found = transported(more, less, wanted)
+    torch.testing.assert_close(found[:500], transported(own, count, wanted), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found[500:600], found[:100], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e30])
+def test_colours_of_any_size_end_near_the_wanted_ones(size: float) -> None:
+    own, wanted = size * (colours(800, 10) - 0.5), colours(900, 11)
+    found = transported(own, torch.ones(800, dtype=torch.float64), wanted)
+    assert bool(found.isfinite().all())
+    assert float(found.min()) > -0.3
+    assert float(found.max()) < 1.3
+    torch.testing.assert_close(found.mean(0), wanted.mean(0), rtol=0, atol=0.05)
+
+
+def test_one_colour_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
+    wanted = colours(1000, 12)
+    own = torch.full((100_000, 3), 0.1, dtype=torch.float64)
+    own += 1e-9 * torch.randn(own.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = transported(own, torch.ones(len(own), dtype=torch.float64), wanted)
+    torch.testing.assert_close(found.mean(0), wanted.mean(0), rtol=0, atol=1e-3)
+    assert float(found.std(0).max()) < 1e-6
+
+
+def test_parts_that_go_through_together_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    own, count, wanted = colours(1000, 13), weights(1000, 14), colours(700, 15)
+    whole = transported(own, count, wanted)
+    monkeypatch.setattr(colour_transport, "_TOGETHER", 17)
+    torch.testing.assert_close(transported(own, count, wanted), whole, rtol=0, atol=1e-12)
