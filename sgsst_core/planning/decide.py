@@ -176,7 +176,8 @@ class _Deciding:
             return "none"
         if form != "auto":
             return form
-        if not self._keeping_pays(visits):
+        own_bytes = raster.half_bytes / len(self.probe.survey.covered) / self.probe.machine.ranks
+        if own_bytes > self.budget or not self._keeping_pays(visits):  # not even one view's would be kept
             return "none"
         exactly = raster.bytes <= self.budget or self.settings.preset == "paper"
         return "float32" if exactly else "half"

@@ -16,7 +16,7 @@ from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Wo
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
-from sgsst_core.planning.visits import MAP_BYTES, MAPS_OF_A_RENDER, Visits
+from sgsst_core.planning.visits import MAP_BYTES, MAPS_OF_A_RENDER, Made, Visits
 from sgsst_core.scene.camera import Camera
 from sgsst_core.settings import Settings
 
@@ -337,6 +337,8 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
             reason = "gsplat keeps none"
         elif plan.anew in GPU_RASTERIZERS:
             reason = _why_not_on_a_gpu(raster, reason)
+        elif (least := (raster.half_bytes or 0) / len(plan.covered)) > budget:
+            reason = f"those of one view take {least / 1e9:.2g} GB, and {budget / 1e9:.2g} GB are there for them"
         return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
     room = f"{budget / 1e9:.1f} GB are there for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
@@ -344,11 +346,11 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
     if plan.kept_weights == "half":
         size = raster.half_bytes or 0
         error = "each weight is off by at most 1/2048 of itself: 0.12 of 255 levels in a pixel"
-    part = "all" if size <= budget else f"{budget / size:.0%} of the views'"
+    share = Made(0.0, size, budget, len(plan.covered)).kept
+    part = "all" if share == 1 else f"{share:.0%} of the views'"
     decision = f"{part} kept in {'half precision' if plan.kept_weights == 'half' else 'float32'}"
     if plan.coarse_weights:
         decision += "; in phase 1 only those of the coarsest scale"
-    share = min(1.0, budget / max(size, 1))
     reason = f"they take {size / 1e9:.2f} GB of all views; {room}"
     if plan.anew in GPU_RASTERIZERS and raster.kept_seconds is not None:
         reason += f"; {_against(raster)}"

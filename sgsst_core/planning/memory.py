@@ -93,7 +93,8 @@ class PeakMemory:
 
     def _weights(self) -> int:
         weights = self.visits.weights
-        return int(min(self._all_visited * weights.bytes / self._ranks, weights.room)) if weights else 0
+        ranks = self._ranks
+        return int(min(self._all_visited * weights.bytes / ranks, weights.fitting(ranks))) if weights else 0
 
     def _colours(self) -> int:
         colours = self.visits.colours

@@ -39,16 +39,18 @@ class Made:
         seconds: of making it.
         bytes: of all views together.
         room: bytes that there are for them.
+        views: how many, where a view's is kept whole or not at all; None where any share of it is.
     """
 
     seconds: float
     bytes: float = 0.0
     room: float = float("inf")
+    views: int | None = None
 
     @property
     def kept(self) -> float:
         """The share of the views for which it is kept."""
-        return min(1.0, self.room / self.bytes) if self.bytes else 1.0
+        return self.fitting() / self.bytes if self.bytes else 1.0
 
     @property
     def once(self) -> float:
@@ -63,7 +65,14 @@ class Made:
     @property
     def kept_bytes(self) -> int:
         """Memory that it takes at last."""
-        return int(min(self.bytes, self.room))
+        return int(self.fitting())
+
+    def fitting(self, ranks: int = 1) -> float:
+        """Bytes that are kept on each of some ranks, among which every view is divided."""
+        own = self.bytes / ranks
+        if own <= self.room:
+            return own
+        return self.room if self.views is None else self.room // (own / self.views) * (own / self.views)
 
 
 @dataclass(frozen=True)
@@ -117,7 +126,7 @@ class Visits:
         if plan.kept_weights != "none":
             size = (raster.bytes if plan.kept_weights == "float32" else raster.half_bytes) or 0
             seconds = KEEPING_RENDERS * raster.seconds if raster.keeping_seconds is None else raster.keeping_seconds
-            weights = Made(seconds, size, weighed)
+            weights = Made(seconds, size, weighed, views)
         rendered = RENDER * raster.seconds if settings.content_weight else 0.0
         forward = probe.network.rate.forward if settings.content_weight else 0.0
         room_of_content = 0 if "content" in settings.keep else room / (4 if probe.maps else 2)

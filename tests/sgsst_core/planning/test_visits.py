@@ -40,6 +40,25 @@ def test_what_fits_is_made_once_and_the_rest_at_every_visit() -> None:
     assert (Made(6.0).once, Made(6.0, 400, 0).always) == (6.0, 6.0)
 
 
+def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
+    made = Made(6.0, 400, 250, views=4)
+    assert (made.kept, made.once, made.always, made.kept_bytes) == (0.5, 3.0, 3.0, 200)
+    assert (made.fitting(2), made.fitting(4)) == (200, 100)
+    alone = Made(6.0, 400, 250, views=1)
+    assert (alone.kept, alone.always, alone.kept_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
+
+
+def test_blend_weights_of_which_no_view_fits_are_not_kept() -> None:
+    """Nor counted in the peak, nor taken for an approximation that has to be measured."""
+    fits, large = (replace(LARGE, bytes=4 * size, half_bytes=2 * size) for size in (GIGABYTE // 2, 8 * GIGABYTE))
+    assert plan_of(fits).kept_weights == "float32"
+    plan = plan_of(large)
+    assert plan.kept_weights == "none"
+    decision = next(each for each in plan.decisions if each.item == "blend weights")
+    assert "those of one view take 4 GB, and 2.5 GB are there" in decision.reason
+    assert plan_of(large, kept_weights="half").kept_weights == "half"
+
+
 def test_lists_and_colours_come_with_the_first_visit_where_they_fit() -> None:
     """The survey's lists are cut down to the Gaussians that are rendered, for a quarter of what they cost."""
     small, large = expected(replace(LARGE, first_seconds=0.0, colours_seconds=0.0)), expected(LARGE)
