@@ -48,6 +48,16 @@ def is_scan(looked: Survey, *, weighted: bool) -> bool:
     return weighted and looked.uncovered_share > SCAN_SHARE
 
 
+def starts_warm(settings: Settings, *, scan: bool) -> bool:
+    """Whether colours begin as the style's: what they have in common, steps reach slowly (docs/quality.md).
+
+    By luminance alone that is known of scans only, beside which nothing tells how bright they should be.
+    """
+    if settings.warm_start is None:
+        return scan or settings.keep_colours != "luminance"
+    return settings.warm_start
+
+
 def surround_of(settings: Settings, *, scan: bool) -> PlannedSurround:
     """What is behind the Gaussians in a step."""
     if settings.surround == "auto":

@@ -22,6 +22,7 @@ from sgsst_core.planning.choices import (
     optimised_gaussians,
     precision_of,
     rendered_gaussians,
+    starts_warm,
     surround_of,
 )
 from sgsst_core.planning.cost import (
@@ -140,7 +141,7 @@ class _Deciding:
             weighted=weighted,
             steps_coarse=steps_coarse,
             surround=surround_of(settings, scan=scan),
-            warm_start=scan if settings.warm_start is None else settings.warm_start,
+            warm_start=starts_warm(settings, scan=scan),
             memory_limit=probe.machine.memory_limit,
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
@@ -176,8 +177,7 @@ class _Deciding:
             return "none"
         if form != "auto":
             return form
-        own_bytes = raster.half_bytes / len(self.probe.survey.covered) / self.probe.machine.ranks
-        if own_bytes > self.budget or not self._keeping_pays(visits):  # not even one view's would be kept
+        if not self._keeping_pays(visits):
             return "none"
         exactly = raster.bytes <= self.budget or self.settings.preset == "paper"
         return "float32" if exactly else "half"

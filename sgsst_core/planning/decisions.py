@@ -11,7 +11,7 @@ from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
-from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, pruned_gaussians
+from sgsst_core.planning.choices import GPU_RASTERIZERS, is_scan, precision_of, pruned_gaussians
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
@@ -145,7 +145,9 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
             reason += f"; content features are computed with it, {cost:.2g} s in every iteration"
         decisions.append(Decision("surround", f"{colour} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
-        reason = f"{share}: nothing beside the object tells how bright it should be"
+        reason = "steps change slowly what all colours have in common"
+        if is_scan(plan.survey, weighted=plan.weighted):
+            reason = f"{share}: nothing beside the object tells how bright it should be"
         by_luminance = settings.keep_colours == "luminance"
         decisions.append(
             Decision(
@@ -337,8 +339,6 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
             reason = "gsplat keeps none"
         elif plan.anew in GPU_RASTERIZERS:
             reason = _why_not_on_a_gpu(raster, reason)
-        elif (least := (raster.half_bytes or 0) / len(plan.covered)) > budget:
-            reason = f"those of one view take {least / 1e9:.2g} GB, and {budget / 1e9:.2g} GB are there for them"
         return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
     room = f"{budget / 1e9:.1f} GB are there for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None

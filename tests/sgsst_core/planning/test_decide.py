@@ -136,10 +136,12 @@ def test_position_weights_are_for_views_with_an_empty_surround(share: float, wan
 @pytest.mark.parametrize(
     ("share", "values", "surround", "warm"),
     [
-        (0.0, {}, "background", False),
-        (0.05, {}, "background", False),  # a room with holes
+        (0.0, {}, "background", True),
+        (0.05, {}, "background", True),  # a room with holes
+        (0.05, {"keep_colours": "luminance"}, "background", False),
+        (0.5, {"keep_colours": "luminance"}, "palette", True),
         (0.5, {}, "palette", True),
-        (0.5, {"position_weights": "off"}, "background", False),
+        (0.5, {"position_weights": "off"}, "background", True),
         (0.5, {"preset": "paper"}, "background", False),
         (0.5, {"surround": "background", "warm_start": False}, "background", False),
         (0.5, {"surround": "random"}, "random", True),
@@ -156,7 +158,8 @@ def test_what_is_behind_a_scan_and_what_its_colours_begin_with(
     for found, setting in ((behind, "surround"), (start, "warm_start")):
         if found:
             assert ("asked for" in found.reason) is (setting in values)
-            assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values)
+            scan = share == 0.5 and "position_weights" not in values
+            assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values and scan)
 
 
 def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end() -> None:

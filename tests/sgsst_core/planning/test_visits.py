@@ -48,15 +48,18 @@ def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
     assert (alone.kept, alone.always, alone.kept_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
 
 
-def test_blend_weights_of_which_no_view_fits_are_not_kept() -> None:
-    """Nor counted in the peak, nor taken for an approximation that has to be measured."""
-    fits, large = (replace(LARGE, bytes=4 * size, half_bytes=2 * size) for size in (GIGABYTE // 2, 8 * GIGABYTE))
-    assert plan_of(fits).kept_weights == "float32"
-    plan = plan_of(large)
-    assert plan.kept_weights == "none"
-    decision = next(each for each in plan.decisions if each.item == "blend weights")
-    assert "those of one view take 4 GB, and 2.5 GB are there" in decision.reason
-    assert plan_of(large, kept_weights="half").kept_weights == "half"
+def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
+    """Lists are kept in a smaller room beside them, and every view is rendered from these."""
+    found = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
+    predictions = [plan.prediction for plan in found.values()]
+    assert all(plan.kept_weights == "half" for plan in found.values())
+    assert predictions[0] is not None
+    assert predictions[1] is not None
+    assert predictions[0].peak_bytes - predictions[1].peak_bytes == pytest.approx(2 * GIGABYTE, rel=0.2)
+    assert predictions[1].first_visit < predictions[0].first_visit, "nothing is made to be kept"
+    told = [next(each for each in plan.decisions if each.item == "blend weights").decision for plan in found.values()]
+    assert told[0].startswith("50% of the views'")
+    assert told[1].startswith("0% of the views'")
 
 
 def test_lists_and_colours_come_with_the_first_visit_where_they_fit() -> None:

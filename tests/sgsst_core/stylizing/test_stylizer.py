@@ -134,7 +134,7 @@ def test_the_first_step_moves_every_seen_value_by_the_learning_rate(
 ) -> None:
     """Adam's first update is lr * sign(gradient), whatever the gradient's size."""
     hidden = replace(scene, means=torch.cat([scene.means[:-10], scene.means[-10:] * torch.tensor([1.0, 1.0, -1.0])]))
-    stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05, bounded=False)
+    stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05, bounded=False, warm_start=False)
     stylizer.run_step()
     assert not stylizer.plan.seen[-10:].any()
     moved = (stylizer.sh_dc.detach() - hidden.sh_dc[stylizer.plan.seen]).abs()
@@ -333,7 +333,7 @@ def test_cameras_without_any_sight_of_the_scene_are_refused(tiny_weights: Backbo
 
 def test_photos_are_the_content_where_they_are_given(tiny_weights: BackboneWeights, scene: Scene) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
-    settings = make_settings()
+    settings = make_settings(warm_start=False)
     own = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights)
     given = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
     assert own.evaluate([0])[0]["content"] == 0
