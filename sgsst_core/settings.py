@@ -252,7 +252,8 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
-#: colours below 0 on their way and therefore need `revive` (docs/performance.md, "The standard preset").
+#: colours below 0 on their way and therefore need `revive` (docs/performance.md, "The standard preset"), and begin with
+#: the style's colours, which steps alone reach slowly (docs/quality.md, "What colours begin with").
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,
