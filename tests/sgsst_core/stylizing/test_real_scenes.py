@@ -25,8 +25,15 @@ def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data,
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = cameras_of(folder, scene, 12)
     style = load_image(shared_data / "styles" / "starry_night.jpg")
+    # from the scene's own colours, and with nothing else behind it in a step than where the loss is judged
     settings = make_settings(
-        steps_coarse=10, steps_sos=50, learning_rate=0.2, learning_rate_end=0.05, coarsest_side=100
+        steps_coarse=10,
+        steps_sos=50,
+        learning_rate=0.2,
+        learning_rate_end=0.05,
+        coarsest_side=100,
+        warm_start=False,
+        surround="background",
     )
     chosen = [camera for index, camera in enumerate(cameras) if index % 3 != 1]
     training = Stylizer.planned(scene, chosen, style, settings, weights=vgg16_weights)
