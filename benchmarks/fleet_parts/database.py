@@ -109,6 +109,7 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
 
     submitted = NewJob("key_000", "", 0, {"preset": "paper"}, _INPUTS)
     progress = {
+        "attempt": 1,
         "stage": "sos",
         "step": 7,
         "total": 20_000,
@@ -138,14 +139,18 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
 
 def _cost(store: Store, port: int, call: Callable[[], Any]) -> dict[str, float]:
     statements = 0
+    errors: list[Exception] = []
 
     def count(*_: Any) -> None:
         nonlocal statements
         statements += 1
 
     def work() -> None:
-        for _ in range(_EACH):
-            call()
+        try:
+            for _ in range(_EACH):
+                call()
+        except Exception as error:
+            errors.append(error)
 
     event.listen(store.database.engine, "before_cursor_execute", count)
     before, started = _server_seconds(port), time.perf_counter()
@@ -154,6 +159,8 @@ def _cost(store: Store, port: int, call: Callable[[], Any]) -> dict[str, float]:
         thread.start()
     for thread in threads:
         thread.join()
+    if errors:
+        raise errors[0]
     seconds, used = time.perf_counter() - started, _server_seconds(port) - before
     event.remove(store.database.engine, "before_cursor_execute", count)
     calls = _THREADS * _EACH
