@@ -198,9 +198,9 @@ class Settings(BaseModel):
         le=MAX_RESOLUTION,
         description="Shorter side of the coarsest scale in pixels, at most; the method's is 511.",
     )
-    warm_start: Annotated[
-        bool | None, Option(flags="--warm-start/--cold-start", default="on; by luminance, for scans alone")
-    ] = Field(None, description="Begin with colours that are distributed as the style's.")
+    warm_start: Annotated[bool | None, Option(flags="--warm-start/--cold-start", default="on")] = Field(
+        None, description="Begin with colours that are distributed as the style's; by luminance alone, for scans only."
+    )
     revive: bool = Field(
         False, description="Let colours that fell below black come back, by gradients that would raise them."
     )

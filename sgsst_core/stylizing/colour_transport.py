@@ -15,17 +15,18 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
+from sgsst_core.compiled import kernel_threads
+from sgsst_core.stylizing import colour_transport_kernels
+
 #: Sets of axes. The distance that is left falls to that of the samples within so many.
 ROUNDS = 16
-#: Colours of each side that distributions are taken from, at most, and values by which one axis is told.
+#: Colours of each side that distributions are taken from, at most, and values by which one axis is told (a power of 2).
 _SAMPLES = 1 << 16
-_KNOTS = 512
+_KNOTS = 1 << 9
 #: Values that are nearer to each other than this are one: a flat scene must not be pulled apart by its rounding.
 _APART = 1e-6
 #: What colours are brought to first: beyond it their order counts for nothing, and turning them would lose digits.
 _FARTHEST = 10.0
-#: Colours that go through all rounds together: as many as stay in a core's cache.
-_TOGETHER = 1 << 14
 #: Root of x^4 = x + 4, from which, with the square root of 2, turns spread evenly: Alexa, "Super-Fibonacci Spirals:
 #: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
 _PSI = 1.533751168755204288118041
@@ -47,7 +48,7 @@ def transported(colours: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
     """
     begun = colours.clamp(-_FARTHEST, _FARTHEST)
     rounds = _rounds(begun[_drawn(weights)], wanted)
-    return torch.cat([_through(part, rounds) for part in begun.split(_TOGETHER)])
+    return _through(begun, rounds) if begun.is_cuda else _through_compiled(begun, rounds)
 
 
 def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
@@ -67,6 +68,22 @@ def _through(colours: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Te
         along = zip((colours @ axes).unbind(1), maps, strict=True)
         colours = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
     return colours
+
+
+def _through_compiled(colours: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
+    """`_through` on CPUs, for many colours."""
+    knots = torch.full((len(rounds), 3, _KNOTS), math.inf, dtype=torch.float64)
+    targets = torch.empty_like(knots)
+    for number, (_, maps) in enumerate(rounds):
+        for axis, (places, become) in enumerate(maps):
+            knots[number, axis, : len(places)] = places
+            targets[number, axis] = become[-1]
+            targets[number, axis, : len(become)] = become
+    axes = torch.stack([axes.contiguous() for axes, _ in rounds])
+    moved = colours.clone(memory_format=torch.contiguous_format)
+    with kernel_threads():
+        colour_transport_kernels.through(*(part.numpy() for part in (moved, axes, knots, targets)))
+    return moved
 
 
 def _drawn(weights: Tensor) -> Tensor:

@@ -132,7 +132,8 @@ class Stylizer:
         rasterizer, self._coarse = self._rasterizers(seen, workshop)
         self.views = self._views(seen, fit_cameras(cameras, settings), rasterizer)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
-        start = self.transferred() if plan.warm_start else seen.sh_dc
+        # Made once: another processor may round it otherwise, and ranks begin with the same bits.
+        start = self.collectives.broadcast(self.transferred) if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
         kept = regions.kept[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
         #: Of the Gaussians that are rendered, those that stay as they are; None where none do.

@@ -25,8 +25,6 @@ from sgsst_core.stylizing.colour_transport import transported
 #: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
 #: could be stretched to the style's: it is left flat instead of blowing rounding up.
 _FLAT = 1e-9
-
-
 #: Pixels of a style that stand for all of them, at most.
 _PIXELS = 1 << 16
 

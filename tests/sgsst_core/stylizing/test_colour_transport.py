@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.stylizing import colour_transport
-from sgsst_core.stylizing.colour_transport import _drawn, _turns, transported
+from sgsst_core.stylizing.colour_transport import _drawn, _rounds, _through, _through_compiled, _turns, transported
 
 Array = NDArray[np.float64]
 
@@ -115,8 +115,19 @@ def test_one_colour_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
     assert float(found.std(0).max()) < 1e-6
 
 
-def test_parts_that_go_through_together_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, count, wanted = colours(1000, 13), weights(1000, 14), colours(700, 15)
-    whole = transported(own, count, wanted)
-    monkeypatch.setattr(colour_transport, "_TOGETHER", 17)
-    torch.testing.assert_close(transported(own, count, wanted), whole, rtol=0, atol=1e-12)
+@pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])
+def test_the_compiled_kernel_does_what_tensors_do(case: str) -> None:
+    own, count, wanted = colours(3000, 13), weights(3000, 14), colours(700, 15)
+    if case == "far":  # most knots in one of the cells
+        own[::100] *= 50
+    if case == "flat":
+        own[:] = 0.3
+    if case == "two":
+        own[:] = torch.where(own[:, :1] < own[:, :1].median(), 0.2, 0.7)
+    begun = own.clamp(-10, 10)
+    rounds = _rounds(begun[_drawn(count)], wanted)
+    outside = torch.cat([begun, 3 * begun - 1, torch.full((1, 3), -10.0), torch.full((1, 3), 10.0)])
+    for only in rounds:  # one by one: maps may be as steep as 1e6, and steep ones multiply what was rounded
+        torch.testing.assert_close(_through_compiled(outside, [only]), _through(outside, [only]), rtol=0, atol=1e-8)
+    errors = (_through_compiled(outside, rounds) - _through(outside, rounds)).abs()
+    assert float(errors.median()) < 1e-12
