@@ -2,9 +2,10 @@
 
 python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content_weight": 3000}' 'ROW=...'
 
-Every row has settings on top of the standard preset's, in JSON; `factor` scales all features of VGG16 by a number, 1
-leaves them as the network comes. Rows are added to benchmarks/results/equal_steps.json, under NAME; with more seeds
-they are means, and "spread" is the largest difference between two seeds.
+Every row has settings on top of the standard preset's, in JSON; `factor` scales all features of VGG16 by a number (1
+leaves them as the network comes), or each layer's by its own ({"relu1_1": 16, "relu2_1": 8}; later ones follow). Rows
+are added to benchmarks/results/equal_steps.json, under NAME; with more seeds they are means, and "spread" is the
+largest difference between two seeds.
 """
 
 from __future__ import annotations
@@ -102,10 +103,12 @@ def _run(
     return stylizer.stylized(), time.process_time() - before
 
 
-def _weights(factor: float | None) -> BackboneWeights:
+def _weights(factor: float | dict[str, float] | None) -> BackboneWeights:
     weights = load_network_weights("vgg16")
     if factor is None:
         return weights
+    if isinstance(factor, dict):
+        return with_scales(weights, factor)
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
     return with_scales(weights, dict.fromkeys(layers, float(factor)))
 

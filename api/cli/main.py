@@ -422,7 +422,7 @@ def bench_quality(
     style: StyleOption,
     out: Annotated[Path, typer.Option(help="Folder for JSON, plot, pictures and scenes.")] = Path("quality"),
     cameras: CamerasOption = None,
-    variants: Annotated[str, typer.Option(help="Names with commas between.")] = "standard,one-scale,warm-start",
+    variants: Annotated[str, typer.Option(help="Names with commas between.")] = "standard,one-scale,cold-start",
     seconds: BenchSeconds = 300.0,
     *,
     options: ViewOptions,

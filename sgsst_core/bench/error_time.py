@@ -96,13 +96,11 @@ VARIANTS = {
         Variant("coarse-only", "the coarsest scale alone", _coarse_only),
         Variant("one-scale", "the paper's loss at full size alone", _full_size_only),
         Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
-        Variant("warm-start", "standard, from the style's distribution of colours", settings={"warm_start": True}),
         Variant("cold-start", "standard, from the scene's own colours", settings={"warm_start": False}),
         Variant(
             "fixed-surround", "standard, with the background behind every step", settings={"surround": "background"}
         ),
         Variant("random-surround", "standard, with a random colour behind each step", settings={"surround": "random"}),
-        Variant("warm-no-phase-1", "warm start instead of phase 1", _sos, {"warm_start": True}),
         Variant("no-revive", "standard; colours that fall below 0 stay there", settings={"revive": False}),
         Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
         Variant("tf32", "standard with TF32 convolutions", settings={"precision": "tf32"}),

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
-    names = ["standard", "coarse-only", "coarse-to-fine", "warm-start", "pruned", "half-weights"]
+    names = ["standard", "coarse-only", "coarse-to-fine", "cold-start", "pruned", "half-weights"]
     scene, views = wall(), cameras(2, 96, 72)
     curves = error_time(scene, views, style(), choose_variants(names), 1.0, weights=tiny_weights, coarsest_side=36)
     assert [curve.variant.name for curve in curves] == names
