@@ -122,8 +122,8 @@ class Settings(BaseModel):
     )
     feature_scale: FeatureScale = Field(
         "even",
-        description="How much each layer of the network counts; paper: as in the paper's network; even: in each layer "
-        "Gram matrix, mean and deviation count about alike.",
+        description="How much each layer of the network counts; paper: as in the paper's network; even: Gram "
+        "matrix, mean and deviation count about alike, colours (features of the first layer) more.",
     )
     style_loss: StyleLossName = Field(
         "sos",
