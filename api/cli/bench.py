@@ -119,7 +119,7 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
 
 
 def run_quality(request: VariantsRequest, progress: Any) -> Quality:
-    """Run the variants, judge them, and write `quality.json`, `quality.png`, `quality.jpg` and scenes into the folder.
+    """Run the variants, judge them, and write `quality.json`, plots, `quality.jpg` and scenes into the folder.
 
     Args:
         progress: called with a variant and each of its points.
@@ -131,6 +131,7 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
     quality = inputs.run(compare_quality, request, progress)
     write_json(request.out / "quality.json", {**inputs.as_dict(request), **quality.as_dict()})
     write_quality_plot(request.out / "quality.png", quality, request.title)
+    write_plot(request.out / "error_time.png", quality.curves, request.title)
     write_sheet(request.out / "quality.jpg", quality)
     for outcome in quality.outcomes[1:]:
         write_stylized(inputs.file, request.out / f"{outcome.name}.ply", outcome.sh_dc)

@@ -27,6 +27,7 @@ from worker.styles import parse_styles
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
     from api.cli.bench import VariantsRequest
+    from sgsst_core.bench.error_time import Curve
     from worker.description import Prepared
     from worker.execute import Result
     from worker.ranks.attempts import RanksResult, WorkerOptions
@@ -385,12 +386,14 @@ def demo(
     _stylize(request, arguments)
 
 
+#: Of the options of a job, those that `bench` gives all variants.
+_OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
 BenchSeconds = Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")]
 
 
 @bench_app.command("error-time")
 @with_options(ViewOptions)
-@with_options(StylizeOptions, "chosen", only=("coarsest_side", "background", "backbone", "memory_limit"))
+@with_options(StylizeOptions, "chosen", only=_OF_VARIANTS)
 def bench_error_time(
     scene: SceneArgument,
     style: StyleOption,
@@ -408,15 +411,12 @@ def bench_error_time(
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
     curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
     Console(width=TABLE_WIDTH).print(error_time_table(curves))
-    for curve in curves:
-        if curve.left_out:
-            out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
-    out_console.print(f"{'results:':<22}{out}")
+    _tell_what_was_left_out(curves, out)
 
 
 @bench_app.command("quality")
 @with_options(ViewOptions)
-@with_options(StylizeOptions, "chosen", only=("coarsest_side", "background", "backbone", "memory_limit"))
+@with_options(StylizeOptions, "chosen", only=_OF_VARIANTS)
 def bench_quality(
     scene: SceneArgument,
     style: StyleOption,
@@ -434,8 +434,14 @@ def bench_quality(
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
     quality = run_quality(request, lambda variant, point: error_console.print(point_line(variant, point)))
     Console(width=TABLE_WIDTH).print(quality_table(quality))
-    for name, reason in quality.left_out.items():
-        out_console.print(f"{name} was left out: {reason}")
+    _tell_what_was_left_out(quality.curves, out)
+
+
+def _tell_what_was_left_out(curves: Sequence[Curve], out: Path) -> None:
+    """And where the results are."""
+    for curve in curves:
+        if curve.left_out:
+            out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
     out_console.print(f"{'results:':<22}{out}")
 
 

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from sgsst_core.bench.error_time import Curve, Point, Variant, error_time
+from sgsst_core.bench.error_time import as_dict as curves_as_dict
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
@@ -89,13 +90,13 @@ class Quality:
 
     Attributes:
         outcomes: the unstylized scene, the transfer, and the variants.
-        left_out: variants that could not run, and why.
+        curves: the variants' losses against seconds; of those that could not run, why.
         judge: judges further colours of the scene.
         style: the style image [H, W, 3].
     """
 
     outcomes: list[Outcome]
-    left_out: dict[str, str]
+    curves: list[Curve]
     judge: Judge
     style: Tensor
 
@@ -113,8 +114,8 @@ class Quality:
         return {
             "views": [camera.name for camera in self.judge.cameras],
             "outcomes": [outcome.as_dict() for outcome in self.outcomes],
-            "left_out": self.left_out,
             "front": [outcome.name for outcome in self.front()],
+            "error_time": curves_as_dict(self.curves),
         }
 
 
@@ -173,11 +174,7 @@ def compare_quality(
             last = curve.points[-1]
             found = outcome(curve.variant.name, curve.variant.what, curve.sh_dc)
             outcomes.append(replace(found, loss=last.relative, steps=last.step, seconds=last.seconds))
-    return Quality(outcomes, _left_out(curves), judge, style)
-
-
-def _left_out(curves: Sequence[Curve]) -> dict[str, str]:
-    return {curve.variant.name: curve.left_out for curve in curves if curve.left_out}
+    return Quality(outcomes, curves, judge, style)
 
 
 def held_out_views(stylizer: Stylizer) -> HeldOut:

@@ -381,16 +381,18 @@ def test_bench_quality_writes_table_plot_pictures_and_scenes(files: Files, capsy
     assert main([*command, "--variants", "standard,finest"]) == 2
     assert "no variant finest" in capsys.readouterr().err
     assert not folder.exists()
-    assert main([*command, "--seconds", "2", "--variants", "standard,coarse-only"]) == 0
+    assert main([*command, "--seconds", "2", "--variants", "standard,coarse-only", "--seed", "3"]) == 0
     shown = capsys.readouterr().out
     values = json.loads((folder / "quality.json").read_text())
     names = [outcome["name"] for outcome in values["outcomes"]]
     assert names == ["unstylized", "transfer", "standard", "coarse-only"]
     assert all(name in shown for name in names)
+    assert values["settings"]["seed"] == 3
     assert {path.name for path in folder.iterdir()} == {
         "quality.json",
         "quality.png",
         "quality.jpg",
+        "error_time.png",
         "transfer.ply",
         "standard.ply",
         "coarse-only.ply",
