@@ -18,6 +18,7 @@ from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing import checkpoint
 from sgsst_core.stylizing.checkpoint import (
     Checkpoint,
     Checkpoints,
@@ -304,6 +305,14 @@ def test_fingerprint_tells_jobs_apart() -> None:
         fingerprint(scene, views, image, settings, "w", "photos"),
     ]
     assert len({base, *others}) == len(others) + 1
+
+
+@pytest.mark.parametrize(("scale", "same"), [("even", False), ("paper", True)])
+def test_a_job_does_not_go_on_under_other_factors(scale: str, same: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = (wall(), cameras(), style(), make_settings(feature_scale=scale), "w")
+    before = fingerprint(*job)
+    monkeypatch.setattr(checkpoint, "EVEN_COLOUR_SCALE", 8.0)
+    assert (fingerprint(*job) == before) == same
 
 
 def test_fingerprint_leaves_budgets_free() -> None:
