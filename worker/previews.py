@@ -61,7 +61,7 @@ class Previews:
             camera = resized(camera, _SIDE)
         path = self._folder / f"step_{stylizer.step:07d}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
-        colours = stylizer.sh_dc.detach() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
+        colours = stylizer.shown() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
         with torch.no_grad():
             # The rasterizer's own render: other ranks take no part in it.
             image = views.rasterizer.render(views.colours(index, colours), camera)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.errors import SettingsError
+from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
@@ -56,6 +57,15 @@ def starts_warm(settings: Settings, *, scan: bool) -> bool:
     if settings.warm_start is None:
         return scan or settings.keep_colours != "luminance"
     return settings.warm_start
+
+
+def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
+    """Whether a job that begins with the style's colours is given them once more behind the last step.
+
+    A loss without statistics lets them go in its steps; ARF (Zhang et al. 2022) transfers them a second time, too. With
+    statistics it would undo what steps have found (docs/quality.md).
+    """
+    return warm and not has_statistics(settings.style_loss)
 
 
 def surround_of(settings: Settings, *, scan: bool) -> PlannedSurround:

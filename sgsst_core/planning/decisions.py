@@ -11,7 +11,13 @@ from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
-from sgsst_core.planning.choices import GPU_RASTERIZERS, is_scan, precision_of, pruned_gaussians
+from sgsst_core.planning.choices import (
+    GPU_RASTERIZERS,
+    ends_with_transfer,
+    is_scan,
+    precision_of,
+    pruned_gaussians,
+)
 from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
@@ -149,10 +155,13 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
         if is_scan(plan.survey, weighted=plan.weighted):
             reason = f"{share}: nothing beside the object tells how bright it should be"
         by_luminance = settings.keep_colours == "luminance"
+        begins = "luminance begins with the style's mean and spread" if by_luminance else "colours begin as the style's"
+        if ends_with_transfer(settings, warm=True):
+            begins += f"; the same once more behind the last step, because {settings.style_loss} lets them go"
         decisions.append(
             Decision(
                 "start",
-                "luminance begins with the style's mean and spread" if by_luminance else "colours begin as the style's",
+                begins,
                 reason if settings.warm_start is None else "asked for",
                 error="it is another start than the paper's",
             )

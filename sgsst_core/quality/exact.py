@@ -163,7 +163,7 @@ class ExactTwin(ExactLoss):
         return gradient, time.perf_counter() - started
 
     def gradient_error(self, *, start: bool = False) -> GradientError:
-        """Compare the job's gradient of its latest view with the exact one, at the job's present colours.
+        """Compare the job's gradient of its latest view with the exact one, at the colours that it would end with now.
 
         Args:
             start: compare that of the first view at the unstylized colours, whatever the present ones are.
@@ -175,7 +175,7 @@ class ExactTwin(ExactLoss):
             index, phase = stylizer.history[-1].view, stylizer.phase
         scales = phase.scales(stylizer.scales(index))
         colours = stylizer.scene.sh_dc if start else stylizer.stylized()
-        with stylizer.with_colours(colours) if start else nullcontext():
+        with stylizer.with_colours(colours) if start or stylizer.transfers_last else nullcontext():
             approximate, seconds = stylizer.gradient(index, scales)
         exact, seconds_exact = self.gradient(index, colours, scales)
         seen = stylizer.plan.seen

@@ -98,7 +98,7 @@ class Measurements:
             return stylizer.start()
         with stylizer.measuring():
             if not self.approximated:
-                return stylizer.evaluate(stylizer.evaluation_views)
+                return stylizer.evaluate(stylizer.evaluation_views, stylizer.shown())
             colours = stylizer.scene.sh_dc if unstylized else stylizer.stylized()
             return self.exact.evaluate(stylizer.evaluation_views, colours)
 

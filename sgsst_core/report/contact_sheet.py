@@ -39,7 +39,7 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     pairs = []
     with torch.no_grad():
         for index in stylizer.evaluation_views:
-            dcs = (views.scene.sh_dc.to(device), stylizer.sh_dc.detach())
+            dcs = (views.scene.sh_dc.to(device), stylizer.shown())
             # The rasterizer's own render: one rank writes the sheet, and the others take no part in it.
             camera = views.cameras[index]
             renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]

@@ -25,7 +25,7 @@ from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.choices import rasterizer_options
+from sgsst_core.planning.choices import ends_with_transfer, rasterizer_options
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import Workshop, make_network, sharing_memory
@@ -211,13 +211,33 @@ class Stylizer:
             regions=regions,
         )
 
-    def transferred(self) -> Tensor:
-        """The style's colours before any step, [N, 3], of the Gaussians that are rendered: see `warm_start`."""
-        seen, own = self.plan.seen, self.scene.sh_dc[self.plan.seen]
+    def transferred(self, own: Tensor | None = None) -> Tensor:
+        """The Gaussians that are rendered in the style's colours, [n, 3] on the CPU: see `warm_start`.
+
+        Args:
+            own: [n, 3] on the CPU, what they have; None for the scene's, as before any step.
+        """
+        seen = self.plan.seen
+        own = self.scene.sh_dc[seen] if own is None else own
         weights = self.plan.survey.total_blend_weights[seen]
         found = self.styles.transferred(own, weights, seen, keep_chroma=self._keeps_chroma)
         # Of what no view decides, colours follow from what becomes of the others: see `stylized`.
         return torch.where(self.plan.optimised[seen][:, None], found, own)
+
+    @property
+    def transfers_last(self) -> bool:
+        """Whether results have the style's colours once more: see `ends_with_transfer`."""
+        return ends_with_transfer(self.settings, warm=self.plan.warm_start)
+
+    def _transferred_last(self, optimised: Tensor) -> Tensor:
+        """What is written of optimised colours [n, 3]; before the first step they are the style's as they are."""
+        if not (self.transfers_last and self.step):
+            return optimised
+        found = self.transferred(optimised)
+        if not self._keeps_chroma:
+            return found
+        bounded = constrained(found, self.scene.sh_dc[self.plan.seen], bounded=self.settings.bounded)
+        return torch.where(found != optimised, bounded, optimised)  # kept ones to the last bit
 
     @property
     def _keeps_chroma(self) -> bool:
@@ -551,12 +571,12 @@ class Stylizer:
     def stylized(self) -> Tensor:
         """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians.
 
-        Kept until the colours change, because the neighbours of millions of unseen Gaussians take seconds to find: it
-        must not be written to.
+        They are what a job that ends now writes, so with the last transfer, where there is one. Kept until the colours
+        change, because the neighbours of millions of unseen Gaussians take seconds to find: it must not be written to.
         """
         if self._stylized is None:
             result = self.scene.sh_dc.clone()
-            result[self.plan.seen] = self.sh_dc.detach().cpu()
+            result[self.plan.seen] = self._transferred_last(self.sh_dc.detach().cpu())
             if self.settings.unseen == "neighbours":
                 weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
                 change = result - self.scene.sh_dc
@@ -572,6 +592,15 @@ class Stylizer:
                 result[takes] = constrained(own + change, chroma_of, bounded=self.settings.bounded)
             self._stylized = result
         return self._stylized
+
+    def shown(self) -> Tensor:
+        """sh_dc [n, 3] of the Gaussians that are rendered, on the rasterizer's device, as a job that ends now has them.
+
+        Unlike `sh_dc`, which steps go on from, they have the last transfer, where there is one.
+        """
+        if not self.transfers_last:
+            return self.sh_dc.detach()
+        return self.stylized()[self.plan.seen].to(self.sh_dc.device)
 
     def set_colours(self, sh_dc: Tensor) -> None:
         """Put the colours [N, 3] of the whole scene in place of the present ones, to evaluate them on these views."""

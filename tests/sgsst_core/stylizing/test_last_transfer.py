@@ -1,0 +1,136 @@
+"""The style's colours once more behind the last step, where the loss has no statistics that would hold them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core import Stylizer, make_settings
+from sgsst_core.constants import SH_C0
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.loss.regions import Region, Regions
+from sgsst_core.planning.plan import Plan
+from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.measure import Measurements
+from sgsst_core.report.contact_sheet import write_contact_sheet
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.screen import on_screen_by_luminance
+from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.warm_start import warm_start
+from tests.small_scenes import cameras, style, wall
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(
+    weights: BackboneWeights, scene: Scene | None = None, regions: Regions | None = None, **values: Any
+) -> Stylizer:
+    settings = make_settings(**{"style_loss": "nnfm", "steps_sos": 6, "early_stop": False, **values})
+    return Stylizer.planned(scene or wall(60, 40), cameras(), style(), settings, weights=weights, regions=regions)
+
+
+def told(plan: Plan) -> bool:
+    return any("behind the last step" in line.decision for line in plan.decisions)
+
+
+def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights)
+    run(stylizer)
+    optimised = stylizer.sh_dc.detach().clone()
+    rows = stylizer.plan.optimised
+    assert rows.any()
+    found = stylizer.stylized()
+    weights = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
+    wanted = warm_start(optimised, weights, stylizer.style)
+    assert torch.equal(found[rows], wanted[rows[stylizer.plan.seen]])
+    assert float((wanted - optimised).abs().mean()) > 0.01
+    assert torch.equal(stylizer.sh_dc, optimised)
+    assert torch.equal(stylizer.shown(), found[stylizer.plan.seen])
+    assert told(stylizer.plan)
+
+
+@pytest.mark.parametrize(
+    "values", [{"style_loss": "sos"}, {"style_loss": "mixed"}, {"warm_start": False}, {"steps_sos": 1, "steps": 0}]
+)
+def test_other_results_are_what_steps_have_found(tiny_weights: BackboneWeights, values: dict[str, Any]) -> None:
+    """Of a loss with statistics, of a cold start, and of a job that has made no step yet."""
+    steps = values.pop("steps", None)
+    stylizer = make(tiny_weights, **values)
+    run(stylizer, Callbacks(stop=lambda: steps == stylizer.step))
+    rows = stylizer.plan.optimised
+    assert torch.equal(stylizer.stylized()[rows], stylizer.sh_dc.detach()[rows[stylizer.plan.seen]])
+    assert torch.equal(stylizer.shown(), stylizer.sh_dc)
+    assert told(stylizer.plan) == (steps == 0)
+
+
+def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) -> None:
+    whole, first = make(tiny_weights), make(tiny_weights)
+    run(whole)
+    for _ in range(3):
+        first.run_step()
+        first.stylized()  # as a preview has it made
+    again = Stylizer(first.plan, wall(60, 40), cameras(), style(), first.settings, weights=tiny_weights)
+    again.load_state(first.state())
+    run(again)
+    assert torch.equal(again.stylized(), whole.stylized())
+
+
+def test_each_region_has_the_colours_of_its_own_style_and_kept_ones_their_bits(tiny_weights: BackboneWeights) -> None:
+    scene = wall(60, 40)
+    dark, bright = (StyleMixture.of(torch.full((40, 40, 3), grey)) for grey in (0.2, 0.7))
+    labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
+    labels[scene.means[:, 1] > 1] = 2
+    regions = Regions(
+        (Region("rest", style=dark), Region("right", style=bright), Region("low", keep=True)),
+        labels,
+    )
+    stylizer = make(tiny_weights, scene, regions)
+    run(stylizer)
+    found = stylizer.stylized()
+    assert torch.equal(found[labels == 2].view(torch.int32), scene.sh_dc[labels == 2].view(torch.int32))
+    for place, grey in enumerate((0.2, 0.7)):
+        own = 0.5 + SH_C0 * found[(labels == place) & stylizer.plan.optimised]
+        assert float((own - grey).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeights, bounded: bool) -> None:
+    stylizer = make(tiny_weights, keep_colours="luminance", warm_start=True, bounded=bounded, unseen="keep")
+    run(stylizer)
+    rows, before = stylizer.plan.optimised, stylizer.scene.sh_dc
+    found = stylizer.stylized()
+    change = (found - before)[rows].double()
+    assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
+    assert not torch.equal(found[rows], stylizer.sh_dc.detach()[rows[stylizer.plan.seen]])
+    off = float((on_screen_by_luminance(found[rows]) - found[rows]).abs().max())
+    assert off < 1e-6 if bounded else off > 0.1
+
+
+def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+    """Loss and pictures are of the colours in the file; the error of bfloat16 is that of one and the same colours."""
+    stylizer = make(tiny_weights, precision="bfloat16")
+    run(stylizer)
+    measure = Measurements(stylizer)
+    written = ExactTwin(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
+    assert measure.approximated
+    assert measure.evaluate()[0].total == pytest.approx(written[0].total, rel=1e-6)
+    assert ExactTwin(stylizer).gradient_error().relative_error < 0.5
+
+    exact = make(tiny_weights)
+    run(exact)
+    after = Measurements(exact).evaluate()[0].total
+    optimised = exact.evaluate(exact.evaluation_views)[0].total
+    with exact.with_colours(exact.stylized()):
+        assert exact.evaluate(exact.evaluation_views)[0].total == after != optimised
+    other = make(tiny_weights, warm_start=False)
+    sheets = []
+    for colours in (exact.stylized(), exact.scene.sh_dc.index_put((exact.plan.seen,), exact.sh_dc.detach())):
+        other.set_colours(colours)
+        write_contact_sheet(tmp_path / "other.jpg", other)
+        sheets.append((tmp_path / "other.jpg").read_bytes())
+    write_contact_sheet(tmp_path / "sheet.jpg", exact)
+    assert (tmp_path / "sheet.jpg").read_bytes() == sheets[0] != sheets[1]
