@@ -56,6 +56,15 @@ def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.
     return out.read_bytes()
 
 
+@pytest.fixture(scope="module")
+def short_job(files: dict[str, Path], service: Service) -> str:
+    """A job that has ended, of few steps, for tests that only look."""
+    with service.client() as client:
+        job_id = submit(client, files, steps_sos=5)
+        wait_until(service, client, job_id, "succeeded")
+    return job_id
+
+
 def submit(client: httpx.Client, files: dict[str, Path], **parameters: Any) -> str:
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     data = {"parameters": json.dumps(PARAMETERS | parameters)}
@@ -173,14 +182,14 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         assert result(client, job_id) == expected
 
 
-def test_the_ply_in_ranges(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
+def test_the_ply_in_ranges(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     with service.client() as client:
-        job_id = submit(client, files)
+        job_id = submit(client, files, steps_sos=5)
         wait_until(service, client, job_id, "succeeded")
         where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
         whole = client.get(where)
         assert whole.headers["content-disposition"] == 'attachment; filename="stylized.ply"'
-        tag, size = whole.headers["etag"], len(whole.content)
+        tag, size, expected = whole.headers["etag"], len(whole.content), whole.content
         parts = b""
         for start in range(0, size, 10_000):
             headers = {"Range": f"bytes={start}-{start + 9_999}", "If-Range": tag}
@@ -254,17 +263,14 @@ def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: d
         assert not (service.data / "artifacts" / job_id).exists()
 
 
-def test_one_packed_result_for_many_who_ask_at_once(service: Service, files: dict[str, Path]) -> None:
-    with service.client() as client:
-        job_id = submit(client, files, steps_sos=5)
-        wait_until(service, client, job_id, "succeeded")
-        where = f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply?format=spz"
-        with ThreadPoolExecutor(6) as pool:
-            answers = list(pool.map(lambda _: httpx.get(where, timeout=120), range(6)))
-        assert {answer.status_code for answer in answers} == {200}
-        assert len({answer.headers["etag"] for answer in answers}) == 1
-        stored = list((service.data / "artifacts" / job_id).rglob("stylized.spz"))
-        assert len(stored) == 1, "nothing was made twice"
+def test_one_packed_result_for_many_who_ask_at_once(service: Service, short_job: str) -> None:
+    where = f"{service.url}/v1/jobs/{short_job}/artifacts/stylized.ply?format=spz"
+    with ThreadPoolExecutor(6) as pool:
+        answers = list(pool.map(lambda _: httpx.get(where, timeout=120), range(6)))
+    assert {answer.status_code for answer in answers} == {200}
+    assert len({answer.headers["etag"] for answer in answers}) == 1
+    stored = list((service.data / "artifacts" / short_job).rglob("stylized.spz"))
+    assert len(stored) == 1, "nothing was made twice"
 
 
 def read(folder: Path, data: bytes) -> SceneFile:
@@ -395,9 +401,8 @@ def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, P
         assert len(client.get("/v1/jobs").json()["jobs"]) == before
 
 
-def test_the_api_never_loads_pytorch_or_ray(service: Service, files: dict[str, Path]) -> None:
-    with service.client() as client:
-        wait_until(service, client, submit(client, files, steps_sos=1), "succeeded")
+@pytest.mark.usefixtures("short_job")
+def test_the_api_never_loads_pytorch_or_ray(service: Service) -> None:
     process = service.process("api.http.server")
     assert process is not None
     mapped = Path(f"/proc/{process.pid}/maps").read_text()

@@ -117,6 +117,7 @@ def in_regions(asked: StylizeRequest) -> StylizeRequest:
     return replace(asked, regions=region_requests(options))
 
 
+@pytest.mark.slow
 def test_regions_wait_for_nothing_more(counts: Counts, tmp_path: Path) -> None:
     stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
     assert stylizer.plan.device == "cuda"

@@ -127,6 +127,7 @@ def dispatcher(data: Path, environment: dict[str, str]) -> Iterator[None]:
         process.wait(120)
 
 
+@pytest.mark.slow
 def test_api_and_dispatcher_share_a_bucket_and_no_folder(
     environment: dict[str, str], tmp_path: Path, tiny_installed: Path
 ) -> None:
