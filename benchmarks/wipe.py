@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import io
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -46,21 +47,26 @@ def main() -> None:
     arguments = parser.parse_args()
     scene, stylized = read_scene(arguments.scene).scene, read_scene(arguments.stylized).scene
     cameras = _way(arguments, scene)
-    rasterizer = make_rasterizer("cpu", scene, background=(arguments.background,) * 3)
-
-    def picture(camera: Camera, sh_dc: torch.Tensor) -> torch.Tensor:
-        """[H, W, 3] in 8 bits; both scenes have one geometry."""
-        rest = rest_colours(scene.sh_rest, scene.means, camera)
-        return (rasterizer.render(view_colours(sh_dc, rest), camera).clamp(0, 1) * 255).round().to(torch.uint8)
-
+    before, after = _painter(scene, arguments.background), _painter(stylized, arguments.background)
     frames = []
     for place, camera in enumerate(cameras):
         line = round(camera.width * (0.5 - 0.5 * math.cos(2 * math.pi * place / len(cameras))))
-        frame = picture(camera, stylized.sh_dc)
-        frame[:, line:] = picture(camera, scene.sh_dc)[:, line:]
+        frame = after(camera)
+        frame[:, line:] = before(camera)[:, line:]
         frame[:, max(0, line - _LINE) : line] = 255
         frames.append(Image.fromarray(frame.numpy()))
     arguments.out.write_bytes(_smallest(frames, arguments.milliseconds, arguments.bytes))
+
+
+def _painter(scene: Scene, grey: float) -> Callable[[Camera], torch.Tensor]:
+    """Renders views [H, W, 3] of a scene, in 8 bits."""
+    rasterizer = make_rasterizer("cpu", scene, background=(grey,) * 3)
+
+    def picture(camera: Camera) -> torch.Tensor:
+        rest = rest_colours(scene.sh_rest, scene.means, camera)
+        return (rasterizer.render(view_colours(scene.sh_dc, rest), camera).clamp(0, 1) * 255).round().to(torch.uint8)
+
+    return picture
 
 
 def _way(arguments: argparse.Namespace, scene: Scene) -> list[Camera]:
