@@ -88,7 +88,7 @@ class JobStyles:
         }
 
     def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, keep_chroma: bool = False) -> Tensor:
-        """Colours [n, 3] with the colours of their region's style before any step: see `warm_start`.
+        """Colours [n, 3] with the colours of their region's style: see `warm_start`.
 
         Args:
             sh_dc: [n, 3], of some of the scene's Gaussians.
