@@ -146,7 +146,8 @@ def test_losses_of_regions_are_those_of_the_cpu(tmp_path: Path) -> None:
             assert found.run_step().loss == pytest.approx(expected.run_step().loss, rel=2e-4)
 
 
-@pytest.mark.parametrize("scan", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", [False, True])
 def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> None:
     """With VGG19, the larger network, on three scales. The number is the same for views of any size.
 

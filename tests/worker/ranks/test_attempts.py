@@ -125,6 +125,7 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     return loss_of(ended), request.out.read_bytes()
 
 
+@pytest.mark.slow
 def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path: Path) -> None:
     job = prepare(small_request(tmp_path, STEPS))
     alone = execute(job, progress=lambda step: None, stop=lambda: False, warn=pytest.fail)

@@ -32,6 +32,7 @@ def ranks_that_run() -> int:
     return sum("FaultyRank" in " ".join(child.cmdline()) for child in children if child.is_running())
 
 
+@pytest.mark.slow
 def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_path: Path) -> None:
     request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
     ranks_alive: list[int] = []
