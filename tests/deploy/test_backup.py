@@ -23,7 +23,15 @@ from tests.service.store.conftest import postgres  # noqa: F401 (a fixture)
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
-PARAMETERS = {"steps_sos": 500, "steps_coarse": 0, "backbone": "vgg16", "keep_everything": True, "seed": 3}
+#: A job has to run for longer than two backups take, on a busy machine too.
+PARAMETERS = {
+    "steps_sos": 700,
+    "early_stop": False,
+    "steps_coarse": 0,
+    "backbone": "vgg16",
+    "keep_everything": True,
+    "seed": 3,
+}
 
 
 @pytest.fixture(scope="module")
