@@ -173,7 +173,8 @@ class FileCache:
     def _remove_half_files(self) -> None:
         for path in self._half.iterdir():
             with contextlib.suppress(FileNotFoundError):
-                if path.stat().st_mtime < time.time() - _HALF_SECONDS:
+                # the inode's time: a whole one that is about to get its place has a time by its content already
+                if path.stat().st_ctime < time.time() - _HALF_SECONDS:
                     path.unlink()
 
     @contextlib.contextmanager

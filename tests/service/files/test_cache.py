@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from service.errors import NoSpaceError, StoreError
+from service.files import cache as cache_module
 from service.files.cache import FileCache
 
 
@@ -135,6 +136,20 @@ def test_a_file_that_is_handed_over_is_not_copied(cache: FileCache, tmp_path: Pa
     source = Source(data)
     cache.link(sha256, 1000, tmp_path / "a", source)
     assert ((tmp_path / "a").stat().st_ino, source.fetched) == (first, 0)
+
+
+def test_half_files_go_by_how_long_they_have_lain(
+    cache: FileCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A whole file is given the time of its content just before its place, and may then seem decades old."""
+    half = tmp_path / "cache" / "half" / "0123456789abcdef"
+    half.write_bytes(b"whole")
+    os.utime(half, (0, 0))
+    cache.evict(wanted=2501)
+    assert half.exists()
+    monkeypatch.setattr(cache_module, "_HALF_SECONDS", -1.0)
+    cache.evict(wanted=2501)
+    assert not half.exists()
 
 
 def _use(folder: str, number: int) -> None:
