@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import io
 import json
@@ -22,7 +23,7 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from api.client import AsyncClient, Client
+from api.client import AsyncClient, Client, Job
 from sgsst_core.files.ply import SceneFile, read_scene, write_packed
 from sgsst_core.files.scene_headers import PACKED_FORMS
 from tests.api.service import ROOT, Service, wait_for
@@ -58,11 +59,17 @@ def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.
 
 @pytest.fixture(scope="module")
 def short_job(files: dict[str, Path], service: Service) -> str:
-    """A job that has ended, of few steps, for tests that only look."""
-    with service.client() as client:
-        job_id = submit(client, files, steps_sos=5)
-        wait_until(service, client, job_id, "succeeded")
-    return job_id
+    """A job that has ended, of few steps, sent by the asynchronous client: for tests that only look."""
+
+    async def sent() -> Job:
+        async with AsyncClient(service.url) as client:
+            parameters = PARAMETERS | {"steps_sos": 5}
+            made = await client.submit(files["scene"], files["style"], cameras=files["cameras"], **parameters)
+            return await client.wait(made.id)
+
+    ended = asyncio.run(sent())
+    assert ended.status == "succeeded", ended.error
+    return ended.id
 
 
 def submit(client: httpx.Client, files: dict[str, Path], **parameters: Any) -> str:
@@ -182,11 +189,9 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         assert result(client, job_id) == expected
 
 
-def test_the_ply_in_ranges(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+def test_the_ply_in_ranges(service: Service, files: dict[str, Path], short_job: str, tmp_path: Path) -> None:
     with service.client() as client:
-        job_id = submit(client, files, steps_sos=5)
-        wait_until(service, client, job_id, "succeeded")
-        where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
+        where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
         whole = client.get(where)
         assert whole.headers["content-disposition"] == 'attachment; filename="stylized.ply"'
         tag, size, expected = whole.headers["etag"], len(whole.content), whole.content
@@ -205,14 +210,11 @@ def test_the_ply_in_ranges(service: Service, files: dict[str, Path], tmp_path: P
         assert client.get(where, headers={"If-None-Match": tag}).status_code == 304
         head = client.head(where)
         assert (head.headers["content-length"], head.content) == (str(size), b"")
-        assert client.get(f"/v1/jobs/{job_id}/artifacts/.checkpoint").status_code == 404
-        assert client.get(f"/v1/jobs/{job_id}/artifacts/../../sgsst.db").status_code == 404
+        assert client.get(f"/v1/jobs/{short_job}/artifacts/.checkpoint").status_code == 404
+        assert client.get(f"/v1/jobs/{short_job}/artifacts/../../sgsst.db").status_code == 404
         path = tmp_path / "stylized.ply"
         path.write_bytes(parts)
         assert len(read_scene(path).scene) == len(read_scene(files["scene"]).scene)
-        assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
-        assert client.get(where).status_code == 404
-        assert not (service.data / "artifacts" / job_id).exists()
 
 
 @pytest.mark.slow
@@ -410,6 +412,7 @@ def test_the_api_never_loads_pytorch_or_ray(service: Service) -> None:
     assert "ray/_raylet" not in mapped
 
 
+@pytest.mark.slow
 def test_the_client_and_its_commands(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
     def sgsst(*arguments: str) -> subprocess.CompletedProcess[str]:
         environment = {**service.environment, "SGSST_URL": service.url}
@@ -446,18 +449,14 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
         assert (tmp_path / "result.ply").read_bytes()[:3] == b"ply"
 
 
-async def _async_round(url: str, files: dict[str, Path]) -> str:
-    async with AsyncClient(url) as client:
-        made = await client.submit(
-            files["scene"], files["style"], cameras=files["cameras"], backbone="vgg16", steps_sos=1
-        )
-        return (await client.wait(made.id)).status
-
-
-def test_the_asynchronous_client(service: Service, files: dict[str, Path]) -> None:
-    import asyncio
-
-    assert asyncio.run(_async_round(service.url, files)) == "succeeded"
+def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -> None:
+    """The last that looks at it."""
+    with service.client() as client:
+        where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
+        assert client.get(where).status_code == 200
+        assert client.delete(f"/v1/jobs/{short_job}").status_code == 204
+        assert client.get(where).status_code == 404
+        assert not (service.data / "artifacts" / short_job).exists()
 
 
 def test_nothing_went_wrong_unnoticed(service: Service) -> None:

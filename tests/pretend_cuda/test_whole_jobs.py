@@ -165,6 +165,7 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
     assert 300 < counts.launches.total() < 500, counts.launches
 
 
+@pytest.mark.slow
 def test_losses_are_those_of_the_cpu(tmp_path: Path) -> None:
     """Of the same steps: every kernel in its place, with the numbers that it was given."""
     asked = request_(tmp_path, scan=True, size=(64, 48))

@@ -105,7 +105,7 @@ def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: Stylize
     assert go_on(second).stopped == "finished"
 
 
-@pytest.mark.parametrize("form", ["ply", "spz", "compressed.ply"])
+@pytest.mark.parametrize("form", ["ply", "spz", pytest.param("compressed.ply", marks=pytest.mark.slow)])
 def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_path: Path, form: PackedForm) -> None:
     jobs = []
     for name in ("whole", "resumed"):

@@ -354,6 +354,7 @@ def test_held_out_views_approximations_and_findings_are_reported(files: Files) -
     assert plan["decisions"] == report["plan"]["decisions"]
 
 
+@pytest.mark.slow
 def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     folder = files.out.with_name("bench")
     command = ["bench", "error-time", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
@@ -426,6 +427,7 @@ def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytes
 # --- stopping and going on -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
     options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: time for a signal to arrive
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -458,7 +460,7 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
     assert files.out.read_bytes() == resumed
 
 
-@pytest.mark.parametrize("command", ["plan", "stylize"])
+@pytest.mark.parametrize("command", ["plan", pytest.param("stylize", marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, command: str) -> None:
     """On a terminal, whose bar tells when the views are looked at; of so many that the signal comes in between."""
     views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")

@@ -199,6 +199,7 @@ def test_a_full_disk_costs_a_checkpoint_and_a_cancelled_job_goes_on(
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_a_bad_input_is_told_at_once_and_not_tried_again(cluster: Cluster, tmp_path: Path) -> None:
     request, heard = small_request(tmp_path, STEPS), Heard()
     request.source.scene.write_bytes(request.source.scene.read_bytes()[:-1000])

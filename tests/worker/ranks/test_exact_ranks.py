@@ -169,8 +169,9 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
 
 @pytest.mark.parametrize(
     "scene",
-    [pytest.param(wall(sh_degree=1), id="wall"), pytest.param(ball(), id="ball", marks=pytest.mark.slow)],
+    [pytest.param(wall(sh_degree=1), id="wall"), pytest.param(ball(), id="ball")],
 )
+@pytest.mark.slow
 def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(scene: Scene) -> None:
     values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False}
     alone = stylize(ALONE, scene, 3, values)

@@ -37,6 +37,7 @@ def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int],
     return stylizer.stylized(), losses, waits, f"{stylizer.plan.device} {stylizer.plan.anew}"
 
 
+@pytest.mark.slow
 def test_two_ranks_make_the_steps_of_one_and_wait_once_in_each() -> None:
     """Exchanges are the communication library's: it waits for the other ranks, not the step for its device."""
     expected, losses, _, _ = run_steps(ALONE)
