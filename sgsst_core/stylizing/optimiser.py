@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from sgsst_core.scene.luminance import with_chroma_of
 from sgsst_core.scene.screen import on_screen, on_screen_by_luminance
 
 #: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
+#: Decay of the first and the second moment, the usual ones.
+_BETA1, _BETA2 = 0.9, 0.999
 #: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
 LARGEST_GRADIENT = 1e19
 
@@ -19,9 +22,11 @@ class ColourOptimiser:
 
     On a GPU a step is one kernel, which looks itself whether it is to be made: the host need not wait to be told.
 
+    The steps are PyTorch's function `adam`. Its class `Adam` makes the same ones, and imports PyTorch's compiler on the
+    way: two seconds of every process that optimises, and nothing here is compiled.
+
     Args:
         colours: [n, 3] float32, changed in place.
-        learning_rate: until `update` names another one.
         unit: of the features that gradients come from (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
             gradients grow with its square, and would sooner be too large to be squared.
         chroma_of: [n, 3], colours whose chroma is kept: what is optimised is then how far each colour's luminance is
@@ -33,7 +38,6 @@ class ColourOptimiser:
     def __init__(
         self,
         colours: Tensor,
-        learning_rate: float,
         unit: float = 1.0,
         chroma_of: Tensor | None = None,
         *,
@@ -45,7 +49,8 @@ class ColourOptimiser:
         self._colours = colours.requires_grad_()
         self._unit = unit
         self._fused = colours.is_cuda
-        self._adam = torch.optim.Adam([colours], lr=learning_rate, eps=ADAM_EPS, fused=self._fused)
+        self._first, self._second = (torch.zeros_like(colours, requires_grad=False) for _ in range(2))
+        self._steps = torch.zeros((), dtype=torch.float32, device=colours.device if self._fused else None)
 
     def update(self, gradient: Tensor, learning_rate: float) -> Tensor:
         """One step, but for a gradient [n, 3] that is beyond `LARGEST_GRADIENT` or not finite: then nothing changes.
@@ -60,19 +65,38 @@ class ColourOptimiser:
             # The derivative with respect to what is added to all three channels. Adam's steps are the same in each.
             gradient = gradient.sum(dim=1, keepdim=True).expand(-1, 3).contiguous()
         largest = gradient.abs().amax()
-        for group in self._adam.param_groups:
-            group["lr"] = learning_rate
         self._colours.grad = gradient.to(self._colours.dtype)
         if self._fused:
             # PyTorch's way to tell a fused step that its gradient cannot be used, made for scaled half precision.
-            self._adam.found_inf = torch.logical_not(largest <= LARGEST_GRADIENT).float()  # type: ignore[attr-defined]
-            self._adam.step()
+            self._step(learning_rate, torch.logical_not(largest <= LARGEST_GRADIENT).float())
         elif not is_too_large(float(largest)):
-            self._adam.step()
+            self._step(learning_rate)
         else:
             return largest
         self._constrain(largest)
         return largest
+
+    @torch.no_grad()
+    def _step(self, learning_rate: float, found_inf: Tensor | None = None) -> None:
+        """Where `found_inf` is not 0, nothing changes."""
+        assert self._colours.grad is not None
+        adam(
+            [self._colours],
+            [self._colours.grad],
+            [self._first],
+            [self._second],
+            [],
+            [self._steps],
+            fused=self._fused,
+            found_inf=found_inf,
+            amsgrad=False,
+            beta1=_BETA1,
+            beta2=_BETA2,
+            lr=learning_rate,
+            weight_decay=0.0,
+            eps=ADAM_EPS,
+            maximize=False,
+        )
 
     @torch.no_grad()
     def _constrain(self, largest: Tensor) -> None:
@@ -90,19 +114,13 @@ class ColourOptimiser:
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """First and second moment [n, 3], on the CPU; zeros before the first step."""
-        state = self._adam.state.get(self._colours, {})
-        nothing = torch.zeros_like(self._colours)
-        first, second = (state.get(name, nothing).detach() for name in ("exp_avg", "exp_avg_sq"))
-        return first.cpu().clone(), second.cpu().clone()
+        return self._first.cpu().clone(), self._second.cpu().clone()
 
     def load_moments(self, step: int, first: Tensor, second: Tensor) -> None:
         """Go on after so many steps, at least one, with their moments [n, 3]."""
-        device = self._colours.device
-        self._adam.state[self._colours] = {
-            "step": torch.tensor(float(step), device=device if self._fused else None),
-            "exp_avg": first.to(device).clone(),
-            "exp_avg_sq": second.to(device).clone(),
-        }
+        self._steps.fill_(step)
+        self._first.copy_(first)
+        self._second.copy_(second)
 
 
 def constrained(colours: Tensor, chroma_of: Tensor | None, *, bounded: bool) -> Tensor:

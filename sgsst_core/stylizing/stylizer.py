@@ -141,7 +141,6 @@ class Stylizer:
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
         self._optimiser = ColourOptimiser(
             self.sh_dc,
-            settings.learning_rate,
             self.network.unit,
             chroma_of,
             bounded=settings.bounded,

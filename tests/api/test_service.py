@@ -63,7 +63,7 @@ def short_job(files: dict[str, Path], service: Service) -> str:
 
     async def sent() -> Job:
         async with AsyncClient(service.url) as client:
-            parameters = PARAMETERS | {"steps_sos": 5}
+            parameters: dict[str, Any] = PARAMETERS | {"steps_sos": 5}
             made = await client.submit(files["scene"], files["style"], cameras=files["cameras"], **parameters)
             return await client.wait(made.id)
 

@@ -117,7 +117,7 @@ def test_steps_are_those_of_projected_adam() -> None:
     start = torch.randn((200, 3), generator=generator)
     gradients = [torch.randn((200, 3), generator=generator) + 0.5 for _ in range(20)]
     colours = start.clone()
-    optimiser = ColourOptimiser(colours, 0.3, bounded=True)
+    optimiser = ColourOptimiser(colours, bounded=True)
     for gradient in gradients:
         optimiser.update(gradient, 0.3)
     expected = adam(start, gradients, 0.3)
@@ -127,5 +127,5 @@ def test_steps_are_those_of_projected_adam() -> None:
 
 def test_a_step_that_is_not_made_brings_nothing_back() -> None:
     colours = torch.full((4, 3), 5.0)
-    ColourOptimiser(colours, 0.1, bounded=True).update(torch.full((4, 3), 10 * LARGEST_GRADIENT), 0.1)
+    ColourOptimiser(colours, bounded=True).update(torch.full((4, 3), 10 * LARGEST_GRADIENT), 0.1)
     assert bool((colours == 5).all())

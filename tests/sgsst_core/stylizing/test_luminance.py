@@ -190,7 +190,7 @@ def test_where_no_step_can_be_made_nothing_changes() -> None:
     original = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
     colours = original + 0.7 * torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
     before = colours.clone()
-    optimiser = ColourOptimiser(colours, 0.1, chroma_of=original)
+    optimiser = ColourOptimiser(colours, chroma_of=original)
     optimiser.update(torch.full((50, 3), 1e20), 0.1)
     assert torch.equal(colours.detach(), before)
     optimiser.update(torch.ones(50, 3), 0.1)

@@ -36,7 +36,9 @@ def on_ranks(
 @functools.cache
 def _pool() -> ProcessPoolExecutor:
     # A rank waits for the others inside its task, so that no process takes two of them.
-    pool = ProcessPoolExecutor(MOST_RANKS, mp_context=multiprocessing.get_context("spawn"))
+    context = multiprocessing.get_context("forkserver")  # which imports once what every rank would
+    context.set_forkserver_preload(["sgsst_core.stylizing.stylizer", "worker.ranks.process_group"])
+    pool = ProcessPoolExecutor(MOST_RANKS, mp_context=context)
     atexit.register(pool.shutdown, cancel_futures=True)
     return pool
 
