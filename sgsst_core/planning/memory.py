@@ -13,7 +13,7 @@ from sgsst_core.planning.visits import COLOUR_BYTES, Visits
 from sgsst_core.settings import Settings
 
 #: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.
-MEASURING_BYTES = 200 << 20
+MEASURING_BYTES = 100 << 20
 #: Bytes of each Gaussian of a scene that is projected: of its shape, kept between views, and of its projection, its
 #: depth and their order while a view's lists are built.
 SHAPE_BYTES, BUILDING_BYTES = 32, 104
