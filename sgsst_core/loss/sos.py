@@ -298,7 +298,7 @@ class SosLoss:
             for scale in pyramids[0]
         }
         if self.nearest_layers and all(found is None for found in vectors.values()):
-            height, width = _size(pyramids[0][0])
+            height, width = _size(pyramids[0][min(pyramids[0])])  # of the scales that count
             raise ImageError(
                 f"The style is used at {width} x {height} pixels, too few to match features with. "
                 "Give a larger picture, or larger views, or leave --style-loss at sos."

@@ -45,8 +45,8 @@ class CachedRasterizer:
     Weights are kept in the order in which views first come, until the next ones would exceed `max_bytes`; nothing is
     ever evicted (views come round in turn, so that what is evicted would be needed again before what is kept). Views
     and bands without kept weights are computed each time, on the same device, by `cpu` or `triton`: on the CPU with the
-    same result as float32 weights give, on a GPU within rounding. A band is served from the whole view's weights where
-    those are kept, else from its own. Colour gradients repeat to the bit.
+    same image as float32 weights give and gradients within rounding, on a GPU both within rounding. A band is served
+    from the whole view's weights where those are kept, else from its own. Colour gradients repeat to the bit.
 
     Args:
         scene: its geometry must not change while this object lives.

@@ -11,6 +11,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss import nearest
 from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, nearest_reference, search
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, layers_of, nearest_layers
@@ -234,6 +235,9 @@ def test_a_style_of_hardly_any_vector(
 def test_a_style_without_a_vector_is_refused(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
         loss_of(tiny_weights, "nnfm").style_targets(picture(3, 200), (100, 80))
+    without_full_size = loss_of(tiny_weights, "nnfm", coarsest=40, scales=ScaleWeights((0.0, 1.0)))
+    with pytest.raises(ImageError, match="The style is used at 100 x 2 pixels, too few to match"):
+        without_full_size.style_targets(picture(4, 200), (100, 80))
 
 
 def test_large_styles_are_thinned_evenly() -> None:
