@@ -16,6 +16,7 @@ import time
 import traceback
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -74,7 +75,7 @@ def outcome(situation: Situation) -> tuple[str, str | None]:
         return type(error).__name__, None
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
-        return "broken", f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+        return "broken", f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
     if result.passed:
         return "within its bounds", None
     return "broken", f"error {result.error:.3g}, bound {result.bound:.3g}; {result.note}"
