@@ -27,6 +27,8 @@ from pathlib import Path
 _TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x0002 | 0x1000
 _LARGEST_PACKET = 65536
 _TOOLS = ("ip", "unshare", "nsenter", "mount")
+#: Third numbers of addresses: 10.77.N. The scripts in deploy/ have those from 81 on.
+_NETWORKS = range(61, 80)
 
 
 def missing() -> str | None:
@@ -138,16 +140,21 @@ class Carrier(threading.Thread):
 
 
 class Network:
-    """A switch with hosts; this machine itself is at `gateway`. A context manager that leaves nothing behind.
+    """A switch with hosts, on the first of `_NETWORKS` that is free; this machine itself is at `gateway`.
+
+    A context manager that leaves nothing behind. What one that was killed has left is passed over: two networks on a
+    machine do not disturb each other.
 
     Args:
         folder: new, for logs and the hosts' disks.
-        prefix: of the first three numbers of all addresses.
+
+    Attributes:
+        prefix: the first three numbers of all addresses, once entered.
         name: of the switch; names of devices begin with it.
     """
 
-    def __init__(self, folder: Path, prefix: str = "10.77.84", name: str = "sgsst4") -> None:
-        self.folder, self.prefix, self.name = folder, prefix, name
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.prefix, self.name = folder, "", ""
         self.carrier = Carrier()
         self.hosts: dict[str, Host] = {}
 
@@ -157,7 +164,7 @@ class Network:
         return f"{self.prefix}.1"
 
     def __enter__(self) -> Network:
-        _ip("link", "add", self.name, "type", "bridge")
+        self._take()
         _ip("link", "set", self.name, "up")
         _ip("address", "add", f"{self.gateway}/24", "dev", self.name)
         self.carrier.start()
@@ -168,6 +175,17 @@ class Network:
             host.kill()
         self.carrier.end()
         _ip("link", "delete", self.name, check=False)
+
+    def _take(self) -> None:
+        """A switch of a name that no other has: making it is what takes its network."""
+        for number in _NETWORKS:
+            self.prefix, self.name = f"10.77.{number}", f"sgsst{number}"
+            made = subprocess.run(["ip", "link", "add", self.name, "type", "bridge"], capture_output=True, text=True)
+            if made.returncode == 0:
+                return
+        raise RuntimeError(
+            f"no network of 10.77.{_NETWORKS[0]} to {_NETWORKS[-1]} could be taken: {made.stderr.strip()}"
+        )
 
     def host(self, name: str, number: int, disk_bytes: int = 1 << 30) -> Host:
         """A new host, which runs."""
@@ -204,6 +222,7 @@ class Host:
     def start(self) -> None:
         """Switch it on: nothing runs on it yet, its disk is empty."""
         self.disk.mkdir(parents=True, exist_ok=True)
+        _ip("netns", "delete", self._space, check=False)  # its file outlives a machine whose /run is on a disk
         _ip("netns", "add", self._space)
         self._plug_in()
         made = f"hostname {self.name}; mount -t tmpfs -o size={self._disk_bytes} tmpfs {self.disk}; exec sleep infinity"

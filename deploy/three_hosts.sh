@@ -12,11 +12,10 @@
 # Usage: deploy/three_hosts.sh [FOLDER] [kill]
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source deploy/free_network.sh
 BIN=$(realpath "${BIN:-.venv/bin}")
 OUT=$(realpath -m "${1:-three_hosts}")
 HOW=${2:-quiet}
-NET=10.77.83
-BRIDGE=sgsst3-br
 RAY_PORT=6479
 PG_PORT=5498
 S3_PORT=5599
@@ -27,7 +26,7 @@ CACHE=${SGSST_CACHE:-$HOME/.cache/sgsst}
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} PATH=$BIN:$PG_BIN:$PATH
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN RAY_USAGE_STATS_ENABLED=0 OMP_NUM_THREADS=1
 RAY_AUTH_TOKEN=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
-export AWS_ENDPOINT_URL=http://$NET.1:$S3_PORT AWS_ACCESS_KEY_ID=key AWS_SECRET_ACCESS_KEY=secret AWS_DEFAULT_REGION=us-east-1
+export AWS_ACCESS_KEY_ID=key AWS_SECRET_ACCESS_KEY=secret AWS_DEFAULT_REGION=us-east-1
 declare -A hosts=()
 others=()
 
@@ -38,11 +37,7 @@ done
 
 clean_up() {
   for pid in "${hosts[@]}" "${others[@]}"; do kill -KILL "$pid" 2> /dev/null || true; done
-  for name in api head node; do
-    ip link delete "sgsst3-$name" 2> /dev/null || true
-    ip netns delete "sgsst3-$name" 2> /dev/null || true
-  done
-  ip link delete "$BRIDGE" 2> /dev/null || true
+  give_network_back api head node
   sleep 1
   rm -rf "$WORK"
 }
@@ -52,15 +47,9 @@ trap 'exit 130' INT TERM
 # A host: its own network, processes, name, and disks for what is temporary and for the service. $1 name, $2 address.
 start_host() {
   local name=$1 address=$2
-  ip netns add "sgsst3-$name"
-  ip link add "sgsst3-$name" type veth peer name eth0 netns "sgsst3-$name"
-  ip link set "sgsst3-$name" master "$BRIDGE" up
-  ip -n "sgsst3-$name" link set lo up
-  ip -n "sgsst3-$name" link set eth0 up
-  ip -n "sgsst3-$name" address add "$address/24" dev eth0
-  ip -n "sgsst3-$name" route add default via "$NET.1"
+  add_host "$name" "$address"
   mkdir -p "$WORK/ray" "$WORK/disk"
-  ip netns exec "sgsst3-$name" unshare --uts --pid --mount --fork --mount-proc --kill-child bash -c \
+  ip netns exec "$BRIDGE-$name" unshare --uts --pid --mount --fork --mount-proc --kill-child bash -c \
     "hostname host-$name; mount -t tmpfs tmpfs $WORK/ray; mount -t tmpfs tmpfs $WORK/disk; exec sleep infinity" \
     > "$WORK/$name.log" 2>&1 &
   hosts[$name]=$!
@@ -76,8 +65,7 @@ start_host() {
 stop_host() {
   kill -KILL "${hosts[$1]}"
   sleep 1
-  ip link delete "sgsst3-$1" 2> /dev/null || true
-  ip netns delete "sgsst3-$1"
+  remove_host "$1"
 }
 
 # A command on a host. $1 name, the rest: the command.
@@ -115,9 +103,8 @@ start_node() {
     --node-ip-address "$NET.4" --num-cpus 2 "${common[@]}"
 }
 
-ip link add "$BRIDGE" type bridge
-ip link set "$BRIDGE" up
-ip address add "$NET.1/24" dev "$BRIDGE"
+take_network
+export AWS_ENDPOINT_URL=http://$NET.1:$S3_PORT
 
 mkdir "$WORK/pg"
 chmod 755 "$WORK"
@@ -147,7 +134,7 @@ start_node
 run_on head dispatcher "${service[@]}" RAY_ADDRESS="$NET.3:$RAY_PORT" python -m service.scheduling.dispatcher
 url=http://$NET.2:8000
 wait_for "the service" sh -c "curl -s $url/readyz | grep -q '\"status\":\"ok\"'"
-echo "Three hosts: API on host-api, dispatcher on host-head, a Ray node on host-node"
+echo "Three hosts of $NET: API on host-api, dispatcher on host-head, a Ray node on host-node"
 
 python - "$WORK/scene" <<'PYTHON'
 import sys

@@ -8,10 +8,9 @@
 # Usage: deploy/two_hosts.sh [OUT.ply]
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source deploy/free_network.sh
 BIN=$(realpath "${BIN:-.venv/bin}")
 OUT=$(realpath -m "${1:-two_hosts/stylized.ply}")
-NET=10.77.81
-BRIDGE=sgsst-br
 PORT=6479
 WORK=$(mktemp -d /tmp/sgsst-two-XXXXXX)
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN RAY_USAGE_STATS_ENABLED=0
@@ -26,11 +25,7 @@ done
 
 clean_up() {
   for pid in "${hosts[@]}"; do kill -KILL "$pid" 2> /dev/null || true; done # a host's first process takes all others along
-  for name in a b; do
-    ip link delete "sgsst-$name" 2> /dev/null || true
-    ip netns delete "sgsst-$name" 2> /dev/null || true
-  done
-  ip link delete "$BRIDGE" 2> /dev/null || true
+  give_network_back a b
   rm -rf "$WORK"
 }
 trap clean_up EXIT
@@ -40,15 +35,9 @@ trap 'exit 130' INT TERM
 start_host() {
   local name=$1 address=$2
   shift 2
-  ip netns add "sgsst-$name"
-  ip link add "sgsst-$name" type veth peer name eth0 netns "sgsst-$name"
-  ip link set "sgsst-$name" master "$BRIDGE" up
-  ip -n "sgsst-$name" link set lo up
-  ip -n "sgsst-$name" link set eth0 up
-  ip -n "sgsst-$name" address add "$address/24" dev eth0
-  ip -n "sgsst-$name" route add default via "$NET.1"
+  add_host "$name" "$address"
   mkdir -p "$WORK/ray"
-  ip netns exec "sgsst-$name" unshare --uts --pid --mount --fork --mount-proc --kill-child bash -c \
+  ip netns exec "$BRIDGE-$name" unshare --uts --pid --mount --fork --mount-proc --kill-child bash -c \
     "hostname host-$name; mount -t tmpfs tmpfs $WORK/ray; exec $(printf '%q ' "$@")" > "$WORK/$name.log" 2>&1 &
   hosts[$name]=$!
   disown  # or the shell would report its end
@@ -62,9 +51,7 @@ on_host() {
   nsenter -t "$first" -n -u -p -m --wd="$PWD" "$@"
 }
 
-ip link add "$BRIDGE" type bridge
-ip link set "$BRIDGE" up
-ip address add "$NET.1/24" dev "$BRIDGE"
+take_network
 
 echo "Building a scene"
 python - "$WORK" <<'PYTHON'
@@ -91,12 +78,12 @@ done
 grep -q "Ray runtime started" "$WORK/b.log" || { cat "$WORK/a.log" "$WORK/b.log" >&2; exit 1; }
 
 echo "Two hosts: $NET.2 and $NET.3"
-before=$(cat /sys/class/net/sgsst-b/statistics/rx_bytes)
+before=$(cat "/sys/class/net/$BRIDGE-b/statistics/rx_bytes")
 scene=$WORK/scene
 on_host a env RAY_ADDRESS="$NET.2:$PORT" sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" \
   --style "$scene/starry_night.jpg" --out "$OUT" --resolution 160 --views 3 --steps-coarse 0 --steps-sos 20 --backbone vgg16 \
   --keep-everything --workers 2
-after=$(cat /sys/class/net/sgsst-b/statistics/rx_bytes)
+after=$(cat "/sys/class/net/$BRIDGE-b/statistics/rx_bytes")
 
 python - "${OUT%.ply}.report.json" $((after - before)) <<'PYTHON'
 import json

@@ -32,6 +32,6 @@ def test_scripts(script: str) -> None:
     lint("shellcheck", "--shell=sh", "--severity=warning", script)
 
 
-@pytest.mark.parametrize("script", ["deploy/two_hosts.sh", "deploy/three_hosts.sh"])
+@pytest.mark.parametrize("script", ["deploy/free_network.sh", "deploy/two_hosts.sh", "deploy/three_hosts.sh"])
 def test_scripts_of_hosts(script: str) -> None:
     lint("shellcheck", "--severity=error", script)
