@@ -27,6 +27,17 @@ def test_a_search_says_how_jobs_ended() -> None:
     assert not found
 
 
+@pytest.mark.parametrize(
+    ("number", "how"),
+    [
+        (248, "ImageError"),  # features to match, of a style of one column, at half size alone
+        (3278, "within its bounds"),  # a maximum that is nearly tied after half size was averaged
+    ],
+)
+def test_what_it_found_stays_mended(number: int, how: str) -> None:
+    assert outcome(drawn(number)) == (how, None)
+
+
 def test_what_breaks_a_bound_or_ends_in_any_other_way_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"steps_coarse": 0, "steps_sos": 1, "content_weight": 0}  # whose rounding would be another bound
     style = torch.rand(30, 26, 3, generator=torch.Generator().manual_seed(1))

@@ -6,7 +6,9 @@ import math
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -216,17 +218,36 @@ class DecisionsOf(FeatureNetwork):
 
     Without them, a maximum that is tied in exact arithmetic (in any constant picture) sends the gradient to either
     pixel: both are subgradients, and no precision is high enough to agree.
+
+    They are those of the passes that the other network made in a block of `listening`, in their order, and not of
+    passes over the same pixels: those of a lower scale are averaged in float64 here and were in float32 there, and a
+    maximum that is nearly tied may have moved.
     """
 
     def __init__(self, weights: BackboneWeights, other: FeatureNetwork) -> None:
         super().__init__(weights, other.layers, torch.float64)
         self.other = other
         self.flips = 0
+        self._heard: deque[list[Tensor]] = deque()
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """A block in which the other network makes the passes that this one is to follow afterwards."""
+        forward = self.other.forward
+
+        def heard(rgb: Tensor, *, keep: bool = True) -> Activations:
+            made = forward(rgb, keep=keep)
+            self._heard.append(list(made.outputs))
+            return made
+
+        self.other.forward = heard  # type: ignore[method-assign]
+        yield
+        del self.other.forward
 
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
-        """As `FeatureNetwork.forward`, with the other network's decisions kept for `backward`."""
+        """As `FeatureNetwork.forward`, with the decisions of the other network's next pass kept for `backward`."""
         own = super().forward(rgb, keep=keep)
-        theirs = self.other.forward(rgb, keep=keep)
+        theirs = Activations({}, self._heard.popleft())
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
             self.flips += int((mine != other).sum())
         own.outputs = [output.double() for output in theirs.outputs]
@@ -253,9 +274,9 @@ def compare_losses(
     style = resize_area(style, style_size((style.shape[0], style.shape[1]), (image.shape[0], image.shape[1])))
     single = FeatureNetwork(vgg16())
     double = DecisionsOf(vgg16(), single)
-    found, expected = (
-        _evaluate(network, image, style, content, content_weight, coverage) for network in (single, double)
-    )
+    with double.listening():
+        found = _evaluate(single, image, style, content, content_weight, coverage)
+    expected = _evaluate(double, image, style, content, content_weight, coverage)
     assert found.image_gradient is not None
     assert expected.image_gradient is not None
     loss = expected.loss

@@ -168,7 +168,9 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     content = job.views.content(index)
     coverage = job.views.coverage(index)[0] if job.views.weighted else None
     double = DecisionsOf(job.weights, job.network)
-    found, exact = (_evaluate(job, network, picture, content, coverage) for network in (job.network, double))
+    with double.listening():
+        found = _evaluate(job, job.network, picture, content, coverage)
+    exact = _evaluate(job, double, picture, content, coverage)
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
