@@ -236,6 +236,8 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         stylizer.style_targets(stylizer.views.cameras[index])
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
         stylizer.views.target(index, scales, stylizer.behind(index))
+        for phase in phases:
+            stylizer.keep(index, phase.scales(chosen))
         stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MAX, NEAR
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.arguments import (
     CameraKey,
     Rows,
@@ -42,11 +43,12 @@ class _Kept:
 class CachedRasterizer:
     """The protocol of `sgsst_core.rasterizer.Rasterizer` with blend weights that are computed once a view.
 
-    Weights are kept in the order in which views first come, until the next ones would exceed `max_bytes`; nothing is
-    ever evicted (views come round in turn, so that what is evicted would be needed again before what is kept). Views
-    and bands without kept weights are computed each time, on the same device, by `cpu` or `triton`: on the CPU with the
-    same image as float32 weights give and gradients within rounding, on a GPU both within rounding. A band is served
-    from the whole view's weights where those are kept, else from its own. Colour gradients repeat to the bit.
+    Weights are kept in the order in which views first come, or in which `keep` names them, until the next ones would
+    exceed `max_bytes`; nothing is ever evicted (views come round in turn, so that what is evicted would be needed again
+    before what is kept). Views and bands without kept weights are computed each time, on the same device, by `cpu` or
+    `triton`: on the CPU with the same image as float32 weights give and gradients within rounding, on a GPU both within
+    rounding. A band is served from the whole view's weights where those are kept, else from its own. Colour gradients
+    repeat to the bit.
 
     Args:
         scene: its geometry must not change while this object lives.
@@ -58,6 +60,8 @@ class CachedRasterizer:
         max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `anew`, which keeps
             those that weights leave room for, and lets go of a view's once its weights are kept.
         least_list_bytes: memory for these lists beside it, however much is taken by weights.
+        at_first_use: keep what comes; False keeps what `keep` is called for alone, so that looks at other views in
+            between, as many as there may be, change no bit of what follows.
         device: where weights are kept and applied, and where results lie.
         anew: computes weights, and what is not kept: of the same scene. Its lists, device, background, near plane and
             clamp of alpha take the place of those given here; None makes one.
@@ -80,6 +84,7 @@ class CachedRasterizer:
         precision: Precision = "float32",
         max_bytes: int | None = None,
         least_list_bytes: int = 0,
+        at_first_use: bool = True,
         device: torch.device | str = "cpu",
         anew: CpuRasterizer | TritonRasterizer | None = None,
     ) -> None:
@@ -88,6 +93,7 @@ class CachedRasterizer:
         self.max_bytes = max_bytes
         self.least_list_bytes = least_list_bytes
         self.kept_bytes = 0
+        self._at_first_use = at_first_use
         if anew is None and torch.device(device).type == "cpu":
             anew = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
         elif anew is None:
@@ -108,10 +114,17 @@ class CachedRasterizer:
         """Bytes that a band's weights take or would take. Costs about one render, and keeps nothing."""
         return self.count(camera, rows).nbytes(self.precision)
 
+    def keep(self, camera: Camera, rows: Rows | None = None) -> bool:
+        """Keep a band's weights from now on; whether they fit, which is decided when the band is first named."""
+        key, band = camera_key(camera), check_rows(camera, rows)
+        with self._lock:
+            if self._serving(key, band, camera) is None and (key, band) not in self._kept:
+                self._kept[key, band] = self._keep(camera, band)
+            return self._serving(key, band, camera) is not None
+
     def is_kept(self, camera: Camera, rows: Rows | None = None) -> bool:
         """Whether the band is served from kept weights by now."""
-        key, band = camera_key(camera), check_rows(camera, rows)
-        return any(self._kept.get((key, b)) is not None for b in (band, (0, camera.height)))
+        return self._serving(camera_key(camera), check_rows(camera, rows), camera) is not None
 
     def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
@@ -148,15 +161,14 @@ class CachedRasterizer:
         return self.anew.survey(camera)
 
     def _kept_for(self, camera: Camera, band: Rows) -> _Kept | None:
-        """The kept weights that serve a band, made now if they are new and fit; None where they do not fit."""
-        key = camera_key(camera)
-        with self._lock:
-            whole = self._kept.get((key, (0, camera.height)))
-            if whole is not None:
-                return whole
-            if (key, band) not in self._kept:
-                self._kept[key, band] = self._keep(camera, band)
-            return self._kept[key, band]
+        """The kept weights that serve a band, made now if they are to be and fit; None where there are none."""
+        if self._at_first_use:
+            self.keep(camera, band)
+        return self._serving(camera_key(camera), band, camera)
+
+    def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _Kept | None:
+        """The weights that serve a band by now: those of the whole view, else its own."""
+        return self._kept.get((key, (0, camera.height))) or self._kept.get((key, band))
 
     def _keep(self, camera: Camera, band: Rows) -> _Kept | None:
         counted = self.count(camera, band)
@@ -168,3 +180,14 @@ class CachedRasterizer:
         if self.max_bytes is not None and isinstance(self.anew, CpuRasterizer):
             self.anew.let_go_of_lists(camera, max(self.max_bytes - self.kept_bytes, self.least_list_bytes))
         return _Kept(band, weights)
+
+
+def repeatable(rasterizer: Rasterizer) -> Rasterizer:
+    """What renders a rasterizer's images with the same bits whether weights are kept by then or not.
+
+    `cached` itself only in float32 on the CPU: see there.
+    """
+    if not isinstance(rasterizer, CachedRasterizer):
+        return rasterizer
+    exact = rasterizer.precision == "float32" and isinstance(rasterizer.anew, CpuRasterizer)
+    return rasterizer if exact else rasterizer.anew

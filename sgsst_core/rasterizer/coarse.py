@@ -136,20 +136,26 @@ class CoarseOperator:
 class _Operators:
     """Operators of views at coarse scales, kept until the next one would exceed `max_bytes`."""
 
-    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None) -> None:
+    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None, at_first_use: bool) -> None:
         self.max_bytes = max_bytes
+        self.at_first_use = at_first_use
         self.kept_bytes = 0
         self.kept: dict[tuple[CameraKey, int], CoarseOperator | None] = {}
         self._cpu = cpu
         self._lock = threading.Lock()
 
     def get(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
-        """The view's kept operator, built now if it is new and fits; None where it does not fit."""
+        """The view's kept operator, built now if it is to be and fits; None where there is none."""
+        if self.at_first_use:
+            self.keep(camera, scale, grid)
+        return self.kept.get((camera_key(camera), scale))
+
+    def keep(self, camera: Camera, scale: int, grid: _Grid) -> None:
+        """Build the view's operator if it is new and fits."""
         key = (camera_key(camera), scale)
         with self._lock:
             if key not in self.kept:
                 self.kept[key] = self._build(camera, grid)
-            return self.kept[key]
 
     def _build(self, camera: Camera, grid: _Grid) -> CoarseOperator | None:
         lists = self._cpu.lists(camera)
@@ -165,9 +171,9 @@ class _Operators:
 class CoarseRasterizer:
     """The protocol of `sgsst_core.rasterizer.Rasterizer` at a coarse scale, on the CPU.
 
-    Operators are kept in the order in which views first come, until the next one would exceed `max_bytes`; nothing is
-    ever evicted. Views without a kept operator are rendered at full size by `cpu` and averaged, with the same result up
-    to rounding. Results are the same bits for any number of threads.
+    Operators are kept in the order in which views first come, or in which `keep` names them, until the next one would
+    exceed `max_bytes`; nothing is ever evicted. Views without a kept operator are rendered at full size by `cpu` and
+    averaged, with the same result up to rounding. Results are the same bits for any number of threads.
 
     Cameras are those of full-size views. Rows and columns that fill no square of 2^scale pixels are left out, as by
     `pyramid.downscale`. Every method raises ValueError for a view that holds no such square: its image would be empty.
@@ -176,6 +182,7 @@ class CoarseRasterizer:
         cpu: whose scene, lists, background, near plane and clamp of alpha this object shares.
         scale: 1 or more.
         max_bytes: most bytes of operators to keep; None for no limit.
+        at_first_use: keep what comes; False keeps what `keep` is called for alone (`CachedRasterizer`).
 
     Raises:
         ValueError: scale 0 or less.
@@ -185,13 +192,15 @@ class CoarseRasterizer:
     device = _CPU
     dtype = torch.float32
 
-    def __init__(self, cpu: CpuRasterizer, scale: int = 1, max_bytes: int | None = None) -> None:
+    def __init__(
+        self, cpu: CpuRasterizer, scale: int = 1, max_bytes: int | None = None, *, at_first_use: bool = True
+    ) -> None:
         if scale < 1:
             raise ValueError(f"scale {scale}: a coarse operator is for scale 1 or more; use `cached` for full size")
         self.scene = cpu.scene
         self.scale = scale
         self._cpu = cpu
-        self._operators = _Operators(cpu, max_bytes)
+        self._operators = _Operators(cpu, max_bytes, at_first_use)
 
     def at(self, scale: int) -> CoarseRasterizer:
         """The same at another scale; what both keep counts together."""
@@ -209,6 +218,11 @@ class CoarseRasterizer:
         grid = _Grid.of(camera, self.scale)
         lists = self._cpu.lists(camera)
         return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
+
+    def keep(self, camera: Camera) -> bool:
+        """Keep a view's operator from now on; whether it fits, which is decided when the view is first named."""
+        self._operators.keep(camera, self.scale, _Grid.of(camera, self.scale))
+        return self.is_kept(camera)
 
     def is_kept(self, camera: Camera) -> bool:
         """Whether a view is served from a kept operator by now."""

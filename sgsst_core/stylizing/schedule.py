@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+
+import torch
 
 from sgsst_core.planning.plan import Plan
 from sgsst_core.settings import Settings
@@ -41,3 +43,15 @@ def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
             return phase
         step -= phase.steps
     return schedule[-1]
+
+
+def drawn_round(covered: Sequence[int], generator: torch.Generator) -> list[int]:
+    """Every view once in random order; the last one comes first."""
+    return [covered[i] for i in torch.randperm(len(covered), generator=generator).tolist()]
+
+
+def drawn_views(covered: Sequence[int], seed: int) -> Iterator[int]:
+    """The views of all steps of a job from its first one on, round after round."""
+    generator = torch.Generator().manual_seed(seed)
+    while True:
+        yield from reversed(drawn_round(covered, generator))

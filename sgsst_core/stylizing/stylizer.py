@@ -30,6 +30,7 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import Workshop, make_network, sharing_memory
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cached import repeatable
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -47,7 +48,7 @@ from sgsst_core.stylizing.evaluation import (
 from sgsst_core.stylizing.optimiser import ColourOptimiser, constrained, is_too_large
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.regions import JobStyles, neighbours_change_by_region
-from sgsst_core.stylizing.schedule import Phase, phase_at, planned_phases
+from sgsst_core.stylizing.schedule import Phase, drawn_round, drawn_views, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.surround import Colour, drawn_colour
 from sgsst_core.stylizing.team import Team
@@ -148,6 +149,8 @@ class Stylizer:
         )
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
+        #: Steps before a resume whose views' blend weights are still to be kept.
+        self._visited_before = 0
         self.schedule = planned_phases(plan, settings)
         self.total = sum(phase.steps for phase in self.schedule)
         self._process = psutil.Process()
@@ -281,11 +284,12 @@ class Stylizer:
             max_bytes=budget - share,
             least_list_bytes=self._least_list_bytes,
             precision="half" if plan.kept_weights == "half" else "float32",
+            at_first_use=False,
             anew=anew,
         )
         coarse = None
         if plan.coarse_weights and isinstance(anew, CpuRasterizer):
-            coarse = CoarseRasterizer(anew, max_bytes=share)
+            coarse = CoarseRasterizer(anew, max_bytes=share, at_first_use=False)
         return cached, coarse
 
     @property
@@ -310,7 +314,7 @@ class Stylizer:
             regions=plan.survey.regions if plan.weighted else None,
             background=settings.background,
             drawn=plan.surround != "background",
-            maps=self.styles.maps(rasterizer, plan.seen),
+            maps=self.styles.maps(repeatable(rasterizer), plan.seen),
             collectives=self.group,
         )
 
@@ -389,6 +393,7 @@ class Stylizer:
         started = time.perf_counter()
         self._stylized = None
         self.timer.clear()
+        self._keep_visited()
         sent = dict(self.collectives.sent)
         phase = self.phase
         if phase.scale is None:
@@ -432,6 +437,7 @@ class Stylizer:
             scales = phase.scales(self.scales(index))
             behind = self.behind(index)
             with self.timer("prepare", whole=True):
+                self.keep(index, scales)
                 target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])
@@ -494,8 +500,7 @@ class Stylizer:
     def _next_view(self) -> int:
         """Random views without replacement: every view once before any comes again."""
         if not self._queue:
-            covered = self.views.covered
-            self._queue = [covered[i] for i in torch.randperm(len(covered), generator=self._generator).tolist()]
+            self._queue = drawn_round(self.views.covered, self._generator)
         return self._queue.pop()
 
     def _look_ahead(self, left: Sequence[int], phase: Phase) -> None:
@@ -526,6 +531,7 @@ class Stylizer:
         Args:
             sh_dc: [n, 3], colours to evaluate in place of the present ones of the n optimised Gaussians.
         """
+        self._keep_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
         return evaluate(self.views, self.style_targets, indices, values)
 
@@ -534,6 +540,7 @@ class Stylizer:
 
         Targets are prepared before the clock starts. Changes nothing.
         """
+        self._keep_visited()
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
         started = time.perf_counter()
         gradient = self._gradient(index, style, target, scales)[0]
@@ -560,6 +567,28 @@ class Stylizer:
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
             return self.views.gradient(index, result.image_gradient.to(colours.device), colours, rasterizer), result
+
+    def keep(self, index: int, scales: Sequence[int]) -> None:
+        """Keep a view's blend weights for some scales, as its first step does, where they fit.
+
+        Only steps do: what is rendered in between, which depends on the clock, changes none of their bits.
+        """
+        self.views.keep(index, self._rasterizer_for(scales))
+
+    def _keep_visited(self) -> None:
+        """Once after a resume: keep what the steps before it kept, in their order, so that the same views fit."""
+        steps, self._visited_before = self._visited_before, 0
+        if not steps:
+            return
+        order = drawn_views(self.views.covered, self.settings.seed)
+        with self.timer("prepare"):
+            for step in range(steps):
+                views = [next(order) for _ in range(self.settings.views_per_step)]
+                phase = phase_at(self.schedule, step)
+                for index in views[self._team.own_group :: self._team.groups]:
+                    scales = phase.scales(self.scales(index))
+                    if self.phase.scale is not None or not self._rasterizer_for(scales).scale:
+                        self.keep(index, scales)  # those of a phase that is over are not needed
 
     def _rasterizer_for(self, scales: Sequence[int]) -> Rasterizer:
         """What renders a view for some scales: at the one coarse scale alone, where its weights are kept."""
@@ -652,3 +681,4 @@ class Stylizer:
         earlier = state.seconds_by_part
         self.seconds_by_part = {**earlier, **{name: earlier.get(name, 0.0) + own[name] for name in own}}
         self.measured = list(state.measured)
+        self._visited_before = state.step

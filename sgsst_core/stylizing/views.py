@@ -15,6 +15,8 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide_rows
 from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer, Rows
+from sgsst_core.rasterizer.cached import CachedRasterizer, repeatable
+from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
@@ -71,6 +73,8 @@ class Views:
         self.scene = scene
         self.cameras = list(cameras)
         self.rasterizer = rasterizer
+        #: For what is kept through many steps: whenever it is made, it has the same bits.
+        self._repeatable = repeatable(rasterizer)
         self.loss = loss
         self.collectives = collectives
         self._photos = photos
@@ -154,6 +158,18 @@ class Views:
         # After the sum: which colours are let through depends on the sign of their whole gradient.
         return view_colours_gradient(gradient, colours, revive=self.revive)
 
+    def keep(self, index: int, rasterizer: Rasterizer | None = None) -> None:
+        """Keep the blend weights of this rank's part of a view, where its rasterizer keeps any and they fit.
+
+        Args:
+            rasterizer: as for `render`.
+        """
+        rasterizer, camera, band = rasterizer or self.rasterizer, self.cameras[index], self._own_band(index)
+        if isinstance(rasterizer, CoarseRasterizer):
+            rasterizer.keep(camera)
+        elif isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
+            rasterizer.keep(camera, band)
+
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
         """The sum [N, 3] of every rank's gradient [N, 3], which is 0 but for the Gaussians that the view shows."""
         with self.loss.timer("communication"):
@@ -199,7 +215,7 @@ class Views:
             return self._ahead(index)
         if self._photos is not None:
             return self._photos(index)
-        return self.render(index, self.colours(index, self._sh_dc))
+        return self.render(index, self.colours(index, self._sh_dc), self._repeatable)
 
     def look_ahead(self, index: int, scales: Sequence[int]) -> None:
         """On a GPU, begin to read the photo of the view whose target is asked for next, if that will need it."""
@@ -294,7 +310,7 @@ class Views:
     def _position_weights(self, index: int) -> list[Tensor]:
         band, camera = self._own_band(index), self.cameras[index]
         some = band[0] < band[1]
-        rows = self.rasterizer.coverage(camera, band) if some else self._nothing(0, camera.width)
+        rows = self._repeatable.coverage(camera, band) if some else self._nothing(0, camera.width)
         return self.loss.position_weights(self.collectives.all_gather_rows(rows, self._bands[index]))
 
     def _rendered_regions(self, index: int, maps: RegionMaps) -> list[list[Tensor]]:

@@ -1,0 +1,110 @@
+"""Which views' blend weights are kept, where not all of them fit, and so a job's bits: the steps alone decide it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.small_scenes import cameras, style, wall
+
+VIEWS = cameras(6)
+STEPS = 7
+#: So many visits of each view that the coarsest scale has kept weights of its own.
+PHASES = {"steps_coarse": 30, "steps_sos": 6, "coarsest_side": 16}
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
+    """In memory for the blend weights of about half the views."""
+    scene = wall()
+    kept = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
+    size = sum(kept.operator_bytes(camera) for camera in VIEWS) // 2
+    settings = {"steps_coarse": 0, "steps_sos": STEPS, "position_weights": "on", "seed": 3, **settings}
+    chosen = make_settings(
+        "preview", kept_weights=form, memory_limit=int(size / MEMORY_SHARES["rasterizer"]), **settings
+    )
+    return Stylizer.planned(scene, VIEWS, style(), chosen, weights=weights)
+
+
+def kept_views(stylizer: Stylizer) -> list[bool]:
+    rasterizer: Any = stylizer.views.rasterizer
+    return [rasterizer.is_kept(camera) for camera in stylizer.views.cameras]
+
+
+def steps(stylizer: Stylizer, count: int) -> Stylizer:
+    for _ in range(count):
+        stylizer.run_step()
+    return stylizer
+
+
+@pytest.mark.parametrize("form", ["float32", "half"])
+@pytest.mark.parametrize("views_per_step", [1, 2])
+def test_looks_in_between_change_no_bit(form: str, views_per_step: int, tiny_weights: BackboneWeights) -> None:
+    alone, watched = (job(tiny_weights, form, views_per_step=views_per_step) for _ in range(2))
+    everything = list(range(len(VIEWS)))
+    watched.evaluate(everything)
+    watched.gradient(4, watched.scales(4))
+    steps(alone, STEPS)
+    for _ in range(STEPS):
+        watched.run_step()
+        watched.evaluate(everything[::-1])
+    assert 0 < sum(kept_views(alone)) < len(VIEWS)
+    assert kept_views(watched) == kept_views(alone)
+    assert torch.equal(watched.sh_dc, alone.sh_dc)
+
+
+@pytest.mark.parametrize("form", ["float32", "half"])
+@pytest.mark.parametrize("views_per_step", [1, 2])
+@pytest.mark.parametrize("before", [2, STEPS])
+def test_a_resumed_job_keeps_the_same_views(
+    form: str, views_per_step: int, before: int, tiny_weights: BackboneWeights
+) -> None:
+    whole, first, rest = (job(tiny_weights, form, views_per_step=views_per_step) for _ in range(3))
+    losses = steps(whole, before).evaluate([5, 0])
+    steps(whole, STEPS - before)
+    rest.load_state(steps(first, before).state())
+    assert rest.evaluate([5, 0]) == losses
+    assert torch.equal(steps(rest, STEPS - before).sh_dc, whole.sh_dc)
+    assert kept_views(rest) == kept_views(whole)
+
+
+def test_a_job_that_was_resumed_behind_phase_1_keeps_nothing_of_it(tiny_weights: BackboneWeights) -> None:
+    whole, first, rest = (job(tiny_weights, "auto", **PHASES) for _ in range(3))
+    assert whole.plan.coarse_weights
+    steps(whole, 36)
+    rest.load_state(steps(first, 33).state())
+    coarse: Any = rest._coarse
+    assert torch.equal(steps(rest, 3).sh_dc, whole.sh_dc)
+    assert coarse.kept_bytes == 0
+    assert kept_views(rest) == kept_views(whole)
+
+
+def test_a_job_that_was_resumed_in_phase_1_keeps_its_operators(tiny_weights: BackboneWeights) -> None:
+    whole, first, rest = (job(tiny_weights, "auto", **PHASES) for _ in range(3))
+    operators: list[Any] = [whole._coarse, rest._coarse]
+    steps(whole, 5)
+    rest.load_state(steps(first, 3).state())
+    steps(rest, 2)
+    assert list(operators[0]._operators.kept) == list(operators[1]._operators.kept)
+    assert operators[0].kept_bytes == operators[1].kept_bytes
+    assert torch.equal(rest.sh_dc, whole.sh_dc)
+
+
+def test_keeping_is_left_to_the_caller() -> None:
+    scene, view = wall(), VIEWS[0]
+    kept, cpu = CachedRasterizer(scene, at_first_use=False), CpuRasterizer(scene)
+    pixels = torch.ones(view.height, view.width, 3)
+    assert torch.equal(kept.colour_gradient(pixels, view), cpu.colour_gradient(pixels, view))
+    assert (kept.is_kept(view), kept.kept_bytes) == (False, 0)
+    assert kept.keep(view)
+    assert kept.is_kept(view, (3, 9))
+    assert not kept.is_kept(VIEWS[1])
+    assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).keep(view)
