@@ -237,7 +237,7 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
         stylizer.views.target(index, scales, stylizer.behind(index))
         for phase in phases:
-            stylizer.keep(index, phase.scales(chosen))
+            stylizer.keep_weights(index, phase.scales(chosen))
         stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 

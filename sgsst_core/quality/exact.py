@@ -166,13 +166,11 @@ class ExactTwin(ExactLoss):
         """Compare the job's gradient of its latest view with the exact one, at the colours that it would end with now.
 
         Args:
-            start: compare that of the first step's view at the unstylized colours, whatever the present ones are.
+            start: compare that of the first view at the unstylized colours, whatever the present ones are.
         """
         stylizer = self._stylizer
         if start or not stylizer.history:
-            # One that a step has visited, if any: blend weights are kept of these alone.
-            index = stylizer.history[0].view if stylizer.history else stylizer.views.covered[0]
-            phase = stylizer.schedule[0]
+            index, phase = stylizer.views.covered[0], stylizer.schedule[0]
         else:
             index, phase = stylizer.history[-1].view, stylizer.phase
         scales = phase.scales(stylizer.scales(index))

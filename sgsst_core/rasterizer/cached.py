@@ -8,6 +8,8 @@ device: `strips` on the CPU, `triton_kept` on GPUs.
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -101,6 +103,7 @@ class CachedRasterizer:
         self.anew = anew
         self.device = anew.device
         self._kept: dict[tuple[CameraKey, Rows], _Kept | None] = {}
+        self._lent: dict[tuple[CameraKey, Rows], _Kept] = {}
         self._lock = threading.Lock()
 
     def count(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
@@ -121,6 +124,21 @@ class CachedRasterizer:
             if self._serving(key, band, camera) is None and (key, band) not in self._kept:
                 self._kept[key, band] = self._keep(camera, band)
             return self._serving(key, band, camera) is not None
+
+    @contextmanager
+    def lending(self, camera: Camera, rows: Rows | None = None) -> Iterator[None]:
+        """A block in which a band is served from weights as `keep` makes them, and after which they are gone.
+
+        Those that are kept by then serve it; those that alone exceed `max_bytes`, which `keep` never makes, do not.
+        """
+        key, band = camera_key(camera), check_rows(camera, rows)
+        counted = None if self._serving(key, band, camera) else self.count(camera, band)
+        if counted is not None and (self.max_bytes is None or counted.nbytes(self.precision) <= self.max_bytes):
+            self._lent[key, band] = _Kept(band, counted.keep(self.precision))
+        try:
+            yield
+        finally:
+            self._lent.pop((key, band), None)
 
     def is_kept(self, camera: Camera, rows: Rows | None = None) -> bool:
         """Whether the band is served from kept weights by now."""
@@ -168,7 +186,8 @@ class CachedRasterizer:
 
     def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _Kept | None:
         """The weights that serve a band by now: those of the whole view, else its own."""
-        return self._kept.get((key, (0, camera.height))) or self._kept.get((key, band))
+        whole = self._kept.get((key, (0, camera.height)))
+        return whole or self._kept.get((key, band)) or self._lent.get((key, band))
 
     def _keep(self, camera: Camera, band: Rows) -> _Kept | None:
         counted = self.count(camera, band)

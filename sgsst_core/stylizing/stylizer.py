@@ -437,7 +437,7 @@ class Stylizer:
             scales = phase.scales(self.scales(index))
             behind = self.behind(index)
             with self.timer("prepare", whole=True):
-                self.keep(index, scales)
+                self.keep_weights(index, scales)
                 target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])
@@ -542,9 +542,10 @@ class Stylizer:
         """
         self._keep_visited()
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
-        started = time.perf_counter()
-        gradient = self._gradient(index, style, target, scales)[0]
-        return gradient.cpu(), time.perf_counter() - started
+        with self.views.lending_weights(index, self._rasterizer_for(scales)):
+            started = time.perf_counter()
+            gradient = self._gradient(index, style, target, scales)[0]
+            return gradient.cpu(), time.perf_counter() - started
 
     def _gradient(
         self,
@@ -568,12 +569,12 @@ class Stylizer:
             assert result.image_gradient is not None
             return self.views.gradient(index, result.image_gradient.to(colours.device), colours, rasterizer), result
 
-    def keep(self, index: int, scales: Sequence[int]) -> None:
+    def keep_weights(self, index: int, scales: Sequence[int]) -> None:
         """Keep a view's blend weights for some scales, as its first step does, where they fit.
 
         Only steps do: what is rendered in between, which depends on the clock, changes none of their bits.
         """
-        self.views.keep(index, self._rasterizer_for(scales))
+        self.views.keep_weights(index, self._rasterizer_for(scales))
 
     def _keep_visited(self) -> None:
         """Once after a resume: keep what the steps before it kept, in their order, so that the same views fit."""
@@ -588,7 +589,7 @@ class Stylizer:
                 for index in views[self._team.own_group :: self._team.groups]:
                     scales = phase.scales(self.scales(index))
                     if self.phase.scale is not None or not self._rasterizer_for(scales).scale:
-                        self.keep(index, scales)  # those of a phase that is over are not needed
+                        self.keep_weights(index, scales)  # those of a phase that is over are not needed
 
     def _rasterizer_for(self, scales: Sequence[int]) -> Rasterizer:
         """What renders a view for some scales: at the one coarse scale alone, where its weights are kept."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor
@@ -158,7 +159,7 @@ class Views:
         # After the sum: which colours are let through depends on the sign of their whole gradient.
         return view_colours_gradient(gradient, colours, revive=self.revive)
 
-    def keep(self, index: int, rasterizer: Rasterizer | None = None) -> None:
+    def keep_weights(self, index: int, rasterizer: Rasterizer | None = None) -> None:
         """Keep the blend weights of this rank's part of a view, where its rasterizer keeps any and they fit.
 
         Args:
@@ -169,6 +170,16 @@ class Views:
             rasterizer.keep(camera)
         elif isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
             rasterizer.keep(camera, band)
+
+    def lending_weights(self, index: int, rasterizer: Rasterizer) -> AbstractContextManager[None]:
+        """A block in which a view's weights are those that `keep_weights` keeps, though they may not be kept by then.
+
+        Coarse ones are no approximation, and not lent.
+        """
+        band = self._own_band(index)
+        if isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
+            return rasterizer.lending(self.cameras[index], band)
+        return nullcontext()
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
         """The sum [N, 3] of every rank's gradient [N, 3], which is 0 but for the Gaussians that the view shows."""

@@ -108,3 +108,21 @@ def test_keeping_is_left_to_the_caller() -> None:
     assert kept.is_kept(view, (3, 9))
     assert not kept.is_kept(VIEWS[1])
     assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).keep(view)
+
+
+def test_lent_weights_are_those_that_are_kept() -> None:
+    scene, view = wall(), VIEWS[0]
+    lender, keeper = (CachedRasterizer(scene, at_first_use=False, precision="half") for _ in range(2))
+    pixels = torch.ones(view.height, view.width, 3)
+    keeper.keep(view)
+    with lender.lending(view):
+        assert torch.equal(lender.colour_gradient(pixels, view), keeper.colour_gradient(pixels, view))
+    anew = CpuRasterizer(scene).colour_gradient(pixels, view)
+    assert torch.equal(lender.colour_gradient(pixels, view), anew)
+    assert lender.kept_bytes == 0
+    small = CachedRasterizer(scene, at_first_use=False, precision="half", max_bytes=10)
+    with small.lending(view):
+        assert torch.equal(small.colour_gradient(pixels, view), anew)
+    with keeper.lending(view):
+        pass
+    assert keeper.is_kept(view)
