@@ -40,6 +40,8 @@ RISE = 1e-3
 NO_LOSS = 1e-3
 #: Of a gradient, whatever the rounding of content is.
 _MOST_UNCERTAIN = 0.5
+#: Of the cosine of two float32 vectors of length 1.
+_ROUNDING_OF_COSINES = 2**-22
 STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
 
@@ -160,51 +162,82 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     """Relative error of loss and pixel gradient of a view's present picture against float64, and flipped decisions.
 
     The second number is what the error may be: more where content has changed by little more than the rounding of its
-    features, of which the difference of both cannot be freed. Of features that are matched, the loss alone: another
-    nearest vector, as near, is no error.
+    features, of which the difference of both cannot be freed. Where it has changed by less, its term may be what that
+    rounding makes of it, and all else is compared without it. Of features that are matched, the loss alone: another
+    nearest vector, as near, is no error; and cosines that are 1 but for their rounding are.
     """
     index = job.views.covered[0]
     picture = job.views.render(index, job.views.colours(index, job.sh_dc.detach()))
     content = job.views.content(index)
     coverage = job.views.coverage(index)[0] if job.views.weighted else None
     double = DecisionsOf(job.weights, job.network)
-    with double.listening():
-        found = _evaluate(job, job.network, picture, content, coverage)
-    exact = _evaluate(job, double, picture, content, coverage)
+    given = (picture, content, coverage)
+    found, exact = _evaluate_both(job, double, *given, job.settings.content_weight)
+    uncertain = _rounding_of_content(job, exact, content)
+    if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, found, exact, content):
+        found, exact = _evaluate_both(job, double, *given, 0.0)
+        uncertain = 0.0
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
         return math.inf, TWIN_BOUND, double.flips
-    error = abs(found.loss - exact.loss) / max(abs(exact.loss), 1.0)
+    least = max(1.0, job.loss.nearest_weight * _ROUNDING_OF_COSINES / TWIN_BOUND)
+    error = abs(found.loss - exact.loss) / max(abs(exact.loss), least)
     if not job.loss.nearest_layers:
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
-    return error, max(TWIN_BOUND, _rounding_of_content(job, exact, content)), double.flips
+    return error, max(TWIN_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
+
+
+def _feature_rounding(job: Stylizer, content: Tensor) -> float:
+    """Rounding of a difference of float32 content features: each is rounded to about 2^-20 of their size."""
+    features = job.network.forward(content, keep=False).features[CONTENT_LAYER]
+    return 2**-20 * float(features.square().mean().sqrt()) if features.numel() else 0.0
 
 
 def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> float:
-    """What float32 features leave uncertain of the content term and its gradient: their rounding over the differences.
+    """What float32 features leave uncertain of the content term and its gradient, relative.
 
-    E_c = lambda mean(d^2) tells how large differences d are; features are rounded to about 2^-20 of their size.
+    E_c = lambda mean(d^2) tells how large differences d are; with d off by delta, E_c is off by 2 delta / d.
     """
-    weight, uncertain = job.settings.content_weight, 0.0
-    if not weight:
-        return uncertain
-    features = job.network.forward(content, keep=False).features[CONTENT_LAYER]
-    size = float(features.square().mean().sqrt()) if features.numel() else 0.0
-    for terms in exact.terms.values():
-        if terms["content"] > 0:
-            uncertain = max(uncertain, 2**-20 * size * math.sqrt(weight / terms["content"]))
-    return min(uncertain, _MOST_UNCERTAIN)
+    weight = job.settings.content_weight
+    rounding = _feature_rounding(job, content) if weight else 0.0
+    terms = [each["content"] for each in exact.terms.values() if each["content"] > 0]
+    return max((2 * rounding * math.sqrt(weight / term) for term in terms), default=0.0)
+
+
+def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, content: Tensor) -> bool:
+    """Whether the content term is no more than differences d that are off by delta make of it: (d + delta)^2."""
+    most = 2 * job.settings.content_weight * _feature_rounding(job, content) ** 2
+    return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in found.terms.items())
+
+
+def _evaluate_both(
+    job: Stylizer,
+    double: DecisionsOf,
+    picture: Tensor,
+    content: Tensor,
+    coverage: Tensor | None,
+    content_weight: float,
+) -> tuple[SosResult, SosResult]:
+    """The loss of a picture by the job's network, and in float64 with its decisions."""
+    with double.listening():
+        found = _evaluate(job, job.network, picture, content, coverage, content_weight)
+    return found, _evaluate(job, double, picture, content, coverage, content_weight)
 
 
 def _evaluate(
-    job: Stylizer, network: FeatureNetwork, picture: Tensor, content: Tensor, coverage: Tensor | None
+    job: Stylizer,
+    network: FeatureNetwork,
+    picture: Tensor,
+    content: Tensor,
+    coverage: Tensor | None,
+    content_weight: float,
 ) -> SosResult:
     settings = job.settings
     loss = SosLoss(
         network,
-        content_weight=settings.content_weight,
+        content_weight=content_weight,
         style_loss=settings.style_loss,
         coarsest=settings.coarsest_side,
         style_scale=settings.style_scale,
