@@ -181,8 +181,8 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
         return math.inf, TWIN_BOUND, double.flips
-    least = max(1.0, job.loss.nearest_weight * _ROUNDING_OF_COSINES / TWIN_BOUND)
-    error = abs(found.loss - exact.loss) / max(abs(exact.loss), least)
+    rounding = job.loss.nearest_weight * _ROUNDING_OF_COSINES
+    error = max(abs(found.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
     if not job.loss.nearest_layers:
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
