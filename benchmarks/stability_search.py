@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import write_result
-from sgsst_core.bench.stability.situations import STEPS, Situation, crowd, strain, views
+from sgsst_core.bench.stability.situations import STEPS, Situation, crowd, even_network, strain, views
 from sgsst_core.errors import SgsstError
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
@@ -91,7 +91,9 @@ def drawn(number: int) -> Situation:
     tame = settings["learning_rate"] <= 0.01 and 0 < settings["content_weight"] <= 3e3 and min(width, height) >= 16
     tame &= min(style.shape[:2]) >= 16 and float(style.std()) > 0.05 and settings["style_loss"] == "sos"
     tame &= settings.get("keep_colours") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
-    return Situation(scene, style, settings, views(width, height), falls=tame and "scales" not in settings)
+    falls = tame and "scales" not in settings
+    weights = even_network() if number % 2 else None  # even numbers: the original network's sizes of features
+    return Situation(scene, style, settings, views(width, height), falls=falls, weights=weights)
 
 
 def _side(rng: random.Random) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +12,7 @@ import torch
 
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_network_weights
+from sgsst_core.features.vgg import PIXELS
 
 #: Channels of every layer.
 CHANNELS = 16
@@ -30,6 +32,11 @@ def tiny_weights(name: Literal["vgg16", "vgg19"] = "vgg16") -> BackboneWeights:
         input_scale=torch.full((3,), 255.0),
         input_shift=-torch.tensor(CAFFE_MEAN),
     )
+
+
+def comparing_pixels(weights: BackboneWeights, factor: float = 20.0) -> BackboneWeights:
+    """The same network, whose pixels are compared as well, times a factor."""
+    return replace(weights, scales={**weights.scales, PIXELS: factor})
 
 
 def install_tiny_weights(folder: Path) -> Path:

@@ -25,6 +25,8 @@ from sgsst_core.scene.luminance import grey, grey_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
+#: What goes into the network, as a layer before the first: three channels, a cell for each pixel. Not the paper's.
+PIXELS = "pixels"
 #: Layer whose features make up the content loss.
 CONTENT_LAYER = "relu4_2"
 #: Receptive field of relu5_1 in pixels to either side (VGG19: 70, VGG16: 58), up to the next multiple of 16,
@@ -44,8 +46,8 @@ _TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
 
 
 def layer_stride(layer: str) -> int:
-    """Pixels from one cell of a layer to the next: 1 for relu1_*, up to 16 for relu5_*."""
-    return 1 << (int(layer[4]) - 1)
+    """Pixels from one cell of a layer to the next: 1 for `PIXELS` and relu1_*, up to 16 for relu5_*."""
+    return 1 if layer == PIXELS else 1 << (int(layer[4]) - 1)
 
 
 FeatureGradient = Callable[[str, Tensor, Tensor], None]
@@ -74,7 +76,7 @@ class Activations:
     """What one forward pass leaves behind: the features asked for and what the backward pass needs.
 
     Attributes:
-        features: layer name to [h, w, c] in the network's dtype (a view in NHWC order).
+        features: layer name to [h, w, c] in the network's dtype (a view in NHWC order), `PIXELS` in float32 at least.
         outputs: for each step, the ReLU's output [1, c, h, w]; nothing, [0], for a pool, the positions of whose maxima
             are found again.
         size: (height, width) of the pixels that went in.
@@ -134,7 +136,7 @@ class FeatureNetwork:
     Args:
         weights: convolutions and input normalisation, in feature units of a 0-255 input.
         layers: the layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`); what lies behind the
-            deepest of them is left out.
+            deepest of them is left out. One of them at least is a convolution's.
         dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
         tf32: on NVIDIA GPUs, convolutions of a float32 network round their factors to the 10 bits of TF32; elsewhere it
             changes nothing.
@@ -173,13 +175,15 @@ class FeatureNetwork:
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
         self._grey = weights.grey
+        self._pixel_scale = weights.scales.get(PIXELS, 1.0)
         self._steps = self._build(weights)
         self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
+        self._channels[PIXELS] = 3
 
     def _build(self, weights: BackboneWeights) -> list[_Step]:
         steps: list[_Step] = []
-        left = set(self.layers)
+        left = set(self.layers) - {PIXELS}
         for block, count in enumerate(BLOCKS[weights.name], start=1):
             if block > 1:
                 steps.append(_Pool())
@@ -228,9 +232,11 @@ class FeatureNetwork:
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
         rgb = rgb.to(self.device, self._input_dtype)
         x = (grey(rgb) if self._grey else rgb) * self._scale + self._shift
+        kept = Activations({}, size=(height, width))
+        if PIXELS in self.layers:
+            kept.features[PIXELS] = x * self._pixel_scale
         # [h, w, 3] seen as [1, 3, h, w] is already in channels-last order: no copy.
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
-        kept = Activations({}, size=(height, width))
         with convolutions(self.device, tf32=self.tf32, search=self.search):
             self._forward_steps(x, kept, keep)
         for layer in self.layers:
@@ -279,9 +285,16 @@ class FeatureNetwork:
         """
         with convolutions(self.device, tf32=self.tf32, search=self.search):
             gradient = self._backward_steps(kept, feature_gradient)
+        shape = (*kept.size, 3)
         if gradient is None:
-            return torch.zeros((*kept.size, 3), dtype=self._input_dtype, device=self.device)
-        pixels = gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
+            pixels = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
+        else:
+            pixels = gradient[0].permute(1, 2, 0).to(self._input_dtype)
+        if (features := kept.features.pop(PIXELS, None)) is not None:
+            own = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
+            feature_gradient(PIXELS, features, own)
+            pixels = torch.add(pixels, own, alpha=self._pixel_scale)
+        pixels = pixels * self._scale
         return grey_gradient(pixels) if self._grey else pixels
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
@@ -317,6 +330,8 @@ class FeatureNetwork:
                 stride *= 2
             else:
                 held += size * int(step.weight.shape[0]) / stride**2
+        if PIXELS in self.layers:
+            held += 3 * torch.finfo(self._input_dtype).bits / 8
         return held
 
     def working_bytes_per_pixel(self) -> float:

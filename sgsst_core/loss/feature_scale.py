@@ -5,6 +5,8 @@ standard deviation and content s^2 times: how much each layer and each term coun
 The paper's network is the original VGG19 (`vgg_conv.pth` of Gatys et al.); torchvision's networks were trained anew,
 and their layers are of other sizes. A network of ReLUs is positively homogeneous: its weights times the ratio of two
 layers' factors, and its biases times the layer's own, give the same features times these factors.
+
+A factor of `PIXELS` also has the pixels themselves compared, which the paper does not do.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_sources import CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.vgg import PIXELS, FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale, Settings
 
@@ -29,6 +31,9 @@ EVEN_SCALE = 8.0
 #: Of the first layer, `even`. It alone knows colours as such, and with the others' factor its share of the loss is less
 #: than a hundredth: palettes came out better with this one, and styles no worse (docs/quality.md).
 EVEN_COLOUR_SCALE = 16.0
+#: Of the pixels, `even`. Colours that begin as the style's would be given up for strokes: with this factor palettes
+#: came out nearer by 3 to 16 levels on six pairs, for up to 0.02 of style (docs/quality.md).
+EVEN_PIXEL_SCALE = 28.0
 #: What the original VGG19 logs in the first iteration of a published run (installation guide of J. Johnson,
 #: "neural-style", its default pictures at 512 pixels), divided by the run's weights of 100 and 5. The run starts from
 #: noise that is nothing to the network. Style layers: the mean squared difference of Gram / (c h w) from a painting's;
@@ -63,9 +68,9 @@ def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights
 
 
 def even_scales(weights: BackboneWeights) -> dict[str, float]:
-    """Factors of layers, `even`: powers of two, so that features change by them and by no rounding."""
+    """Factors of layers, `even`: of features powers of two, so that they change by them and by no rounding."""
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
-    return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOUR_SCALE}
+    return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOUR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
 
 
 def is_original(weights: BackboneWeights) -> bool:
@@ -97,7 +102,10 @@ def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict
 
 
 def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> BackboneWeights:
-    """A network whose features of some layers are so many times as large; other layers have the factor before them."""
+    """A network whose features of some layers are so many times as large; other layers have the factor before them.
+
+    `PIXELS` have none before them, and are compared where they are given one.
+    """
     convolutions: dict[str, tuple[Tensor, Tensor]] = {}
     before = 1.0
     for layer, (weight, bias) in weights.convolutions.items():

@@ -22,6 +22,7 @@ from sgsst_core.features.partition import PartitionTile, Rectangle, covered_regi
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import (
     CONTENT_LAYER,
+    PIXELS,
     STYLE_LAYERS,
     Activations,
     FeatureGradient,
@@ -31,7 +32,7 @@ from sgsst_core.features.vgg import (
 from sgsst_core.loss.mixture import StyleMixture, mixed_target, shares_of
 from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, places_in
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
+from sgsst_core.loss.style_losses import compares_gram, has_statistics, nearest_layers, nearest_weight
 from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
@@ -175,7 +176,8 @@ class SosLoss:
     """Evaluates the SOS loss of views against one style.
 
     Args:
-        network: the feature network; it must report the style layers, and the content layer if it is used.
+        network: the feature network; it must report the style layers, and the content layer if it is used. Statistics
+            are compared of those style layers, and of `PIXELS`, that it reports.
         content_weight: lambda_c; 0 leaves the content branch out.
         style_loss: what is compared with the style; see `style_losses`.
         memory: bytes that activations may take.
@@ -221,7 +223,7 @@ class SosLoss:
         self.timer = timer or Timer()
         self.collectives = collectives
         self.speeds = (1.0,) * collectives.size
-        statistics = STYLE_LAYERS if has_statistics(style_loss) else ()
+        statistics = (PIXELS, *STYLE_LAYERS) if has_statistics(style_loss) else ()
         self.style_layers = [layer for layer in statistics if layer in network.layers]
         self.nearest_layers = nearest_layers(style_loss, network.name)
         self.nearest_weight = nearest_weight(style_loss, network.unit)
@@ -495,7 +497,8 @@ class SosLoss:
         style = part.style.layers if part.style else {}
         for layer, found in statistics.items():
             if layer in style:
-                layer_terms, gradient = style_loss(found, style[layer], feature_eps=self.network.rounding)
+                rounding, gram = self.network.rounding, compares_gram(layer)
+                layer_terms, gradient = style_loss(found, style[layer], feature_eps=rounding, gram=gram)
                 if part.factor != 1:
                     layer_terms, gradient = part.factor * layer_terms, gradient.times(part.factor)
                 pass_.terms = pass_.terms + layer_terms

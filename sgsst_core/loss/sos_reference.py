@@ -11,9 +11,9 @@ from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, layer_stride
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, layer_stride
 from sgsst_core.loss.nearest import nearest_reference
-from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight
+from sgsst_core.loss.style_losses import compares_gram, nearest_layers, nearest_weight, statistics_layers
 from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget
 from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
@@ -35,8 +35,8 @@ def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[st
     if network_weights.grey:
         rgb = (rgb @ torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64))[..., None].expand(rgb.shape)
     x = rgb * network_weights.input_scale.double() + network_weights.input_shift.double()
+    features = {PIXELS: x * network_weights.scales.get(PIXELS, 1.0)}
     x = x.permute(2, 0, 1).unsqueeze(0)
-    features: dict[str, Tensor] = {}
     block = 1
     for name, (weight, bias) in network_weights.convolutions.items():
         if int(name[4]) > block:
@@ -54,16 +54,20 @@ def box_average_reference(image: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(image.permute(2, 0, 1).unsqueeze(0), side)[0].permute(1, 2, 0)
 
 
-def style_loss_reference(features: Tensor, target: LayerTarget, position_weights: Tensor | None = None) -> Tensor:
+def style_loss_reference(
+    features: Tensor, target: LayerTarget, position_weights: Tensor | None = None, *, gram: bool = True
+) -> Tensor:
     """One layer's style loss by its definition, float64 and differentiable: the twin of `terms.style_loss`.
 
     Args:
         features: [h, w, c].
         target: of the style.
         position_weights: [h, w]; None for equal weights.
+        gram: False compares mean and standard deviation alone.
     """
     found = _statistics(features, position_weights)
-    loss = GRAM_WEIGHT / features.shape[-1] ** 2 * (found.gram - target.gram).square().mean()
+    gram_weight = GRAM_WEIGHT / features.shape[-1] ** 2 if gram else 0.0
+    loss = gram_weight * (found.gram - target.gram).square().mean()
     loss = loss + MEAN_WEIGHT * (found.mean - target.mean).square().mean()
     return loss + STD_WEIGHT * (found.std - target.std).square().mean()
 
@@ -135,9 +139,10 @@ def _part_reference(
     """The style terms of a region at the scale of boxes of side x side pixels, from the view's features there."""
     wanted = features_reference(network_weights, box_average_reference(part.style.double(), side))
     loss = torch.zeros((), dtype=torch.float64)
-    for layer in STYLE_LAYERS if has_statistics(style_loss) else ():
+    for layer in statistics_layers(style_loss, network_weights):
         position = _cells(part.share, side * layer_stride(layer))
-        loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position)
+        target = _statistics(wanted[layer])
+        loss = loss + style_loss_reference(features[layer], target, position, gram=compares_gram(layer))
     if matched := nearest_layers(style_loss, network_weights.name):
         position = _cells(part.share, side * layer_stride(matched[0]))
         own, other = ([found[layer] for layer in matched] for found in (features, wanted))

@@ -2,12 +2,15 @@
 
 `sos` is the paper's: Gram matrices, means and standard deviations of `STYLE_LAYERS`. `nnfm` puts the nearest-neighbour
 term (`nearest`) in their place, `mixed` adds it to them. Every scale of the SOS loss has the same terms.
+
+Where weights have a factor for `PIXELS` (`feature_scale`), means and standard deviations of these are compared as well.
 """
 
 from __future__ import annotations
 
 from sgsst_core.features.network_sources import BLOCKS
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS
 from sgsst_core.settings import StyleLossName
 
 #: What brings ImageNet-normalised features, in which ARF's weights are meant, to the units of a 0-255 input.
@@ -44,13 +47,24 @@ def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
     return tuple(f"relu3_{index}" for index in range(1, count + 1))
 
 
-def layers_of(style_loss: StyleLossName, network: str, *, content: bool) -> tuple[str, ...]:
-    """Every layer that a loss reads.
+def statistics_layers(style_loss: StyleLossName, weights: BackboneWeights) -> tuple[str, ...]:
+    """The layers whose statistics are compared, by a loss on a network; none where it has none."""
+    if not has_statistics(style_loss):
+        return ()
+    return (PIXELS, *STYLE_LAYERS) if PIXELS in weights.scales else STYLE_LAYERS
+
+
+def compares_gram(layer: str) -> bool:
+    """Whether a layer's Gram matrix counts beside its means and standard deviations."""
+    return layer != PIXELS
+
+
+def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:
+    """Every layer that a loss reads of a network.
 
     Args:
-        network: "vgg16" or "vgg19".
         content: it has a content term.
     """
-    statistics = STYLE_LAYERS if has_statistics(style_loss) else ()
-    nearest = nearest_layers(style_loss, network)
+    statistics = statistics_layers(style_loss, weights)
+    nearest = nearest_layers(style_loss, weights.name)
     return tuple(dict.fromkeys((*statistics, *nearest, *((CONTENT_LAYER,) if content else ()))))

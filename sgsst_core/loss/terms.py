@@ -146,7 +146,7 @@ class StyleGradient:
 
 
 def style_loss(
-    statistics: LayerStatistics, target: LayerTarget, *, feature_eps: float = 2.0**-23
+    statistics: LayerStatistics, target: LayerTarget, *, feature_eps: float = 2.0**-23, gram: bool = True
 ) -> tuple[Tensor, StyleGradient]:
     """One layer's style loss and its gradient with respect to the features. Both are 0 where there is no position.
 
@@ -154,6 +154,7 @@ def style_loss(
         statistics: of the view's features.
         target: of the style.
         feature_eps: relative rounding of the features (2^-23 for float32, 2^-52 for float64).
+        gram: False compares mean and standard deviation alone.
 
     Returns:
         [5] float64, what the layer adds to each of `TERMS`; and the gradient.
@@ -163,7 +164,7 @@ def style_loss(
     """
     channels = statistics.mean.shape[0]
     if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
-        weights = (GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT)
+        weights = (GRAM_WEIGHT if gram else 0.0, MEAN_WEIGHT, STD_WEIGHT)
         fused = fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
         return fused[0], StyleGradient(*fused[1:])
     some = statistics.count > 0
@@ -171,7 +172,7 @@ def style_loss(
     mean_error = statistics.mean - target.mean
     std = statistics.std()
     std_error = std - target.std
-    gram_weight, nothing = GRAM_WEIGHT / channels**2, torch.zeros_like(statistics.count)
+    gram_weight, nothing = GRAM_WEIGHT / channels**2 if gram else 0.0, torch.zeros_like(statistics.count)
     terms = torch.stack(
         [
             gram_weight * gram_error.square().mean(),

@@ -274,7 +274,7 @@ def sharing_memory(collectives: Collectives, device: Device) -> int:
 
 def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
     """The feature network, with layers up to the deepest one used."""
-    layers = layers_of(settings.style_loss, weights.name, content=settings.content_weight > 0)
+    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
     use_whole_float32()
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 

@@ -94,7 +94,7 @@ class ExactLoss:
         self._stylizer = stylizer
         settings = stylizer.settings
         style_loss = style_loss or settings.style_loss
-        layers = layers_of(style_loss, stylizer.weights.name, content=settings.content_weight > 0)
+        layers = layers_of(style_loss, stylizer.weights, content=settings.content_weight > 0)
         self.loss = SosLoss(
             FeatureNetwork(stylizer.weights, layers, torch.float32, stylizer.network.device),
             content_weight=settings.content_weight,

@@ -23,7 +23,7 @@ from torch import Tensor
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.loss.feature_scale import EVEN_COLOUR_SCALE, EVEN_SCALE
+from sgsst_core.loss.feature_scale import EVEN_COLOUR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.terms import LossTerms
@@ -167,7 +167,7 @@ def fingerprint(
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
     digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
     if settings.feature_scale == "even":  # factors that a later version may choose otherwise: a run keeps to one loss
-        digest.update(repr((EVEN_SCALE, EVEN_COLOUR_SCALE)).encode())
+        digest.update(repr((EVEN_SCALE, EVEN_COLOUR_SCALE, EVEN_PIXEL_SCALE)).encode())
     return digest.hexdigest()
 
 

@@ -12,8 +12,18 @@ import torch
 from torch import Tensor
 
 from sgsst_core.bench.stability.case import Case, CaseResult, repeated, texture, vgg16
-from sgsst_core.bench.stability.situations import Situation, coloured, crowd, make, small_network, strain, views
+from sgsst_core.bench.stability.situations import (
+    Situation,
+    coloured,
+    crowd,
+    even_network,
+    make,
+    small_network,
+    strain,
+    views,
+)
 from sgsst_core.errors import SgsstError
+from sgsst_core.features.vgg import PIXELS
 from sgsst_core.loss.feature_scale import PUBLISHED, with_scales
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.luminance import luminance
@@ -103,6 +113,13 @@ def _black_views(scale: str) -> Situation:
     return replace(job, weights=weights, cameras=views()[:1])
 
 
+def _pixels(situation: Situation, factor: float | None = None) -> Situation:
+    """The same job, in which pixels are compared, too, by another factor than the usual one if need be."""
+    weights = even_network()
+    scales = weights.scales if factor is None else weights.scales | {PIXELS: factor}
+    return replace(situation, weights=replace(weights, scales=scales))
+
+
 def _tiny_views(width: int, height: int, **settings: Any) -> Situation:
     return replace(_job(**settings), cameras=views(width, height), falls=False)
 
@@ -165,6 +182,16 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
         lambda: _with_harmonics(1e4), lambda: texture(30, 26, 7), sh_fade=0.5
     ),
     "harmonics of 1e30 that fade out": lambda: _job(lambda: _with_harmonics(1e30), sh_fade=1.0),
+    "pixels of one colour, style of the same": lambda: _pixels(_scan()),
+    "pixels of one colour, style of another": lambda: _pixels(
+        _unlike(lambda: coloured(crowd(), 0.4, 0.4, 0.4), lambda: _flat(0.9, 0.3, 0.1))
+    ),
+    "pixels of one colour, style of many": lambda: _pixels(_job(lambda: coloured(crowd(), 0.2, 0.5, 0.7))),
+    "pixels in luminance, a grey scene": lambda: _pixels(_job(lambda: _grey(crowd()), keep_colours="luminance")),
+    "pixels, a style of one pixel": lambda: _pixels(_job(style=lambda: _flat(0.9, 0.5, 0.1, 1, 1))),
+    "pixels, views of 3 x 2": lambda: _pixels(_tiny_views(3, 2)),
+    "pixels 1e6 times as large": lambda: _pixels(_job(), 1e6),
+    "pixels, harmonics of 100": lambda: _pixels(_unlike(lambda: _with_harmonics(100.0), lambda: texture(30, 26, 7))),
     "scales weighted 1e12 to 1e-12": lambda: _job(scales=(1e12, 1e-12)),
     "the coarsest scale of a tiny view alone": lambda: _job(scales=(0.0, 1.0)),
 }

@@ -21,6 +21,7 @@ from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, FeatureNetwork
+from sgsst_core.loss.feature_scale import even_scales, with_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -99,6 +100,12 @@ def small_network() -> BackboneWeights:
             channels = _CHANNELS
     scale, shift = torch.full((3,), 255.0), -torch.tensor(CAFFE_MEAN)
     return BackboneWeights("vgg16", "random", "0" * 64, layers, scale, shift)
+
+
+@functools.cache
+def even_network() -> BackboneWeights:
+    """The same one with the factors of `feature_scale` "even", as networks have them that are not the original one."""
+    return with_scales(small_network(), even_scales(small_network()))
 
 
 def make(situation: Situation) -> Stylizer:

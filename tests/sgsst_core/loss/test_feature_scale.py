@@ -8,8 +8,16 @@ import torch
 from PIL import Image
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.feature_scale import EVEN_COLOUR_SCALE, EVEN_SCALE, PUBLISHED, at_scale, paper_scales, with_scales
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.feature_scale import (
+    EVEN_COLOUR_SCALE,
+    EVEN_PIXEL_SCALE,
+    EVEN_SCALE,
+    PUBLISHED,
+    at_scale,
+    paper_scales,
+    with_scales,
+)
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import make_settings
 
@@ -61,7 +69,8 @@ def test_scales_of_torchvisions_vgg16(vgg16_weights: BackboneWeights) -> None:
 def test_even_scales_are_one_factor_but_for_the_layer_that_knows_colours(trained_anew: BackboneWeights) -> None:
     scaled = at_scale(trained_anew, "even")
     assert scaled.scales["relu1_1"] == EVEN_COLOUR_SCALE
-    assert {factor for layer, factor in scaled.scales.items() if layer != "relu1_1"} == {EVEN_SCALE}
+    assert scaled.scales[PIXELS] == EVEN_PIXEL_SCALE
+    assert {factor for layer, factor in scaled.scales.items() if layer not in ("relu1_1", PIXELS)} == {EVEN_SCALE}
     picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
     before, after = features(trained_anew, picture), features(scaled, picture)
     for layer in LAYERS:  # powers of two: exactly

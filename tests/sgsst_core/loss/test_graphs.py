@@ -103,7 +103,7 @@ def test_a_graph_gives_the_same_bits_for_every_view(
 def test_graphs_hold_the_search_for_nearest_vectors(
     counts: Counts, tiny_weights: BackboneWeights, style_loss: StyleLossName
 ) -> None:
-    network = FeatureNetwork(tiny_weights, layers_of(style_loss, "vgg16", content=True), device="cuda")
+    network = FeatureNetwork(tiny_weights, layers_of(style_loss, tiny_weights, content=True), device="cuda")
     loss = SosLoss(network, style_loss=style_loss, coarsest=16, timer=Timer("cuda"))
     style, view, graphs = style_of(loss), view_of(loss, 2, weighted=True), LossGraphs(loss)
     for step in range(FIRST_VISITS + 1):

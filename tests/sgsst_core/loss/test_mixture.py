@@ -79,7 +79,7 @@ def test_a_tiny_picture_leaves_layers_without_cells_to_the_others(tiny_weights):
 
 
 def test_features_are_matched_with_those_of_all_pictures(tiny_weights):
-    network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights.name, content=False))
+    network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
     loss = SosLoss(network, style_loss="nnfm", content_weight=0)
     pictures = [picture(40, 48, seed=1), picture(64, 32, seed=2)]
     mixed = loss.style_targets(StyleMixture.weighted(pictures, [1, 5]), (64, 64))[0].vectors.units

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss import nearest
 from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, nearest_reference, search
 from sgsst_core.loss.scale_weights import ScaleWeights
@@ -16,6 +16,7 @@ from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, layers_of, nearest_layers
 from sgsst_core.settings import StyleLossName
+from tests.networks import comparing_pixels
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.sgsst_core.pictures import picture, relative_error
 
@@ -26,7 +27,7 @@ MATCHED: tuple[StyleLossName, ...] = ("nnfm", "mixed")
 def loss_of(
     weights: BackboneWeights, style_loss: StyleLossName, dtype: torch.dtype = torch.float64, **options: object
 ) -> SosLoss:
-    network = FeatureNetwork(weights, layers_of(style_loss, weights.name, content=True), dtype)
+    network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
     return SosLoss(network, style_loss=style_loss, **options)  # type: ignore[arg-type]
 
 
@@ -268,8 +269,10 @@ def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
 
 
 def test_layers_are_those_that_a_loss_reads() -> None:
-    assert layers_of("sos", "vgg19", content=True) == (*STYLE_LAYERS, CONTENT_LAYER)
-    assert layers_of("nnfm", "vgg16", content=False) == ("relu3_1", "relu3_2", "relu3_3")
-    assert layers_of("nnfm", "vgg19", content=True) == ("relu3_1", "relu3_2", "relu3_3", "relu3_4", CONTENT_LAYER)
-    assert layers_of("mixed", "vgg16", content=False) == (*STYLE_LAYERS, "relu3_2", "relu3_3")
+    small, large = make_tiny_weights("vgg16"), make_tiny_weights("vgg19")
+    assert layers_of("sos", large, content=True) == (*STYLE_LAYERS, CONTENT_LAYER)
+    assert layers_of("sos", comparing_pixels(small), content=False) == (PIXELS, *STYLE_LAYERS)
+    assert layers_of("nnfm", comparing_pixels(small), content=False) == ("relu3_1", "relu3_2", "relu3_3")
+    assert layers_of("nnfm", large, content=True) == ("relu3_1", "relu3_2", "relu3_3", "relu3_4", CONTENT_LAYER)
+    assert layers_of("mixed", small, content=False) == (*STYLE_LAYERS, "relu3_2", "relu3_3")
     assert NEAREST_WEIGHTS["sos"] == 0

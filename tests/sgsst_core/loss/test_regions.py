@@ -11,6 +11,7 @@ from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss, resize_area
 from sgsst_core.loss.sos_reference import RegionReference, sos_reference
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.scene.pyramid import style_size
+from tests.networks import comparing_pixels
 from tests.sgsst_core.pictures import picture, relative_error
 
 SIZE = (112, 150)
@@ -47,12 +48,13 @@ def case():
 
 
 @pytest.mark.parametrize("tile_size", [None, 64])
-@pytest.mark.parametrize("style_loss", ["sos", "mixed"])
-def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss):
+@pytest.mark.parametrize(("style_loss", "pixels"), [("sos", False), ("sos", True), ("mixed", False)])
+def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss, pixels):
+    tiny_weights = comparing_pixels(tiny_weights) if pixels else tiny_weights
     image, content, styles, maps, weights = case
     parts = [RegionReference(*part) for part in zip(styles, maps, weights, strict=True)]
     expected, gradient = sos_reference(tiny_weights, image, parts, content, coarsest=60, style_loss=style_loss)
-    layers = layers_of(style_loss, tiny_weights.name, content=True)
+    layers = layers_of(style_loss, tiny_weights, content=True)
     network = FeatureNetwork(tiny_weights, layers, torch.float64)
     found = evaluate(network, *case, tile_size=tile_size, style_loss=style_loss)
     assert found.loss == pytest.approx(expected, rel=1e-9)

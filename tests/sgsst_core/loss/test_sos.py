@@ -1,13 +1,17 @@
 """The SOS gradient of any partition against the untiled autograd reference."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, Activations, FeatureNetwork
-from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, Activations, FeatureNetwork
+from sgsst_core.loss.sos import ScaleTarget, SosLoss, resize_area
 from sgsst_core.loss.sos_reference import sos_reference
+from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.pyramid import scale_count, style_size
+from tests.networks import comparing_pixels
 from tests.sgsst_core.pictures import picture, relative_error
 
 #: Gradients below agree to these: float64 against the reference; float32 tiled against float32 whole.
@@ -45,6 +49,36 @@ def test_float64_agrees_with_untiled_autograd(tiny_weights, size, tile_sizes, co
     check_against_untiled_autograd(tiny_weights, size, tile_sizes, covered, 100)
 
 
+@pytest.mark.parametrize("grey", [False, True])
+@pytest.mark.parametrize("covered", [False, True])
+def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, grey):
+    weights = replace(comparing_pixels(tiny_weights), grey=grey)
+    check_against_untiled_autograd(weights, (129, 190), [None, 64], covered, 100)
+
+
+def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny_weights):
+    """Where only they differ, the loss is that of means and deviations of 0-255 values, by their factor's square."""
+    weights = comparing_pixels(tiny_weights, 3.0)
+    network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
+    loss = SosLoss(network, content_weight=0)
+    image, style = picture(40, 56, seed=1).float(), picture(40, 56, seed=3).float()
+    only = {
+        scale: ScaleTarget({PIXELS: own.layers[PIXELS]}) for scale, own in loss.style_targets(style, (40, 56)).items()
+    }
+    found = loss.evaluate(image, only, loss.view_target(image))
+    values = [(255 * part.double()).flatten(0, 1) for part in (image, style)]
+    means, deviations = (
+        [own(part) for part in values] for own in (lambda x: x.mean(0), lambda x: x.std(0, correction=0))
+    )
+    assert found.terms[0]["gram"] == 0
+    assert found.terms[0]["mean"] == pytest.approx(9e4 * float((means[0] - means[1]).square().mean()), rel=1e-5)
+    assert found.terms[0]["std"] == pytest.approx(
+        9e4 * float((deviations[0] - deviations[1]).square().mean()), rel=1e-5
+    )
+    matched = loss.evaluate(style, only, loss.view_target(style))
+    assert matched.loss < 1e-9 * found.loss
+
+
 def test_the_real_network_agrees_with_untiled_autograd(vgg16_weights):
     check_against_untiled_autograd(vgg16_weights, (80, 131), [64], True, 40)
 
@@ -53,7 +87,7 @@ def check_against_untiled_autograd(weights, size, tile_sizes, covered, coarsest)
     case = setting(size, covered=covered)
     image, style, content, coverage = case
     expected, expected_gradient = sos_reference(weights, image, style, content, coverage=coverage, coarsest=coarsest)
-    network = FeatureNetwork(weights, dtype=torch.float64)
+    network = FeatureNetwork(weights, layers_of("sos", weights, content=True), torch.float64)
     for tile_size in tile_sizes:
         result = evaluate(network, case, tile_size, coarsest=coarsest)
         assert len(result.terms) == pyramid.scale_count(*size, coarsest)
@@ -72,7 +106,8 @@ def check_against_untiled_autograd(weights, size, tile_sizes, covered, coarsest)
     ],
 )
 def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes, covered):
-    network = FeatureNetwork(tiny_weights)
+    weights = comparing_pixels(tiny_weights)
+    network = FeatureNetwork(weights, layers_of("sos", weights, content=True))
     case = setting(size, covered=covered)
     whole = evaluate(network, case, None, memory=1 << 34)
     for tile_size in tile_sizes:

@@ -307,11 +307,14 @@ def test_fingerprint_tells_jobs_apart() -> None:
     assert len({base, *others}) == len(others) + 1
 
 
+@pytest.mark.parametrize("factor", ["EVEN_COLOUR_SCALE", "EVEN_PIXEL_SCALE"])
 @pytest.mark.parametrize(("scale", "same"), [("even", False), ("paper", True)])
-def test_a_job_does_not_go_on_under_other_factors(scale: str, same: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_does_not_go_on_under_other_factors(
+    scale: str, same: bool, factor: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     job = (wall(), cameras(), style(), make_settings(feature_scale=scale), "w")
     before = fingerprint(*job)
-    monkeypatch.setattr(checkpoint, "EVEN_COLOUR_SCALE", 8.0)
+    monkeypatch.setattr(checkpoint, factor, 8.0)
     assert (fingerprint(*job) == before) == same
 
 

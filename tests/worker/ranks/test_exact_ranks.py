@@ -24,7 +24,7 @@ from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.regions import JobStyles
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
-from tests.networks import tiny_weights
+from tests.networks import comparing_pixels, tiny_weights
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.sgsst_core.stylizing.test_refining import on_a_rank
 from tests.small_scenes import ball, cameras, style, wall
@@ -48,7 +48,8 @@ def gradient(
     regions: Regions | None = None,
 ) -> tuple[Tensor, float, list[bool]]:
     """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
-    network = FeatureNetwork(tiny_weights(), layers_of(style_loss, "vgg16", content=True), dtype)
+    weights = comparing_pixels(tiny_weights())
+    network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
     loss = SosLoss(
         network, style_loss=style_loss, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives
     )
