@@ -16,7 +16,7 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import layer_statistics, merge_all
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import ScaleTarget
-from sgsst_core.loss.terms import ContentDifference, style_loss
+from sgsst_core.loss.terms import ContentDifference, content_factor, style_loss
 from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count
 
 BLOCK = 512
@@ -67,7 +67,9 @@ def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: 
 
         def pull(layer: str, features: Tensor, so_far: Tensor, wanted: Tensor = wanted) -> None:
             if layer == CONTENT_LAYER:
-                so_far += ContentDifference.of(features, wanted, cells, 1.0).gradient()
+                so_far += ContentDifference.of(
+                    features, wanted, content_factor(cells, features.shape[-1], 1.0)
+                ).gradient()
             else:
                 maps[layer].add_to(so_far, features)
 

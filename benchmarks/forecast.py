@@ -202,10 +202,10 @@ class Passes:
         works: list[Work] = []
         for tile, scaled in self.tiles:
             features = meta(1, _cells(CONTENT_LAYER, tile, scaled), channels, dtype=dtype)
-            count = meta(dtype=torch.float64)
+            factor = meta(dtype=torch.float64)
             with Counted() as counted:
-                ContentDifference.of(features, features, count, 1.0).loss()
-                gradient = ContentDifference.of(features, features, count, 1.0).gradient()
+                ContentDifference.of(features, features, factor).loss()
+                gradient = ContentDifference.of(features, features, factor).gradient()
                 features += gradient
             works += counted.works
         return works

@@ -27,7 +27,15 @@ from triton.compiler import ASTSource
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
 from sgsst_core.features import fused_kernels as statistics_kernels
-from sgsst_core.features.fused_statistics import ENTRIES, POSITIONS, SPAN_VALUES, SPANS, TILE, matrix_precision
+from sgsst_core.features.fused_statistics import (
+    POSITIONS,
+    SPAN_VALUES,
+    SPANS,
+    TILE,
+    block_of_channels,
+    block_of_entries,
+    matrix_precision,
+)
 from sgsst_core.loss import fused_kernels as loss_kernels
 from sgsst_core.loss import fused_terms
 from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
@@ -85,28 +93,49 @@ def _of_kept_weights(form: str) -> dict[str, Target]:
     }
 
 
-def _of_statistics(form: str) -> dict[str, Target]:
-    """Of the widest layers, with position weights."""
-    features = {"float32": "*fp32", "bfloat16": "*bf16"}[form]
-    matrix = {"CHANNELS": _CHANNELS, "TILE": TILE, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
-    moments = {**matrix, "SPAN": SPAN_VALUES // _CHANNELS, "P": POSITIONS}
+def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
+    """Of features, with position weights."""
+    features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
+    matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
+    moments = {**matrix, "SPAN": SPAN_VALUES // channels, "P": POSITIONS}
     return {
-        f"shifted_moments_{form}": Target(
+        f"shifted_moments_{of}": Target(
             statistics_kernels.shifted_moments,
             moments,
             4,
             {"features": features, "counts": "*fp32"},
         ),
-        f"add_style_gradient_{form}": Target(
+        f"add_style_gradient_{of}": Target(
             loss_kernels.add_style_gradient,
-            {**matrix, "K": fused_terms.STEP, "P": fused_terms.POSITIONS},
+            {**matrix, "K": block_of_channels(channels, fused_terms.STEP), "P": fused_terms.POSITIONS},
             4,
             {"features": features, "gradient": features},
         ),
     }
 
 
-_CHANNELS = 512
+def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
+    """Of what features are summed up in."""
+    entries = block_of_entries(channels)
+    block = {"ROWS": entries // block_of_channels(channels), "COLUMNS": block_of_channels(channels)}
+    return {
+        f"add_moments{of}": Target(
+            statistics_kernels.add_moments,
+            {"CHANNELS": channels, "ENTRIES": entries, "S": SPANS},
+            4,
+            {"counts": "*fp32", "mean": "*fp64"},
+        ),
+        f"compare{of}": Target(
+            loss_kernels.compare,
+            {**_LOSS, "CHANNELS": channels, **block},
+            4,
+            {"mean": "*fp64", "offset": "*fp32"},
+        ),
+    }
+
+
+#: Channels of the widest layers, and of the pixels.
+_WIDEST, _PIXELS = 512, 3
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _LOSS = {"GRAM": GRAM_WEIGHT, "MEAN": MEAN_WEIGHT, "STD": STD_WEIGHT, "EPS": 2.0**-23}
 _ADDED = {"BLOCK": kernels.ADDED.value, "SLOTS": kernels.SLOTS.value}
@@ -125,20 +154,11 @@ KERNELS: dict[str, Target] = {
     "count_pieces": Target(kept_kernels.count_pieces, _CUTS, 8),
     **_of_kept_weights("float32"),
     **_of_kept_weights("half"),
-    **_of_statistics("float32"),
-    **_of_statistics("bfloat16"),
-    "add_moments": Target(
-        statistics_kernels.add_moments,
-        {"CHANNELS": _CHANNELS, "ENTRIES": ENTRIES, "S": SPANS},
-        4,
-        {"counts": "*fp32", "mean": "*fp64"},
-    ),
-    "compare": Target(
-        loss_kernels.compare,
-        {**_LOSS, "CHANNELS": _CHANNELS, "ROWS": ENTRIES // _CHANNELS},
-        4,
-        {"mean": "*fp64", "offset": "*fp32"},
-    ),
+    **_of_features("float32", _WIDEST, "float32"),
+    **_of_features("bfloat16", _WIDEST, "bfloat16"),
+    **_of_features("float32", _PIXELS, "pixels"),
+    **_of_statistics(_WIDEST),
+    **_of_statistics(_PIXELS, "_pixels"),
     "rest_colours": Target(
         harmonics_kernels.rest_colours,
         {"DEGREE": 3, "COEFFICIENTS": 15, "BLOCK": harmonics_kernels.BLOCK.value},

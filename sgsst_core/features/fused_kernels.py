@@ -14,11 +14,18 @@ import triton.language as tl
 
 
 @triton.jit
-def load_centred(features, shift, row_step, column_step, width, position, channel, there):
+def places_of(there, channel, CHANNELS: tl.constexpr):
+    """Which of some positions and channels are there, [P, C]: a block may have more channels than a layer."""
+    return there[:, None] & (channel < CHANNELS)[None, :]
+
+
+@triton.jit
+def load_centred(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
     """Features minus shift [P, C] float32 of some positions, row by row, and channels; minus shift where not there."""
     place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
-    values = tl.load(features + place[:, None] + channel[None, :], mask=there[:, None], other=0.0).to(tl.float32)
-    return values - tl.load(shift + channel)[None, :]
+    mask = places_of(there, channel, CHANNELS)
+    values = tl.load(features + place[:, None] + channel[None, :], mask=mask, other=0.0).to(tl.float32)
+    return values - tl.load(shift + channel, mask=channel < CHANNELS, other=0.0)[None, :]
 
 
 @triton.jit
@@ -48,7 +55,7 @@ def shifted_moments(
         seconds: [spans, CHANNELS, CHANNELS] float32, sum of a_p x_p x_p^T; the lower pairs are not written.
         positions: h * width.
     """
-    tiles: tl.constexpr = CHANNELS // TILE
+    tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
     span, pair = tl.program_id(0), tl.program_id(1)
     down, across = pair // tiles, pair % tiles
     if down <= across:
@@ -62,16 +69,17 @@ def shifted_moments(
             position = begin + tl.arange(0, P)
             there = position < end
             a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
-            left = load_centred(features, shift, row_step, column_step, width, position, own, there) * a[:, None]
-            right = load_centred(features, shift, row_step, column_step, width, position, other, there)
+            left = load_centred(features, shift, row_step, column_step, width, position, own, there, CHANNELS)
+            left = left * a[:, None]
+            right = load_centred(features, shift, row_step, column_step, width, position, other, there, CHANNELS)
             second += tl.dot(tl.trans(left), right, input_precision=PRECISION)
             first += tl.sum(left, 0)
             count += a
             begin += P
         row = seconds + (span.to(tl.int64) * CHANNELS + own)[:, None] * CHANNELS
-        tl.store(row + other[None, :], second)
+        tl.store(row + other[None, :], second, mask=(own < CHANNELS)[:, None] & (other < CHANNELS)[None, :])
         if down == across:
-            tl.store(firsts + span.to(tl.int64) * CHANNELS + own, first)
+            tl.store(firsts + span.to(tl.int64) * CHANNELS + own, first, mask=own < CHANNELS)
             if pair == 0:
                 tl.store(counts + span, tl.sum(count, 0))
 
@@ -88,9 +96,10 @@ def add_moments(
         count: [] float64; mean: [CHANNELS]; centred: [CHANNELS, CHANNELS]; all 0 where no position has weight.
     """
     entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
-    i, j = entry // CHANNELS, entry % CHANNELS
+    inside = entry < CHANNELS * CHANNELS
+    i, j = tl.where(inside, entry // CHANNELS, 0), entry % CHANNELS
     # The lower pairs were not made: their mirror images were.
-    place = tl.where(i <= j, entry, j * CHANNELS + i)
+    place = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
     n = tl.zeros([S], tl.float64)
     down, across, second = (
         tl.zeros([ENTRIES], tl.float64),
@@ -111,7 +120,7 @@ def add_moments(
     total = tl.sum(n, 0)
     some = total > 0
     divisor = tl.where(some, total, 1.0)
-    tl.store(centred + entry, second - (down / divisor) * (across / divisor) * total)
+    tl.store(centred + entry, second - (down / divisor) * (across / divisor) * total, mask=inside)
     own = tl.where(some, tl.load(shift + j).to(tl.float64) + across / divisor, 0.0)
-    tl.store(mean + j, own, mask=i == 0)
+    tl.store(mean + j, own, mask=inside & (i == 0))
     tl.store(count, total, mask=tl.program_id(0) == 0)

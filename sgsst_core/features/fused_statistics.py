@@ -20,6 +20,8 @@ _SHIFT_ROWS = 64
 TILE, POSITIONS, SPANS = 64, 32, 4
 #: Entries of a layer's matrix, in whole rows, that a program takes at a time.
 ENTRIES = 1024
+#: Channels of a block at least: a matrix product takes no fewer. A layer of less fills a part of it.
+LEAST_CHANNELS = 16
 
 
 def matrix_precision(dtype: torch.dtype) -> str:
@@ -34,7 +36,13 @@ def block_of_positions(usual: int) -> int:
 
 def block_of_entries(channels: int) -> int:
     """Entries of a layer's matrix, in whole rows, that a program takes at a time."""
+    channels = max(channels, LEAST_CHANNELS)
     return min(channels**2, 1 << 18 if _is_interpreted() else max(ENTRIES, channels))
+
+
+def block_of_channels(channels: int, most: int | None = None) -> int:
+    """Channels that a program takes at a time, of a layer's so many; all of them, unless it takes fewer at most."""
+    return min(max(channels, LEAST_CHANNELS), most or max(channels, LEAST_CHANNELS))
 
 
 def _is_interpreted() -> bool:
@@ -47,7 +55,7 @@ def _is_interpreted() -> bool:
 def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """Statistics of features [h, w, c], float32 or bfloat16, with optional position weights [h, w] >= 0.
 
-    c is a power of two, at least 16, and channels lie side by side in memory.
+    c is less than 16 or a power of two, and channels lie side by side in memory.
     """
     from sgsst_core.features import fused_kernels as kernels
 
@@ -55,13 +63,13 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     device, positions = features.device, height * width
     span = SPAN_VALUES // channels
     spans = -(-positions // span)
-    tile = min(channels, TILE)
+    tile = block_of_channels(channels, TILE)
     shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1), dtype=torch.float32)
     counts = torch.empty(spans, device=device)
     firsts = torch.empty((spans, channels), device=device)
     seconds = torch.empty((spans, channels, channels), device=device)
     weights = features if position_weights is None else position_weights
-    kernels.shifted_moments[(spans, (channels // tile) ** 2)](
+    kernels.shifted_moments[(spans, (-(-channels // tile)) ** 2)](
         features, weights, shift, counts, firsts, seconds,
         positions, width, *features.stride()[:2], *weights.stride()[:2],
         CHANNELS=channels, TILE=tile, SPAN=span, P=block_of_positions(POSITIONS), WEIGHTED=position_weights is not None,
@@ -71,7 +79,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     mean = torch.empty(channels, dtype=torch.float64, device=device)
     centred = torch.empty((channels, channels), dtype=torch.float64, device=device)
     entries = block_of_entries(channels)
-    kernels.add_moments[(channels**2 // entries,)](
+    kernels.add_moments[(-(-(channels**2) // entries),)](
         counts, firsts, seconds, shift, count, mean, centred, spans,
         CHANNELS=channels, ENTRIES=entries, S=SPANS,
     )  # fmt: skip
@@ -86,4 +94,5 @@ def can_be_fused(features: Tensor) -> bool:
 
 def has_kernels(device: torch.device, channels: int) -> bool:
     """Whether there are kernels for layers of so many channels on a device."""
-    return device.type == "cuda" and channels >= 16 and channels.bit_count() == 1 and triton_runs_on(device)
+    taken = channels < LEAST_CHANNELS or channels.bit_count() == 1
+    return device.type == "cuda" and taken and triton_runs_on(device)

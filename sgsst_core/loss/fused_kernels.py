@@ -11,16 +11,16 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.fused_kernels import load_centred, load_weights
+from sgsst_core.features.fused_kernels import load_centred, load_weights, places_of
 
 
 @triton.jit
 def compare(
     count, mean, centred, target_gram, target_mean, target_std, terms, matrix, own_mean, offset,
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
-    ROWS: tl.constexpr,
+    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """`terms.style_loss`, in float64; ROWS channels a program.
+    """`terms.style_loss`, in float64; ROWS channels a program, and COLUMNS, all channels at least.
 
     Args:
         count, mean, centred: of the view's statistics.
@@ -29,32 +29,35 @@ def compare(
         matrix, own_mean, offset: [CHANNELS, CHANNELS], [CHANNELS], [CHANNELS] float32, of `terms.StyleGradient`.
     """
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
-    j = tl.arange(0, CHANNELS)
+    j = tl.arange(0, COLUMNS)
+    row, column = i < CHANNELS, j < CHANNELS
+    both = row[:, None] & column[None, :]
     entry = i[:, None] * CHANNELS + j[None, :]
     n = tl.load(count)
     some = n > 0
     divisor = tl.where(some, n, 1.0)
     share = tl.where(some, 1.0 / divisor, 0.0)
-    own, means = tl.load(mean + i), tl.load(mean + j)
-    gram_error = tl.load(centred + entry) / divisor + own[:, None] * means[None, :] - tl.load(target_gram + entry)
-    mean_error = own - tl.load(target_mean + i)
-    std = tl.sqrt(tl.maximum(tl.load(centred + i * CHANNELS + i), 0.0) / divisor)
-    std_error = std - tl.load(target_std + i)
+    own, means = tl.load(mean + i, mask=row, other=0.0), tl.load(mean + j, mask=column, other=0.0)
+    wanted = tl.load(target_gram + entry, mask=both, other=0.0)
+    gram_error = tl.load(centred + entry, mask=both, other=0.0) / divisor + own[:, None] * means[None, :] - wanted
+    mean_error = own - tl.load(target_mean + i, mask=row, other=0.0)
+    std = tl.sqrt(tl.maximum(tl.load(centred + i * CHANNELS + i, mask=row, other=0.0), 0.0) / divisor)
+    std_error = std - tl.load(target_std + i, mask=row, other=0.0)
     slope = tl.where(std > EPS * tl.abs(own), std_error / tl.where(std > 0, std, 1.0), 0.0)
     weight: tl.constexpr = GRAM / (CHANNELS * CHANNELS)
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
-    tl.store(matrix + entry, (line * share).to(tl.float32))
-    tl.store(own_mean + i, own.to(tl.float32))
-    tl.store(offset + i, drawn.to(tl.float32))
+    tl.store(matrix + entry, (line * share).to(tl.float32), mask=both)
+    tl.store(own_mean + i, own.to(tl.float32), mask=row)
+    tl.store(offset + i, drawn.to(tl.float32), mask=row)
     present = tl.where(some, 1.0, 0.0).to(tl.float64)
     squares = tl.sum(gram_error * gram_error, 1) / (CHANNELS * CHANNELS)
-    tl.store(terms + 5 * i, present * weight * squares)
-    tl.store(terms + 5 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error)
-    tl.store(terms + 5 * i + 2, present * (STD / CHANNELS) * std_error * std_error)
-    tl.store(terms + 5 * i + 3, 0.0 * own)
-    tl.store(terms + 5 * i + 4, 0.0 * own)
+    tl.store(terms + 5 * i, present * weight * squares, mask=row)
+    tl.store(terms + 5 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error, mask=row)
+    tl.store(terms + 5 * i + 2, present * (STD / CHANNELS) * std_error * std_error, mask=row)
+    tl.store(terms + 5 * i + 3, 0.0 * own, mask=row)
+    tl.store(terms + 5 * i + 4, 0.0 * own, mask=row)
 
 
 @triton.jit
@@ -80,13 +83,15 @@ def add_style_gradient(
     k = tl.zeros([], tl.int32)
     while k < CHANNELS:
         channel = k + tl.arange(0, K)
-        centred = load_centred(features, mean, row_step, column_step, width, position, channel, there)
-        part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :])
+        centred = load_centred(features, mean, row_step, column_step, width, position, channel, there, CHANNELS)
+        part_of = places_of(channel < CHANNELS, own, CHANNELS)
+        part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :], mask=part_of, other=0.0)
         sums += tl.dot(centred, part, input_precision=PRECISION)
         k += K
     a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
-    sums = (sums + tl.load(offset + own)[None, :]) * a[:, None]
+    sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]
     place = (position // width).to(tl.int64) * out_row_step + (position % width).to(tl.int64) * out_column_step
     target = gradient + place[:, None] + own[None, :]
-    before = tl.load(target, mask=there[:, None], other=0.0)
-    tl.store(target, (before.to(tl.float32) + sums).to(before.dtype), mask=there[:, None])
+    mask = places_of(there, own, CHANNELS)
+    before = tl.load(target, mask=mask, other=0.0)
+    tl.store(target, (before.to(tl.float32) + sums).to(before.dtype), mask=mask)

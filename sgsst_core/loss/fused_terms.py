@@ -5,7 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.features.fused_statistics import TILE, block_of_entries, block_of_positions, matrix_precision
+from sgsst_core.features.fused_statistics import (
+    TILE,
+    block_of_channels,
+    block_of_entries,
+    block_of_positions,
+    matrix_precision,
+)
 from sgsst_core.features.statistics import LayerStatistics
 
 #: Positions that a program of the gradient takes, and channels of theirs at a time: with more, registers spill.
@@ -32,10 +38,12 @@ def fused_style_loss(
     matrix = torch.empty((channels, channels), device=device)
     mean, offset = torch.empty(channels, device=device), torch.empty(channels, device=device)
     gram_weight, mean_weight, std_weight = weights
-    rows = block_of_entries(channels) // channels
-    kernels.compare[(channels // rows,)](
+    columns = block_of_channels(channels)
+    rows = block_of_entries(channels) // columns
+    kernels.compare[(-(-channels // rows),)](
         statistics.count, statistics.mean, statistics.centred, *target, terms, matrix, mean, offset,
         GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
+        COLUMNS=columns,
     )  # fmt: skip
     return terms.sum(dim=0), matrix, mean, offset
 
@@ -58,11 +66,11 @@ def fused_add_style_gradient(
     from sgsst_core.loss import fused_kernels as kernels
 
     height, width, channels = features.shape
-    positions, tile, block = height * width, min(channels, TILE), block_of_positions(POSITIONS)
+    positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
     weights = features if position_weights is None else position_weights
-    kernels.add_style_gradient[(-(-positions // block), channels // tile)](
+    kernels.add_style_gradient[(-(-positions // block), -(-channels // tile))](
         features, weights, gradient, matrix, mean, offset,
         positions, width, *features.stride()[:2], *weights.stride()[:2], *gradient.stride()[:2],
-        CHANNELS=channels, TILE=tile, K=min(channels, STEP), P=block, WEIGHTED=position_weights is not None,
-        PRECISION=matrix_precision(features.dtype),
+        CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEP), P=block,
+        WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
     )  # fmt: skip

@@ -33,7 +33,15 @@ from sgsst_core.loss.mixture import StyleMixture, mixed_target, shares_of
 from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, places_in
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.style_losses import compares_gram, has_statistics, nearest_layers, nearest_weight
-from sgsst_core.loss.terms import TERMS, ContentDifference, LayerTarget, LossTerms, StyleGradient, style_loss
+from sgsst_core.loss.terms import (
+    TERMS,
+    ContentDifference,
+    LayerTarget,
+    LossTerms,
+    StyleGradient,
+    content_factor,
+    style_loss,
+)
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
 from sgsst_core.parallel.division import Piece, Size, divide, rounds
@@ -589,11 +597,11 @@ class _ScalePass:
         self.matches: dict[PartitionTile, list[Matches]] = {}
         self.terms = torch.zeros(len(TERMS), dtype=torch.float64, device=image.device)
         self._coverage = view.coverage
-        self._content_weight = loss.content_weight
         self._timer = loss.timer
         self._content = content
         if content is not None:
-            self._content_count = self._all_positions(CONTENT_LAYER, view.coverage)
+            count = self._all_positions(CONTENT_LAYER, view.coverage)
+            self._content_factor = content_factor(count, loss.network.channels(CONTENT_LAYER), loss.content_weight)
         #: Of each part with features to be matched: the vectors, the factor of its distances, and the part.
         self._matched: list[tuple[StyleVectors, Tensor, _Part]] = []
         for part in parts if loss.nearest_layers else ():
@@ -674,8 +682,7 @@ class _ScalePass:
         return ContentDifference.of(
             features[own.slices],
             self._content[tile],
-            self._content_count,
-            self._content_weight,
+            self._content_factor,
             self._weights(CONTENT_LAYER, view, self._coverage),
         )
 

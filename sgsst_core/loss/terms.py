@@ -191,6 +191,16 @@ def style_loss(
     return torch.where(some, terms, 0.0), StyleGradient(matrix / count, statistics.mean, offset / count)
 
 
+def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
+    """lambda_c / (n c) of a whole view, float64 scalar.
+
+    Args:
+        count: n, float64 scalar, positions or the sum of their weights; 0 gives no loss.
+        weight: lambda_c.
+    """
+    return weight / (torch.where(count > 0, count, torch.inf) * channels)
+
+
 @dataclass(frozen=True)
 class ContentDifference:
     """How far some cells' content features are from what they should be: the content loss follows from it.
@@ -207,20 +217,18 @@ class ContentDifference:
 
     @staticmethod
     def of(
-        features: Tensor, content: Tensor, count: Tensor, weight: float, position_weights: Tensor | None = None
+        features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
     ) -> ContentDifference:
         """Of features and content [h, w, c] at the same positions.
 
         Args:
-            count: float64 scalar, positions (or sum of position weights) of the whole view; 0 gives no loss.
-            weight: lambda_c.
+            factor: of `content_factor`.
             position_weights: [h, w].
         """
         precision = torch.promote_types(features.dtype, torch.float32)
         difference = features.to(precision) - content.to(precision)
         weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
-        divisor = torch.where(count > 0, count, torch.inf) * features.shape[-1]
-        return ContentDifference(difference, weighted, weight / divisor)
+        return ContentDifference(difference, weighted, factor)
 
     def loss(self) -> Tensor:
         """These cells' share of the content loss, float64 scalar."""

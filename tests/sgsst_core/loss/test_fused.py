@@ -60,7 +60,9 @@ def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tu
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize(("channels", "height", "width"), [(16, 50, 40), (64, 150, 200), (128, 40, 33), (512, 9, 31)])
+@pytest.mark.parametrize(
+    ("channels", "height", "width"), [(3, 70, 50), (16, 50, 40), (64, 150, 200), (128, 40, 33), (512, 9, 31)]
+)
 def test_agrees_with_float64(channels: int, height: int, width: int, weighted: bool) -> None:
     """64 channels at this size are summed in more than one span."""
     x = features(height, width, channels, seed=1)

@@ -12,6 +12,7 @@ from sgsst_core.loss.terms import (
     LayerTarget,
     LossTerms,
     StyleGradient,
+    content_factor,
     style_loss,
 )
 from tests.sgsst_core.pictures import relative_error
@@ -79,7 +80,9 @@ def test_content_gradient_agrees_with_autograd(weighted):
     x, content = make_features(9, 11, 6, 1).requires_grad_(), make_features(9, 11, 6, 2)
     a = torch.rand((9, 11), dtype=torch.float64) if weighted else torch.ones((9, 11), dtype=torch.float64)
     expected = 0.7 * (a[:, :, None] * (x - content) ** 2).sum() / (a.sum() * 6)
-    found = ContentDifference.of(x.detach(), content, a.sum(), 0.7, a if weighted else None)
+    found = ContentDifference.of(
+        x.detach(), content, content_factor(a.sum(), x.shape[-1], 0.7), a if weighted else None
+    )
     assert float(found.loss()) == pytest.approx(expected.item(), rel=1e-12)
     torch.testing.assert_close(found.gradient(), torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
 
@@ -88,7 +91,9 @@ def test_without_any_position_loss_and_gradient_are_nothing():
     x = make_features(17, 23, 12, 1, torch.float32)
     nowhere = torch.zeros((17, 23))
     terms, gradient = style_loss(layer_statistics(x, nowhere), LayerTarget.of(layer_statistics(x)))
-    content = ContentDifference.of(x, 2 * x, nowhere.sum(dtype=torch.float64), 0.7, nowhere)
+    content = ContentDifference.of(
+        x, 2 * x, content_factor(nowhere.sum(dtype=torch.float64), x.shape[-1], 0.7), nowhere
+    )
     assert not terms.any()
     assert not gradient.apply(x, torch.ones((17, 23))).any()
     assert float(content.loss()) == 0.0
