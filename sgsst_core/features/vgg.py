@@ -25,8 +25,11 @@ from sgsst_core.scene.luminance import grey, grey_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
-#: What goes into the network, as a layer before the first: three channels, a cell for each pixel. Not the paper's.
+#: The picture itself as a layer before the first, not the paper's: three channels, a cell for each pixel, its colour
+#: times `PIXEL_UNIT`. That is about the units of a 0-255 input, and a power of two: nothing is rounded, so that the
+#: deviation of a picture of nearly one colour is right, where the shift of the input would leave rounding of it.
 PIXELS = "pixels"
+PIXEL_UNIT = 256.0
 #: Layer whose features make up the content loss.
 CONTENT_LAYER = "relu4_2"
 #: Receptive field of relu5_1 in pixels to either side (VGG19: 70, VGG16: 58), up to the next multiple of 16,
@@ -145,6 +148,7 @@ class FeatureNetwork:
         precision: in which convolutions are asked for: "tf32", or the name of `dtype`.
         rounding: of features, relative.
         unit: by what features of the content layer have been made larger, where 1 is the units of a 0-255 input.
+        pixel_weight: by what the terms of `PIXELS` count more: their factor squared, which is not in these features.
         search: cuDNN tries its algorithms on pictures of every new size, which takes about ten passes. Off, unless set:
             it pays for sizes that come back often enough.
     """
@@ -170,12 +174,12 @@ class FeatureNetwork:
         self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
         self.halo = HALO[weights.name]
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
+        self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
         # The normalisation stays in at least float32: in bfloat16, 255 grey levels would lose their last bits twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
         self._grey = weights.grey
-        self._pixel_scale = weights.scales.get(PIXELS, 1.0)
         self._steps = self._build(weights)
         self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
@@ -214,6 +218,10 @@ class FeatureNetwork:
                 if isinstance(step, _Convolution):
                     step.fused = _can_fuse(step)
 
+    def rounding_of(self, layer: str) -> float:
+        """Relative rounding of a layer's features."""
+        return torch.finfo(self._input_dtype).eps if layer == PIXELS else self.rounding
+
     def channels(self, layer: str) -> int:
         """Number of channels of a layer."""
         return self._channels[layer]
@@ -231,10 +239,11 @@ class FeatureNetwork:
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
         rgb = rgb.to(self.device, self._input_dtype)
-        x = (grey(rgb) if self._grey else rgb) * self._scale + self._shift
+        rgb = grey(rgb) if self._grey else rgb
         kept = Activations({}, size=(height, width))
         if PIXELS in self.layers:
-            kept.features[PIXELS] = x * self._pixel_scale
+            kept.features[PIXELS] = rgb * PIXEL_UNIT
+        x = rgb * self._scale + self._shift
         # [h, w, 3] seen as [1, 3, h, w] is already in channels-last order: no copy.
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32, search=self.search):
@@ -289,12 +298,11 @@ class FeatureNetwork:
         if gradient is None:
             pixels = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
         else:
-            pixels = gradient[0].permute(1, 2, 0).to(self._input_dtype)
+            pixels = gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
         if (features := kept.features.pop(PIXELS, None)) is not None:
             own = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
             feature_gradient(PIXELS, features, own)
-            pixels = torch.add(pixels, own, alpha=self._pixel_scale)
-        pixels = pixels * self._scale
+            pixels = torch.add(pixels, own, alpha=PIXEL_UNIT)
         return grey_gradient(pixels) if self._grey else pixels
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:

@@ -48,6 +48,8 @@ def compare(
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
+    # Features are centred about the rounded mean: what it leaves out is a part of the offset.
+    drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * share
     tl.store(matrix + entry, (line * share).to(tl.float32), mask=both)
     tl.store(own_mean + i, own.to(tl.float32), mask=row)
     tl.store(offset + i, drawn.to(tl.float32), mask=row)

@@ -32,7 +32,7 @@ from sgsst_core.features.vgg import (
 from sgsst_core.loss.mixture import StyleMixture, mixed_target, shares_of
 from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, places_in
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.loss.style_losses import compares_gram, has_statistics, nearest_layers, nearest_weight
+from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight, term_weights
 from sgsst_core.loss.terms import (
     TERMS,
     ContentDifference,
@@ -505,8 +505,10 @@ class SosLoss:
         style = part.style.layers if part.style else {}
         for layer, found in statistics.items():
             if layer in style:
-                rounding, gram = self.network.rounding, compares_gram(layer)
-                layer_terms, gradient = style_loss(found, style[layer], feature_eps=rounding, gram=gram)
+                rounding, weights = self.network.rounding_of(layer), term_weights(layer, self.network.pixel_weight)
+                layer_terms, gradient = style_loss(found, style[layer], feature_eps=rounding, weights=weights)
+                if layer == PIXELS and gradient.matrix.dtype == torch.float64:  # kernels have done so
+                    gradient = gradient.about_rounded_mean()
                 if part.factor != 1:
                     layer_terms, gradient = part.factor * layer_terms, gradient.times(part.factor)
                 pass_.terms = pass_.terms + layer_terms

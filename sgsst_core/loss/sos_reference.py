@@ -11,10 +11,10 @@ from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, layer_stride
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_stride
 from sgsst_core.loss.nearest import nearest_reference
-from sgsst_core.loss.style_losses import compares_gram, nearest_layers, nearest_weight, statistics_layers
-from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT, LayerTarget
+from sgsst_core.loss.style_losses import nearest_layers, nearest_weight, statistics_layers, term_weights
+from sgsst_core.loss.terms import PAPERS_WEIGHTS, LayerTarget, TermWeights
 from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
@@ -34,8 +34,8 @@ def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[st
     rgb = rgb.double()
     if network_weights.grey:
         rgb = (rgb @ torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64))[..., None].expand(rgb.shape)
+    features = {PIXELS: rgb * PIXEL_UNIT}
     x = rgb * network_weights.input_scale.double() + network_weights.input_shift.double()
-    features = {PIXELS: x * network_weights.scales.get(PIXELS, 1.0)}
     x = x.permute(2, 0, 1).unsqueeze(0)
     block = 1
     for name, (weight, bias) in network_weights.convolutions.items():
@@ -55,7 +55,11 @@ def box_average_reference(image: Tensor, side: int) -> Tensor:
 
 
 def style_loss_reference(
-    features: Tensor, target: LayerTarget, position_weights: Tensor | None = None, *, gram: bool = True
+    features: Tensor,
+    target: LayerTarget,
+    position_weights: Tensor | None = None,
+    *,
+    weights: TermWeights = PAPERS_WEIGHTS,
 ) -> Tensor:
     """One layer's style loss by its definition, float64 and differentiable: the twin of `terms.style_loss`.
 
@@ -63,13 +67,12 @@ def style_loss_reference(
         features: [h, w, c].
         target: of the style.
         position_weights: [h, w]; None for equal weights.
-        gram: False compares mean and standard deviation alone.
+        weights: of the terms.
     """
     found = _statistics(features, position_weights)
-    gram_weight = GRAM_WEIGHT / features.shape[-1] ** 2 if gram else 0.0
-    loss = gram_weight * (found.gram - target.gram).square().mean()
-    loss = loss + MEAN_WEIGHT * (found.mean - target.mean).square().mean()
-    return loss + STD_WEIGHT * (found.std - target.std).square().mean()
+    loss = weights.gram / features.shape[-1] ** 2 * (found.gram - target.gram).square().mean()
+    loss = loss + weights.mean * (found.mean - target.mean).square().mean()
+    return loss + weights.std * (found.std - target.std).square().mean()
 
 
 def _statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerTarget:
@@ -141,8 +144,8 @@ def _part_reference(
     loss = torch.zeros((), dtype=torch.float64)
     for layer in statistics_layers(style_loss, network_weights):
         position = _cells(part.share, side * layer_stride(layer))
-        target = _statistics(wanted[layer])
-        loss = loss + style_loss_reference(features[layer], target, position, gram=compares_gram(layer))
+        weights = term_weights(layer, network_weights.scales.get(PIXELS, 1.0) ** 2)
+        loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position, weights=weights)
     if matched := nearest_layers(style_loss, network_weights.name):
         position = _cells(part.share, side * layer_stride(matched[0]))
         own, other = ([found[layer] for layer in matched] for found in (features, wanted))

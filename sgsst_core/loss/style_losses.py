@@ -11,6 +11,7 @@ from __future__ import annotations
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS
+from sgsst_core.loss.terms import MEAN_WEIGHT, PAPERS_WEIGHTS, STD_WEIGHT, TermWeights
 from sgsst_core.settings import StyleLossName
 
 #: What brings ImageNet-normalised features, in which ARF's weights are meant, to the units of a 0-255 input.
@@ -54,9 +55,11 @@ def statistics_layers(style_loss: StyleLossName, weights: BackboneWeights) -> tu
     return (PIXELS, *STYLE_LAYERS) if PIXELS in weights.scales else STYLE_LAYERS
 
 
-def compares_gram(layer: str) -> bool:
-    """Whether a layer's Gram matrix counts beside its means and standard deviations."""
-    return layer != PIXELS
+def term_weights(layer: str, pixel_weight: float) -> TermWeights:
+    """Weights of a layer's terms: the paper's, and of `PIXELS` no Gram matrix and the others times `pixel_weight`."""
+    if layer != PIXELS:
+        return PAPERS_WEIGHTS
+    return TermWeights(0.0, MEAN_WEIGHT * pixel_weight, STD_WEIGHT * pixel_weight)
 
 
 def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,6 +39,18 @@ GRAM_WEIGHT = 1e3
 MEAN_WEIGHT = 1e4
 #: w_s.
 STD_WEIGHT = 1e4
+
+
+class TermWeights(NamedTuple):
+    """c^2 w_G, w_m and w_s of a layer."""
+
+    gram: float = GRAM_WEIGHT
+    mean: float = MEAN_WEIGHT
+    std: float = STD_WEIGHT
+
+
+#: SGSST.
+PAPERS_WEIGHTS = TermWeights()
 
 
 @dataclass(frozen=True)
@@ -120,6 +133,15 @@ class StyleGradient:
         """The gradient of the loss times a factor."""
         return StyleGradient(self.matrix * factor, self.mean, self.offset * factor)
 
+    def about_rounded_mean(self) -> StyleGradient:
+        """The same map about the mean as float32 has it, with what that leaves out in the offset.
+
+        `add_to` takes the mean away in the features' precision. Where they lie nearer to each other than the rounding
+        of their mean, as pixels of one colour do, that would be most of the result.
+        """
+        mean = self.mean.float().double()
+        return StyleGradient(self.matrix, mean, self.offset + self.matrix @ (mean - self.mean))
+
     def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
         """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
         result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
@@ -146,7 +168,11 @@ class StyleGradient:
 
 
 def style_loss(
-    statistics: LayerStatistics, target: LayerTarget, *, feature_eps: float = 2.0**-23, gram: bool = True
+    statistics: LayerStatistics,
+    target: LayerTarget,
+    *,
+    feature_eps: float = 2.0**-23,
+    weights: TermWeights = PAPERS_WEIGHTS,
 ) -> tuple[Tensor, StyleGradient]:
     """One layer's style loss and its gradient with respect to the features. Both are 0 where there is no position.
 
@@ -154,7 +180,7 @@ def style_loss(
         statistics: of the view's features.
         target: of the style.
         feature_eps: relative rounding of the features (2^-23 for float32, 2^-52 for float64).
-        gram: False compares mean and standard deviation alone.
+        weights: of the terms.
 
     Returns:
         [5] float64, what the layer adds to each of `TERMS`; and the gradient.
@@ -164,7 +190,6 @@ def style_loss(
     """
     channels = statistics.mean.shape[0]
     if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
-        weights = (GRAM_WEIGHT if gram else 0.0, MEAN_WEIGHT, STD_WEIGHT)
         fused = fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
         return fused[0], StyleGradient(*fused[1:])
     some = statistics.count > 0
@@ -172,21 +197,21 @@ def style_loss(
     mean_error = statistics.mean - target.mean
     std = statistics.std()
     std_error = std - target.std
-    gram_weight, nothing = GRAM_WEIGHT / channels**2 if gram else 0.0, torch.zeros_like(statistics.count)
+    gram_weight, nothing = weights.gram / channels**2, torch.zeros_like(statistics.count)
     terms = torch.stack(
         [
             gram_weight * gram_error.square().mean(),
-            MEAN_WEIGHT * mean_error.square().mean(),
-            STD_WEIGHT * std_error.square().mean(),
+            weights.mean * mean_error.square().mean(),
+            weights.std * std_error.square().mean(),
             nothing,
             nothing,
         ]
     )
     matrix = (4 * gram_weight / channels**2) * gram_error
-    offset = matrix @ statistics.mean + (2 * MEAN_WEIGHT / channels) * mean_error
+    offset = matrix @ statistics.mean + (2 * weights.mean / channels) * mean_error
     alive = std > feature_eps * statistics.mean.abs()
     slope = torch.where(alive, std_error / torch.where(alive, std, 1.0), 0.0)
-    matrix = matrix + torch.diag((2 * STD_WEIGHT / channels) * slope)
+    matrix = matrix + torch.diag((2 * weights.std / channels) * slope)
     count = torch.where(some, statistics.count, torch.inf)
     return torch.where(some, terms, 0.0), StyleGradient(matrix / count, statistics.mean, offset / count)
 

@@ -244,6 +244,10 @@ class DecisionsOf(FeatureNetwork):
         yield
         del self.other.forward
 
+    def rounding_of(self, layer: str) -> float:
+        """That of the other one: a channel that is constant but for it has no part in either's gradient."""
+        return self.other.rounding_of(layer)
+
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
         """As `FeatureNetwork.forward`, with the decisions of the other network's next pass kept for `backward`."""
         own = super().forward(rgb, keep=keep)

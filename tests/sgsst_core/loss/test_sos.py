@@ -57,7 +57,7 @@ def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, grey
 
 
 def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny_weights):
-    """Where only they differ, the loss is that of means and deviations of 0-255 values, by their factor's square."""
+    """Alone, the loss is that of means and deviations of 0-256 values, times the square of their factor."""
     weights = comparing_pixels(tiny_weights, 3.0)
     network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
     loss = SosLoss(network, content_weight=0)
@@ -66,7 +66,7 @@ def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny
         scale: ScaleTarget({PIXELS: own.layers[PIXELS]}) for scale, own in loss.style_targets(style, (40, 56)).items()
     }
     found = loss.evaluate(image, only, loss.view_target(image))
-    values = [(255 * part.double()).flatten(0, 1) for part in (image, style)]
+    values = [(256 * part.double()).flatten(0, 1) for part in (image, style)]
     means, deviations = (
         [own(part) for part in values] for own in (lambda x: x.mean(0), lambda x: x.std(0, correction=0))
     )
