@@ -29,6 +29,9 @@ from sgsst_core.settings import make_settings
 
 #: Results for any number of partition tiles agree to this.
 _TILES_BOUND = 1e-6
+#: Gradients of features to this: 4096 positions are added up in float32, by matrix products that round more often on
+#: some processors than on others (4e-7 with AVX2, 1.2e-6 with AVX-512 on a Xeon).
+_TILES_GRADIENT_BOUND = 2e-6
 
 
 def cases() -> list[Case]:
@@ -124,7 +127,9 @@ def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], 
     gradients = [gradient.apply(features) for _, gradient in results.values()]
     error = max(abs(loss / losses[0] - 1) for loss in losses)
     off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)
-    return CaseResult(max(error, off), _TILES_BOUND, ", ".join(parts))
+    # Of the loss, which has a narrower bound, in units of it.
+    error *= _TILES_GRADIENT_BOUND / _TILES_BOUND
+    return CaseResult(max(error, off), _TILES_GRADIENT_BOUND, ", ".join(parts))
 
 
 def _features() -> tuple[torch.Tensor, LayerTarget]:
