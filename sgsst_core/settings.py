@@ -123,7 +123,7 @@ class Settings(BaseModel):
     feature_scale: FeatureScale = Field(
         "even",
         description="How much each layer of the network counts; paper: as in the paper's network; even: Gram "
-        "matrix, mean and deviation count about alike, colours (features of the first layer) more.",
+        "matrix, mean and deviation count about alike, the first layer more, and the pixels' own colours too.",
     )
     style_loss: StyleLossName = Field(
         "sos",
