@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import replace
 from typing import Any
 
 os.environ.setdefault("TRITON_INTERPRET", "1")  # read when the kernels are first imported
@@ -21,9 +22,10 @@ import torch
 
 from benchmarks.machine import write_result
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.planning.planner import make_plan
 from sgsst_core.settings import Precision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.networks import tiny_weights
+from tests.networks import comparing_pixels, tiny_weights
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
@@ -43,7 +45,11 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
     )
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     with pretend_cuda() as counts:
-        stylizer = Stylizer.planned(scene, cameras(1, *SMALL), style(), settings, weights=tiny_weights("vgg19"))
+        weights = comparing_pixels(tiny_weights("vgg19"))  # as `even` has them
+        plan, workshop = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
+        plan = replace(plan, precision=precision)  # however fast this processor computes it
+        kept = workshop if plan.precision == workshop.network.precision else None
+        stylizer = Stylizer(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, workshop=kept)
         steps = []
         for _ in range(2):
             counts.clear()

@@ -156,7 +156,8 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
     weighted: dict[str, Any] = {"position_weights": "on" if scan else "off", "surround": "background"}
     settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, **weighted)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
-    stylizer = Stylizer.planned(scene, cameras(1, 64, 64), style(), settings, weights=networks.tiny_weights("vgg19"))
+    weights = networks.comparing_pixels(networks.tiny_weights("vgg19"))
+    stylizer = Stylizer.planned(scene, cameras(1, 64, 64), style(), settings, weights=weights)
     assert stylizer.scale_count(0) == 3
     for _ in range(2):
         counts.clear()
