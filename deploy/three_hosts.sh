@@ -182,7 +182,8 @@ for name in stylized.ply report.json plan.json log.txt; do
   curl -sf "$url/v1/jobs/$job/artifacts/$name" -o "$OUT/$name"
 done
 echo "computed on: $(field "['workers']['ranks'][0]['host']" < "$OUT/report.json")"
-sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" --style "$scene/starry_night.jpg" \
+threads=$(field "['workers']['ranks'][0]['threads']" < "$OUT/report.json") # sums of other threads round in other ways
+OMP_NUM_THREADS=$threads sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" --style "$scene/starry_night.jpg" \
   --out "$OUT/expected.ply" --resolution 96 --views 2 --steps-coarse 0 --steps-sos 24 --backbone vgg16 --keep-everything \
   --seed 1 > /dev/null
 cmp "$OUT/stylized.ply" "$OUT/expected.ply" && echo "the result is that of sgsst stylize, byte for byte"

@@ -174,12 +174,14 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
 )
 @pytest.mark.slow
 def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(scene: Scene) -> None:
-    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False}
+    """At a small rate: at that of `standard`, steps make a rounding 1e4 times larger within thirty of them."""
+    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.01}
     alone = stylize(ALONE, scene, 3, values)
     first, second = on_ranks(2, stylize, scene, 3, values)
     assert torch.equal(first["colours"], second["colours"])
     assert first["losses"] == second["losses"]
-    assert first["losses"][-1] == pytest.approx(alone["losses"][-1], rel=1e-3)
+    assert first["losses"] == pytest.approx(alone["losses"], rel=1e-5)
+    assert relative_error(first["colours"], alone["colours"]) < 1e-5
     assert first["views"] == alone["views"]
     assert "ranks" in first["plan"]
     again = on_ranks(2, stylize, scene, 3, values)[0]
