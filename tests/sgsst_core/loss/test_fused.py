@@ -11,7 +11,7 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics_ref
 from sgsst_core.loss import terms
 from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 from sgsst_core.loss.terms import LayerTarget, StyleGradient, style_loss
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.pictures import nearly_one_colour, relative_error
 
 pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -99,6 +99,22 @@ def test_survives_a_large_mean_to_sigma_ratio() -> None:
     fused_add_style_gradient(gradient, x.to(DEVICE), maps[0], maps[1], maps[2])
     assert torch.isfinite(found).all()
     assert relative_error(gradient.cpu(), expected.apply(x.double())) < 1e-4
+
+
+def test_channels_that_differ_by_less_than_their_mean_is_rounded() -> None:
+    """Pixels of nearly one colour, which have no Gram term: their map is about the mean as float32 has it."""
+    x = nearly_one_colour()
+    weights = terms.TermWeights(0.0, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
+    target = target_of(3)
+    on_host = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
+    exact = layer_statistics_reference(x)
+    _, expected = style_loss(exact, on_host, weights=weights)
+    _, *maps = fused_style_loss(
+        fused_statistics(x.to(DEVICE)), (target.gram, target.mean, target.std), weights, 2.0**-23
+    )
+    gradient = torch.zeros_like(x, device=DEVICE)
+    fused_add_style_gradient(gradient, x.to(DEVICE), maps[0], maps[1], maps[2])
+    assert relative_error(gradient.cpu(), expected.apply(x.double())) < 1e-5
 
 
 @pytest.mark.parametrize("dead_in", ["view", "style", "both"])

@@ -12,10 +12,11 @@ from sgsst_core.loss.terms import (
     LayerTarget,
     LossTerms,
     StyleGradient,
+    TermWeights,
     content_factor,
     style_loss,
 )
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.pictures import nearly_one_colour, relative_error
 
 
 def make_features(height, width, channels, seed, dtype=torch.float64):
@@ -63,6 +64,15 @@ def test_dead_channels_give_finite_gradients(dead_in):
     if dead_in == "style":
         _, expected = autograd_style(view, LayerTarget.of(layer_statistics(style)), None)
         assert relative_error(result, expected) < 1e-5
+
+
+def test_a_map_about_the_rounded_mean_is_the_same_map():
+    """Where features differ by less than float32 rounds their mean, as pixels of nearly one colour do."""
+    x, target = nearly_one_colour(), LayerTarget.of(layer_statistics(make_features(30, 20, 3, 2)))
+    _, gradient = style_loss(layer_statistics(x), target, weights=TermWeights(gram=0.0))
+    exact = gradient.apply(x.double())
+    assert relative_error(gradient.about_rounded_mean().apply(x), exact) < 1e-5
+    assert relative_error(gradient.apply(x), exact) > 1e-3
 
 
 def test_gradient_survives_a_large_mean_to_sigma_ratio():
