@@ -448,7 +448,7 @@ def of_precision(probe: Probe, settings: Settings) -> list[Decision]:
         reason = f"{asked} was asked for, which NVIDIA GPUs of compute capability 8.0 and above have: as float32 here"
         return [Decision("precision", "features in float32", reason)]
     if precision_of(asked, ratio) == "float32":
-        reason = f"{asked} was asked for, but this processor computes it {1 / ratio:.0f} times slower"
+        reason = f"{asked} was asked for, but takes {1 / ratio:.1f} times as long as float32 on this processor"
         return [Decision("precision", "features in float32", reason)]
     known = "that of the colours is measured during the run"
     if error is not None:

@@ -250,7 +250,7 @@ def test_content_is_left_out_without_weight() -> None:
             "bfloat16",
             0.04,
             "float32",
-            "features in float32: bfloat16 was asked for, but this processor computes it 25 times slower",
+            "features in float32: bfloat16 was asked for, but takes 25.0 times as long as float32 on this processor",
         ),
         ("tf32", 3.0, "tf32", "convolutions in TF32: asked for, 3.0 times faster here"),
         (
