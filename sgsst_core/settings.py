@@ -35,7 +35,7 @@ Surround = Literal["auto", "background", "random", "palette"]
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
 #: Content weights by how strong the style is then, chosen on the front of style against content (docs/quality.md).
-STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 3e3, "strong": 1.0}
+STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 1e4, "strong": 1.0}
 #: How the default of a setting that presets decide begins, in words.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
