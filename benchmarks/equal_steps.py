@@ -5,7 +5,8 @@ python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content
 Every row has settings on top of the standard preset's, in JSON; `factor` scales all features of VGG16 by a number (1
 leaves them as the network comes), or each layer's by its own ({"relu1_1": 16, "relu2_1": 8}; later ones follow). Rows
 are added to benchmarks/results/equal_steps.json, under NAME; with more seeds they are means, and "spread" is the
-largest difference between two seeds.
+largest difference between two seeds. "sliced" is a distance of palettes that no term of a loss and no start is made
+of: how far pixels' colours are from the style's as whole distributions, in levels of 8 bits (sliced Wasserstein).
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ from sgsst_core.scene.gaussians import Scene
 
 #: Views on the sheet.
 SHOWN = 3
-COLUMNS = ("style", "palette", "content", "features", "swing", "saturated", "seconds")
+COLUMNS = ("style", "palette", "sliced", "content", "features", "swing", "saturated", "seconds")
+#: Directions of colour, and quantiles along each, that distributions are compared by.
+DIRECTIONS, QUANTILES = 64, 1024
 
 
 def main() -> None:
@@ -59,7 +62,7 @@ def main() -> None:
     base = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "early_stop": False}
     base |= json.loads(arguments.settings)
     judge = _judge(scene, cameras, style, base)
-    rows = {"unstylized": asdict(_judged(judge, scene.sh_dc))}
+    rows = {"unstylized": _judged(judge, scene.sh_dc, style)}
     colours = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
     _print("unstylized", rows["unstylized"])
@@ -69,7 +72,7 @@ def main() -> None:
         for seed in arguments.seeds.split(","):
             values = base | json.loads(text or "{}") | {"seed": int(seed)}
             colours[name], seconds = _run(scene, cameras, style, values)
-            found.append({**asdict(_judged(judge, colours[name])), "seconds": seconds})
+            found.append({**_judged(judge, colours[name], style), "seconds": seconds})
         rows[name] = _mean(found)
         _print(name, rows[name])
         _store(arguments, rows)
@@ -85,10 +88,30 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
     return Judge(Lpips(), style, scene, held_out.rasterizer, views, stylizer.settings.background)
 
 
-def _judged(judge: Judge, sh_dc: torch.Tensor) -> Any:
+def _judged(judge: Judge, sh_dc: torch.Tensor, style: torch.Tensor) -> dict[str, float]:
     judgement = judge.judge(sh_dc)
     assert judgement is not None, "no view can be judged: give more cameras, or larger views"
-    return judgement
+    sliced = [_sliced(*judge.pictures(sh_dc, view), style) for view in judge.cameras]
+    return {**asdict(judgement), "sliced": sum(sliced) / len(sliced)}
+
+
+def _sliced(on_black: torch.Tensor, on_white: torch.Tensor, style: torch.Tensor) -> float:
+    """Sliced Wasserstein distance, of order 2, of a view's covered pixels [h, w, 3] from the style's, in levels."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn((3, DIRECTIONS), generator=generator).double(), dim=0)
+    coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1).reshape(-1).double()
+    own, wanted = (picture.reshape(-1, 3).double() @ directions for picture in (on_black, style))
+    differences = _quantiles(own, coverage) - _quantiles(wanted, torch.ones(len(wanted), dtype=torch.float64))
+    return 255 * float(differences.square().mean().sqrt())
+
+
+def _quantiles(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """[QUANTILES, k] of values [n, k], each column by itself, of which each row counts by its weight."""
+    ordered, order = values.sort(dim=0)
+    shares = weights[order].cumsum(0) / weights.sum()
+    wanted = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    places = torch.searchsorted(shares.T.contiguous(), wanted.expand(len(shares.T), -1).contiguous()).T
+    return ordered.gather(0, places.clamp_max(len(ordered) - 1))
 
 
 def _run(
