@@ -61,8 +61,8 @@ def main() -> None:
     cameras = read_views(arguments.cameras, scene, arguments.views, arguments.resolution)
     base = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "early_stop": False}
     base |= json.loads(arguments.settings)
-    judge = _judge(scene, cameras, style, base)
-    rows = {"unstylized": _judged(judge, scene.sh_dc, style)}
+    judge, palette = _judge(scene, cameras, style, base), _quantiles(style, torch.ones(style.shape[:2]))
+    rows = {"unstylized": _judged(judge, scene.sh_dc, palette)}
     colours = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
     _print("unstylized", rows["unstylized"])
@@ -72,7 +72,7 @@ def main() -> None:
         for seed in arguments.seeds.split(","):
             values = base | json.loads(text or "{}") | {"seed": int(seed)}
             colours[name], seconds = _run(scene, cameras, style, values)
-            found.append({**_judged(judge, colours[name], style), "seconds": seconds})
+            found.append({**_judged(judge, colours[name], palette), "seconds": seconds})
         rows[name] = _mean(found)
         _print(name, rows[name])
         _store(arguments, rows)
@@ -88,29 +88,27 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
     return Judge(Lpips(), style, scene, held_out.rasterizer, views, stylizer.settings.background)
 
 
-def _judged(judge: Judge, sh_dc: torch.Tensor, style: torch.Tensor) -> dict[str, float]:
+def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:
     judgement = judge.judge(sh_dc)
     assert judgement is not None, "no view can be judged: give more cameras, or larger views"
-    sliced = [_sliced(*judge.pictures(sh_dc, view), style) for view in judge.cameras]
+    sliced = [_sliced(*judge.pictures(sh_dc, view), palette) for view in judge.cameras]
     return {**asdict(judgement), "sliced": sum(sliced) / len(sliced)}
 
 
-def _sliced(on_black: torch.Tensor, on_white: torch.Tensor, style: torch.Tensor) -> float:
-    """Sliced Wasserstein distance, of order 2, of a view's covered pixels [h, w, 3] from the style's, in levels."""
+def _sliced(on_black: torch.Tensor, on_white: torch.Tensor, palette: torch.Tensor) -> float:
+    """Sliced Wasserstein distance, of order 2, of a view's covered pixels [h, w, 3] from a palette, in levels."""
+    coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1)
+    return 255 * float((_quantiles(on_black, coverage) - palette).square().mean().sqrt())
+
+
+def _quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """[QUANTILES, DIRECTIONS] along each direction, of a picture [h, w, 3] whose pixels count by weights [h, w]."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn((3, DIRECTIONS), generator=generator).double(), dim=0)
-    coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1).reshape(-1).double()
-    own, wanted = (picture.reshape(-1, 3).double() @ directions for picture in (on_black, style))
-    differences = _quantiles(own, coverage) - _quantiles(wanted, torch.ones(len(wanted), dtype=torch.float64))
-    return 255 * float(differences.square().mean().sqrt())
-
-
-def _quantiles(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """[QUANTILES, k] of values [n, k], each column by itself, of which each row counts by its weight."""
-    ordered, order = values.sort(dim=0)
-    shares = weights[order].cumsum(0) / weights.sum()
+    ordered, order = (picture.reshape(-1, 3).double() @ directions).sort(dim=0)
+    shares = weights.reshape(-1).double()[order].cumsum(0) / weights.double().sum()
     wanted = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
-    places = torch.searchsorted(shares.T.contiguous(), wanted.expand(len(shares.T), -1).contiguous()).T
+    places = torch.searchsorted(shares.T.contiguous(), wanted.expand(DIRECTIONS, -1).contiguous()).T
     return ordered.gather(0, places.clamp_max(len(ordered) - 1))
 
 
