@@ -91,12 +91,17 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
 def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:
     judgement = judge.judge(sh_dc)
     assert judgement is not None, "no view can be judged: give more cameras, or larger views"
-    sliced = [_sliced(*judge.pictures(sh_dc, view), palette) for view in judge.cameras]
+    sliced = [_sliced(judge.pictures(sh_dc, view), palette) for view in judge.cameras]
     return {**asdict(judgement), "sliced": sum(sliced) / len(sliced)}
 
 
-def _sliced(on_black: torch.Tensor, on_white: torch.Tensor, palette: torch.Tensor) -> float:
-    """Sliced Wasserstein distance, of order 2, of a view's covered pixels [h, w, 3] from a palette, in levels."""
+def _sliced(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
+    """Sliced Wasserstein distance, of order 2, of a view's covered pixels from a palette, in levels.
+
+    Args:
+        pictures: of the view [h, w, 3], on black and on white.
+    """
+    on_black, on_white = pictures
     coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1)
     return 255 * float((_quantiles(on_black, coverage) - palette).square().mean().sqrt())
 
