@@ -30,6 +30,8 @@ def atomic_path(target: Path) -> Iterator[Path]:
         OutputError: the folder is missing or not writable, the target is a folder, or the disk is full.
     """
     final = Path(os.path.realpath(target))
+    if final.is_dir():
+        raise OutputError(f"{final}: is a folder. Name a file.")
     temporary = _reserve(final)
     try:
         yield temporary
@@ -74,8 +76,6 @@ def ensure_writable_folder(path: Path) -> None:
 
 def _reserve(final: Path) -> Path:
     """Create an empty file beside `final`, with the permissions that a newly written file gets."""
-    if final.is_dir():
-        raise OutputError(f"{final}: is a folder. Name a file.")
     temporary = final.with_name(f".sgsst-{_tag(final)}-{secrets.token_hex(6)}.part{final.suffix}")
     try:
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))

@@ -114,3 +114,10 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) ->
         paths.append(writer.__enter__())
     remove_leftovers(target)
     assert [path.exists() for path in paths] == [False, True]
+
+
+def test_what_lies_in_a_folder_does_not_make_it_unwritable(tmp_path: Path) -> None:
+    for name in ("trial", "sgsst", "part"):
+        (tmp_path / name).mkdir()
+    ensure_writable_folder(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["part", "sgsst", "trial"]
