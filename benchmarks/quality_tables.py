@@ -30,10 +30,14 @@ def main() -> None:
     arguments = parser.parse_args()
     stored = json.loads(STORE.read_text())
     if arguments.way == "add":
+        if not (arguments.folder / "quality.json").is_file():
+            parser.error(f"{arguments.folder}: holds no quality.json; name the --out folder of `sgsst bench quality`")
         stored["pairs"][arguments.name] = read_run(arguments.folder)
         with atomic_path(STORE) as temporary:
             temporary.write_text(json.dumps(stored, indent=2) + "\n")
         return
+    if unknown := set(arguments.names) - set(stored["pairs"]):
+        parser.error(f"{STORE} has no {sorted(unknown)}; it has {list(stored['pairs'])}")
     for name in arguments.names or stored["pairs"]:
         run = stored["pairs"][name]
         print(f"{name}\n\n{judged(run['outcomes'])}\n\n{against_time(run['error_time']['variants'])}\n")
