@@ -15,6 +15,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
@@ -51,7 +53,8 @@ def main() -> None:
         if arguments.only in (None, name):
             settings = make_settings("standard", coarsest_side=arguments.coarsest_side, **values)
             stylizer = Stylizer.planned(file.scene, cameras, load_image(arguments.style), settings)
-            results[name] = {"settings": settings.model_dump(mode="json"), "points": _run(stylizer)}
+            points = _run(stylizer, file.scene.sh_dc)
+            results[name] = {"settings": settings.model_dump(mode="json"), "points": points}
             if arguments.out:
                 arguments.out.mkdir(parents=True, exist_ok=True)
                 write_stylized(file, arguments.out / f"{arguments.name}_{name}.ply", stylizer.stylized())
@@ -69,10 +72,13 @@ def _stored(name: str) -> dict[str, Any]:
     return {key: values[key] for key in ("paper", "standard") if key in values}
 
 
-def _run(stylizer: Stylizer) -> list[dict[str, Any]]:
-    """Loss on all views, relative to the start, at the marks of the schedule."""
+def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
+    """Loss on all views at the marks of the schedule, relative to that of the scene's own colours [n, 3].
+
+    (Not to that of the first step's: `standard` begins with the style's colours.)
+    """
     views = stylizer.views.covered
-    start = stylizer.evaluate(views)
+    start = stylizer.evaluate(views, own[stylizer.plan.seen])
     coarse, sos = stylizer.plan.steps_coarse, stylizer.settings.steps_sos
     marks = {int(coarse * mark) for mark in MARKS} | {coarse + int(sos * mark) for mark in MARKS}
     points, seconds = [], 0.0

@@ -120,6 +120,14 @@ def _pixels(situation: Situation, factor: float | None = None) -> Situation:
     return replace(situation, weights=replace(weights, scales=scales))
 
 
+def _white_on_white() -> Situation:
+    """What differs from the style is a hundredth of what both are: each rounding counts a hundred times as much."""
+    style = partial(_flat, 1, 1, 1, 64, 64)
+    settings = {"background": (1.0, 1.0, 1.0), "content_weight": 0, "learning_rate": 0.01}
+    job = _unlike(lambda: coloured(crowd(), 0.95, 0.95, 0.95), style, **settings)
+    return replace(_pixels(job), cameras=views(32, 32))
+
+
 def _tiny_views(width: int, height: int, **settings: Any) -> Situation:
     return replace(_job(**settings), cameras=views(width, height), falls=False)
 
@@ -192,6 +200,7 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "pixels, views of 3 x 2": lambda: _pixels(_tiny_views(3, 2)),
     "pixels 1e6 times as large": lambda: _pixels(_job(), 1e6),
     "pixels, harmonics of 100": lambda: _pixels(_unlike(lambda: _with_harmonics(100.0), lambda: texture(30, 26, 7))),
+    "white scene before white, flat style: white": _white_on_white,
     "scales weighted 1e12 to 1e-12": lambda: _job(scales=(1e12, 1e-12)),
     "the coarsest scale of a tiny view alone": lambda: _job(scales=(0.0, 1.0)),
 }

@@ -23,6 +23,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, FeatureNetwork
 from sgsst_core.loss.feature_scale import even_scales, with_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.terms import LayerTarget
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
@@ -45,6 +46,8 @@ _MOST_UNCERTAIN = 0.5
 _ROUNDING_OF_COSINES = 2**-22
 STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
+#: Of float32 features, relative to their size.
+_FEATURE_ROUNDING = 2**-20
 
 
 @dataclass(frozen=True)
@@ -168,10 +171,11 @@ def _moved(job: Stylizer, begun: Tensor) -> float:
 def twin_error(job: Stylizer) -> tuple[float, float, int]:
     """Relative error of loss and pixel gradient of a view's present picture against float64, and flipped decisions.
 
-    The second number is what the error may be: more where content has changed by little more than the rounding of its
-    features, of which the difference of both cannot be freed. Where it has changed by less, its term may be what that
-    rounding makes of it, and all else is compared without it. Of features that are matched, the loss alone: another
-    nearest vector, as near, is no error; and cosines that are 1 but for their rounding are.
+    The second number is what the error may be: more where statistics are so near the style's, or content has changed by
+    so little, that their difference is not much more than the rounding of features, of which it cannot be freed. Where
+    content has changed by less, its term may be what that rounding makes of it, and all else is compared without it. Of
+    features that are matched, the loss alone: another nearest vector, as near, is no error; and cosines that are 1 but
+    for their rounding are.
     """
     index = job.views.covered[0]
     picture = job.views.render(index, job.views.colours(index, job.sh_dc.detach()))
@@ -184,6 +188,7 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, found, exact, content):
         found, exact = _evaluate_both(job, double, *given, 0.0)
         uncertain = 0.0
+    uncertain += _rounding_of_style(job, exact, picture, coverage)
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
@@ -196,10 +201,21 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     return error, max(TWIN_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
 
 
+def _rounding_of_style(job: Stylizer, exact: SosResult, picture: Tensor, coverage: Tensor | None) -> float:
+    """What float32 features leave uncertain of the style loss and its gradient, relative.
+
+    The loss is |v - t|^2 of the picture's statistics v and the style's t. Gram matrices of both are off by 2 epsilon of
+    their size, so that it is by 4 epsilon |v| / |v - t|. |v|^2 is the loss against a style of which all is 0.
+    """
+    double = FeatureNetwork(job.weights, job.network.layers, torch.float64)
+    size = _evaluate(job, double, picture, picture, coverage, 0.0, of_nothing=True).loss
+    return 4 * _FEATURE_ROUNDING * math.sqrt(size / exact.loss) if exact.loss > 0 else 0.0
+
+
 def _feature_rounding(job: Stylizer, content: Tensor) -> float:
-    """Rounding of a difference of float32 content features: each is rounded to about 2^-20 of their size."""
+    """Rounding of a difference of float32 content features."""
     features = job.network.forward(content, keep=False).features[CONTENT_LAYER]
-    return 2**-20 * float(features.square().mean().sqrt()) if features.numel() else 0.0
+    return _FEATURE_ROUNDING * float(features.square().mean().sqrt()) if features.numel() else 0.0
 
 
 def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> float:
@@ -240,7 +256,10 @@ def _evaluate(
     content: Tensor,
     coverage: Tensor | None,
     content_weight: float,
+    *,
+    of_nothing: bool = False,
 ) -> SosResult:
+    """The job's loss of a picture by a network; against a style whose statistics are all 0 if so asked."""
     settings = job.settings
     loss = SosLoss(
         network,
@@ -252,4 +271,11 @@ def _evaluate(
     )
     style = job.style.map(lambda own: own.to(network.dtype))
     targets = loss.style_targets(style, (picture.shape[0], picture.shape[1]))
+    if of_nothing:
+        targets = {scale: replace(target, layers=_zeros_like(target.layers)) for scale, target in targets.items()}
     return loss.evaluate(picture.to(network.dtype), targets, loss.view_target(content.to(network.dtype), coverage))
+
+
+def _zeros_like(layers: Mapping[str, LayerTarget]) -> dict[str, LayerTarget]:
+    parts = {name: (each.gram, each.mean, each.std) for name, each in layers.items()}
+    return {name: LayerTarget(*map(torch.zeros_like, each)) for name, each in parts.items()}
