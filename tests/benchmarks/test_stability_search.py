@@ -40,6 +40,8 @@ def test_a_search_says_how_jobs_ended() -> None:
         (737, "within its bounds"),  # and by little more than that of their mean
         (667, "within its bounds"),  # and in their last bit
         (4237, "within its bounds"),  # a picture whose features are within a hundredth of the style's
+        (5810, "within its bounds"),  # a layer whose deviation is a ten thousandth of its mean
+        (6575, "within its bounds"),  # a picture and a style that are black
     ],
 )
 def test_what_it_found_stays_mended(number: int, how: str) -> None:
@@ -53,7 +55,7 @@ def test_what_breaks_a_bound_or_ends_in_any_other_way_is_found(monkeypatch: pyte
     assert outcome(job) == ("within its bounds", None)
     with monkeypatch.context() as patch:
         patch.setattr(situations, "TWIN_BOUND", 0.0)
-        patch.setattr(situations, "_FEATURE_ROUNDING", 0.0)
+        patch.setattr(situations, "_SAFETY", 0.0)
         how, problem = outcome(job)
         assert how == "broken"
         assert "bound 0" in str(problem)

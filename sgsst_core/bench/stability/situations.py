@@ -23,7 +23,6 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, FeatureNetwork
 from sgsst_core.loss.feature_scale import even_scales, with_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.terms import LayerTarget
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
@@ -48,6 +47,11 @@ STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
 #: Of float32 features, relative to their size.
 _FEATURE_ROUNDING = 2**-20
+#: Added to a number and taken away again, so many times itself leaves 20 of float64's 53 bits of it.
+_CUT = 2.0**33
+#: What that changes of a gradient is at least an eighth of what float32 does to it, which rounds sums, too, and those
+#: of equal numbers the same way each time.
+_SAFETY = 8.0
 
 
 @dataclass(frozen=True)
@@ -171,24 +175,22 @@ def _moved(job: Stylizer, begun: Tensor) -> float:
 def twin_error(job: Stylizer) -> tuple[float, float, int]:
     """Relative error of loss and pixel gradient of a view's present picture against float64, and flipped decisions.
 
-    The second number is what the error may be: more where statistics are so near the style's, or content has changed by
-    so little, that their difference is not much more than the rounding of features, of which it cannot be freed. Where
-    content has changed by less, its term may be what that rounding makes of it, and all else is compared without it. Of
-    features that are matched, the loss alone: another nearest vector, as near, is no error; and cosines that are 1 but
-    for their rounding are.
+    The second number is what the error may be: more where the rounding of features, of which nothing can be freed,
+    makes more of it; and where content has changed by little more than that. Where it has changed by less, its term may
+    be what that rounding makes of it, and all else is compared without it. Of features that are matched, the loss
+    alone: another nearest vector, as near, is no error; and cosines that are 1 but for their rounding are.
     """
     index = job.views.covered[0]
     picture = job.views.render(index, job.views.colours(index, job.sh_dc.detach()))
     content = job.views.content(index)
     coverage = job.views.coverage(index)[0] if job.views.weighted else None
     double = DecisionsOf(job.weights, job.network)
-    given = (picture, content, coverage)
-    found, exact = _evaluate_both(job, double, *given, job.settings.content_weight)
+    given, weight = (picture, content, coverage), job.settings.content_weight
+    found, exact = _evaluate_both(job, double, *given, weight)
     uncertain = _rounding_of_content(job, exact, content)
     if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, found, exact, content):
-        found, exact = _evaluate_both(job, double, *given, 0.0)
-        uncertain = 0.0
-    uncertain += _rounding_of_style(job, exact, picture, coverage)
+        uncertain, weight = 0.0, 0.0
+        found, exact = _evaluate_both(job, double, *given, weight)
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
@@ -198,18 +200,33 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     if not job.loss.nearest_layers:
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
+        uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
     return error, max(TWIN_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
 
 
-def _rounding_of_style(job: Stylizer, exact: SosResult, picture: Tensor, coverage: Tensor | None) -> float:
-    """What float32 features leave uncertain of the style loss and its gradient, relative.
+def _rounding_of_features(
+    job: Stylizer, exact: SosResult, given: tuple[Tensor, Tensor, Tensor | None], content_weight: float
+) -> float:
+    """By how much the gradient changes, relative, when all features are rounded a little more than float32 does.
 
-    The loss is |v - t|^2 of the picture's statistics v and the style's t. Gram matrices of both are off by 2 epsilon of
-    their size, so that it is by 4 epsilon |v| / |v - t|. |v|^2 is the loss against a style of which all is 0.
+    It is much where the style loss is a difference of nearly equal statistics, and where a deviation is not much more
+    than the rounding of what deviates.
     """
-    double = FeatureNetwork(job.weights, job.network.layers, torch.float64)
-    size = _evaluate(job, double, picture, picture, coverage, 0.0, of_nothing=True).loss
-    return 4 * _FEATURE_ROUNDING * math.sqrt(size / exact.loss) if exact.loss > 0 else 0.0
+    rounded = _Rounded(job.weights, job.network)
+    _, found = _evaluate_both(job, rounded, *given, content_weight)
+    assert found.image_gradient is not None
+    assert exact.image_gradient is not None
+    off = float((found.image_gradient - exact.image_gradient).norm())
+    return _SAFETY * off / max(float(exact.image_gradient.norm()), 1e-3)
+
+
+class _Rounded(DecisionsOf):
+    """The float64 network with every layer's features rounded, equal ones equally, as they are in float32."""
+
+    def _convolve(self, x: Tensor, step: Any) -> Tensor:
+        features = super()._convolve(x, step)
+        large = features * _CUT
+        return (features + large) - large
 
 
 def _feature_rounding(job: Stylizer, content: Tensor) -> float:
@@ -256,10 +273,8 @@ def _evaluate(
     content: Tensor,
     coverage: Tensor | None,
     content_weight: float,
-    *,
-    of_nothing: bool = False,
 ) -> SosResult:
-    """The job's loss of a picture by a network; against a style whose statistics are all 0 if so asked."""
+    """The job's loss of a picture by a network."""
     settings = job.settings
     loss = SosLoss(
         network,
@@ -271,11 +286,4 @@ def _evaluate(
     )
     style = job.style.map(lambda own: own.to(network.dtype))
     targets = loss.style_targets(style, (picture.shape[0], picture.shape[1]))
-    if of_nothing:
-        targets = {scale: replace(target, layers=_zeros_like(target.layers)) for scale, target in targets.items()}
     return loss.evaluate(picture.to(network.dtype), targets, loss.view_target(content.to(network.dtype), coverage))
-
-
-def _zeros_like(layers: Mapping[str, LayerTarget]) -> dict[str, LayerTarget]:
-    parts = {name: (each.gram, each.mean, each.std) for name, each in layers.items()}
-    return {name: LayerTarget(*map(torch.zeros_like, each)) for name, each in parts.items()}
