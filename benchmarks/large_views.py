@@ -17,6 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
@@ -56,7 +58,7 @@ def _stored() -> list[dict[str, Any]]:
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return row["width"], row["height"], row["precision"]
+    return row["width"], row["height"], row["precision"], row["threads"]
 
 
 def _in_a_process(size: str, limit: float | None) -> list[dict[str, Any]]:
@@ -97,6 +99,7 @@ def _measure(arguments: argparse.Namespace) -> None:
             "width": width,
             "height": height,
             "precision": arguments.precision,
+            "threads": torch.get_num_threads(),
             "memory_gb": arguments.memory,
             "planning_seconds": planning,
             "first_step_seconds": seconds[0],
