@@ -20,7 +20,7 @@ from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, ord
 from sgsst_core.constants import COLOUR_OFFSET, SH_C0
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, FeatureNetwork
+from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork
 from sgsst_core.loss.feature_scale import even_scales, with_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.scene.camera import Camera
@@ -221,7 +221,13 @@ def _rounding_of_features(
 
 
 class _Rounded(DecisionsOf):
-    """The float64 network with every layer's features rounded, equal ones equally, as they are in float32."""
+    """The float64 network with every layer's features rounded, equal ones equally, as they are in float32.
+
+    Pictures, too: those of lower scales are means.
+    """
+
+    def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
+        return super().forward(rgb.float(), keep=keep)
 
     def _convolve(self, x: Tensor, step: Any) -> Tensor:
         features = super()._convolve(x, step)
