@@ -61,7 +61,7 @@ def main() -> None:
     cameras = read_views(arguments.cameras, scene, arguments.views, arguments.resolution)
     base = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "early_stop": False}
     base |= json.loads(arguments.settings)
-    judge, palette = _judge(scene, cameras, style, base), _quantiles(style, torch.ones(style.shape[:2]))
+    judge, palette = _judge(scene, cameras, style, base), quantiles(style, torch.ones(style.shape[:2]))
     rows = {"unstylized": _judged(judge, scene.sh_dc, palette)}
     colours = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
@@ -91,11 +91,11 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
 def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:
     judgement = judge.judge(sh_dc)
     assert judgement is not None, "no view can be judged: give more cameras, or larger views"
-    sliced = [_sliced(judge.pictures(sh_dc, view), palette) for view in judge.cameras]
+    sliced = [sliced_distance(judge.pictures(sh_dc, view), palette) for view in judge.cameras]
     return {**asdict(judgement), "sliced": sum(sliced) / len(sliced)}
 
 
-def _sliced(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
+def sliced_distance(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
     """Sliced Wasserstein distance, of order 2, of a view's covered pixels from a palette, in levels.
 
     Args:
@@ -103,10 +103,10 @@ def _sliced(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
     """
     on_black, on_white = pictures
     coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1)
-    return 255 * float((_quantiles(on_black, coverage) - palette).square().mean().sqrt())
+    return 255 * float((quantiles(on_black, coverage) - palette).square().mean().sqrt())
 
 
-def _quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+def quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     """[QUANTILES, DIRECTIONS] along each direction, of a picture [h, w, 3] whose pixels count by weights [h, w]."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn((3, DIRECTIONS), generator=generator).double(), dim=0)
