@@ -41,6 +41,8 @@ def test_a_search_says_how_jobs_ended() -> None:
         (667, "within its bounds"),  # and in their last bit
         (4237, "within its bounds"),  # a picture whose features are within a hundredth of the style's
         (5810, "within its bounds"),  # a layer whose deviation is a ten thousandth of its mean
+        (7447, "within its bounds"),  # content that has changed by some 1e4 roundings, and counts 1e12 times
+        (12096, "within its bounds"),  # all pixels within 4e-7
         (7963, "within its bounds"),  # pixels whose means at half size are rounded by a tenth of their deviation
         (6575, "within its bounds"),  # a picture and a style that are black
     ],
