@@ -7,8 +7,9 @@ with the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_..
 `pg_restore` of the server's version or a later one. What FOLDER has of an earlier backup is not copied again: names of
 files are never written twice, but for unfinished uploads where the store is a local folder.
 
-Files are copied before and after the database: what its rows refer to was there at one of the two. A checkpoint that
-was made and replaced in between is missing; its job begins anew.
+Files are copied before and after the database: what its rows refer to was there at one of the two, but for a checkpoint
+that was made and replaced in between. Then the database is saved again, up to three times; a job whose checkpoint is
+still missing begins anew.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow
 
 #: Files on their way at a time.
 _AT_A_TIME = 8
+#: How often the database is saved until all checkpoints that it refers to are there.
+_ATTEMPTS = 3
 #: Beside a local store of results lie inputs, and unfinished uploads, which grow.
 _LOCAL_FOLDERS, _GROWING = ("blobs", "uploads"), "uploads"
 #: What the name of a file begins with that is not yet there as a whole.
@@ -65,8 +68,13 @@ def save(settings: ServiceSettings, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     files = folder / "files"
     copied = _copy_all(settings, files)
-    _dump(store, folder)
-    copied += _copy_all(settings, files)
+    for _ in range(_ATTEMPTS):
+        before = _checkpoints(store)
+        _dump(store, folder)
+        after = _checkpoints(store)
+        copied += _copy_all(settings, files)
+        if before == after and all((files / "store" / location).exists() for location in after):
+            break
     store.close()
     print(f"saved the database and {copied} new files in {folder}")
 
@@ -90,6 +98,12 @@ def restore(settings: ServiceSettings, folder: Path) -> None:
     print(f"restored the database and {restored} files; {len(missing)} files are missing")
     for name in missing:
         print(f"missing: {name}", file=sys.stderr)
+
+
+def _checkpoints(store: Store) -> set[str]:
+    """Where the database says that checkpoints are."""
+    with store.database.reading() as session:
+        return set(session.scalars(select(ArtifactRow.location).where(ArtifactRow.name == CHECKPOINT)))
 
 
 def _places(settings: ServiceSettings) -> dict[str, ObjectStore]:
