@@ -7,7 +7,7 @@ two for dispatchers, one for Ray's head, three Ray nodes that compute, PostgreSQ
 a host is started again when it ends, and a killed host comes back with an empty disk, as machines of a cluster do.
 
 Counted: jobs lost (accepted, and not succeeded), published twice, of another result than `sgsst stylize` gives on one
-rank (byte for byte for jobs of one rank; colours for jobs of two), files left over, reads that no API process answered
+rank (byte for byte for jobs of one rank; colors for jobs of two), files left over, reads that no API process answered
 while the database was there, and for each kind of fault the seconds until a job makes steps again.
 """
 

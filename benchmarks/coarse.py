@@ -2,7 +2,7 @@
 
     python -m benchmarks.coarse point_cloud.ply [--cameras cameras.json] [--side 1280] [--scales 1 2] [--repeats 9]
 
-All make the image at a scale and one colour gradient from there: `cpu` and `cached` with the box average and its
+All make the image at a scale and one color gradient from there: `cpu` and `cached` with the box average and its
 adjoint around them, `coarse` without. They take turns on the same view, and a figure is the fastest of its turns, the
 one least disturbed by whatever else the machine was doing. What depends on the geometry alone is prepared before; what
 `coarse` prepares beyond tile lists, its operator, is timed with the first image from it.
@@ -30,31 +30,31 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 
-def at_full_size(rasterizer: Rasterizer, colours: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
+def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
     """Image at a scale and the gradient from there, by way of the whole view."""
-    downscale(rasterizer.render(colours, camera), scale)
+    downscale(rasterizer.render(colors, camera), scale)
     whole = torch.zeros((camera.height, camera.width, 3))
     add_upscaled_(whole, gradient, scale)
-    rasterizer.colour_gradient(whole, camera)
+    rasterizer.color_gradient(whole, camera)
 
 
 def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str, Any]:
     """Fastest seconds of each way, what the operator costs, and the ratios, on one view."""
-    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
     gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
     coarse = CoarseRasterizer(cpu, scale)
 
     def with_operator(rasterizer: CoarseRasterizer = coarse) -> None:
-        rasterizer.render(colours, camera)
-        rasterizer.colour_gradient(gradient, camera)
+        rasterizer.render(colors, camera)
+        rasterizer.color_gradient(gradient, camera)
 
     ways: dict[str, Callable[[], None]] = {
-        "cpu": lambda: at_full_size(cpu, colours, gradient, camera, scale),
-        "cached": lambda: at_full_size(cached, colours, gradient, camera, scale),
+        "cpu": lambda: at_full_size(cpu, colors, gradient, camera, scale),
+        "cached": lambda: at_full_size(cached, colors, gradient, camera, scale),
         "coarse": with_operator,
     }
     seconds: dict[str, list[float]] = {name: [] for name in ways}
@@ -65,7 +65,7 @@ def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str,
         for name, way in ways.items():
             seconds[name].append(timed(way))
         fresh = CoarseRasterizer(cpu, scale)
-        builds.append(timed(lambda fresh=fresh: fresh.render(colours, camera)))  # type: ignore[misc]
+        builds.append(timed(lambda fresh=fresh: fresh.render(colors, camera)))  # type: ignore[misc]
     fastest = {name: min(times) for name, times in seconds.items()}
     return {
         "gaussians": len(scene),

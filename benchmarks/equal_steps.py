@@ -1,4 +1,4 @@
-"""Settings compared after the same steps, judged by a network that no run optimises, on views between the cameras.
+"""Settings compared after the same steps, judged by a network that no run optimizes, on views between the cameras.
 
 python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content_weight": 3000}' 'ROW=...'
 
@@ -6,7 +6,7 @@ Every row has settings on top of the standard preset's, in JSON; `factor` scales
 leaves them as the network comes), or each layer's by its own ({"relu1_1": 16, "relu2_1": 8}; later ones follow). Rows
 are added to benchmarks/results/equal_steps.json, under NAME; with more seeds they are means, and "spread" is the
 largest difference between two seeds. "sliced" is a distance of palettes that no term of a loss and no start is made
-of: how far pixels' colours are from the style's as whole distributions, in levels of 8 bits (sliced Wasserstein).
+of: how far pixels' colors are from the style's as whole distributions, in levels of 8 bits (sliced Wasserstein).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from sgsst_core.scene.gaussians import Scene
 #: Views on the sheet.
 SHOWN = 3
 COLUMNS = ("style", "palette", "sliced", "content", "features", "swing", "saturated", "seconds")
-#: Directions of colour, and quantiles along each, that distributions are compared by.
+#: Directions of color, and quantiles along each, that distributions are compared by.
 DIRECTIONS, QUANTILES = 64, 1024
 
 
@@ -63,7 +63,7 @@ def main() -> None:
     base |= json.loads(arguments.settings)
     judge, palette = _judge(scene, cameras, style, base), quantiles(style, torch.ones(style.shape[:2]))
     rows = {"unstylized": _judged(judge, scene.sh_dc, palette)}
-    colours = {"unstylized": scene.sh_dc}
+    colors = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
     _print("unstylized", rows["unstylized"])
     for row in arguments.rows:
@@ -71,13 +71,13 @@ def main() -> None:
         found = []
         for seed in arguments.seeds.split(","):
             values = base | json.loads(text or "{}") | {"seed": int(seed)}
-            colours[name], seconds = _run(scene, cameras, style, values)
-            found.append({**_judged(judge, colours[name], palette), "seconds": seconds})
+            colors[name], seconds = _run(scene, cameras, style, values)
+            found.append({**_judged(judge, colors[name], palette), "seconds": seconds})
         rows[name] = _mean(found)
         _print(name, rows[name])
         _store(arguments, rows)
     if arguments.out:
-        _write_sheet(arguments.out, arguments.name, judge, style, colours)
+        _write_sheet(arguments.out, arguments.name, judge, style, colors)
 
 
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
@@ -89,10 +89,10 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
 
 
 def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:
-    judgement = judge.judge(sh_dc)
-    assert judgement is not None, "no view can be judged: give more cameras, or larger views"
+    judgment = judge.judge(sh_dc)
+    assert judgment is not None, "no view can be judged: give more cameras, or larger views"
     sliced = [sliced_distance(judge.pictures(sh_dc, view), palette) for view in judge.cameras]
-    return {**asdict(judgement), "sliced": sum(sliced) / len(sliced)}
+    return {**asdict(judgment), "sliced": sum(sliced) / len(sliced)}
 
 
 def sliced_distance(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
@@ -120,7 +120,7 @@ def quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 def _run(
     scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any]
 ) -> tuple[torch.Tensor, float]:
-    """Colours [N, 3], and processor seconds of the steps."""
+    """Colors [N, 3], and processor seconds of the steps."""
     weights = _weights(values.pop("factor", None))
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=weights)
     before = time.process_time()
@@ -165,12 +165,12 @@ def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
     write_result("equal_steps", {"pairs": pairs})
 
 
-def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colours: dict[str, torch.Tensor]) -> None:
+def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
     """A row of views for each of the ways."""
     folder.mkdir(parents=True, exist_ok=True)
-    rows = [(way, [judge.pictures(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colours.items()]
+    rows = [(way, [judge.pictures(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colors.items()]
     write_rows(folder / f"{name}.jpg", style, rows)
-    torch.save(colours, folder / f"{name}.pt")
+    torch.save(colors, folder / f"{name}.pt")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ python -m benchmarks.feature_scale factors PICTURE...
 python -m benchmarks.feature_scale log CONTENT STYLE [--scales none,paper,even] [--iterations 50]
 
 `factors` prints, for each picture, by what VGG16's layers are smaller than the original VGG19's. `log` repeats the
-optimisation whose loss Gatys et al. published (Gram weights 1e3 / c^2, content 1, L-BFGS from the content, 512 pixels),
+optimization whose loss Gatys et al. published (Gram weights 1e3 / c^2, content 1, L-BFGS from the content, 512 pixels),
 with VGG16 at several scales. Results are added to benchmarks/results/feature_scale.json.
 """
 
@@ -49,7 +49,7 @@ def main() -> None:
     found = {}
     for scale in arguments.scales.split(","):
         network = FeatureNetwork(weights if scale == "none" else at_scale(weights, scale))
-        found[scale] = _optimise(network, content, style, arguments.iterations)
+        found[scale] = _optimize(network, content, style, arguments.iterations)
         print(f"{scale:6} start {found[scale]['start']:14,.0f} end {found[scale]['end']:14,.0f}", flush=True)
     _store("log", {f"{arguments.content.name}, {arguments.style.name}": {"iterations": arguments.iterations} | found})
 
@@ -74,12 +74,12 @@ def _gram(features: Tensor) -> Tensor:
     return values.T @ values / len(values)
 
 
-def _optimise(network: FeatureNetwork, content: Tensor, style: Tensor, iterations: int) -> dict[str, float]:
+def _optimize(network: FeatureNetwork, content: Tensor, style: Tensor, iterations: int) -> dict[str, float]:
     """Loss at the first evaluation and after so many, of L-BFGS on pixels in units of 0 to 255, from the content."""
     grams = {layer: _gram(features) for layer, features in _forward(network, style).features.items()}
     kept = _forward(network, content).features[CONTENT_LAYER]
     pixels = (255 * content).clone().requires_grad_()
-    optimiser = torch.optim.LBFGS([pixels], max_iter=iterations, max_eval=iterations)
+    optimizer = torch.optim.LBFGS([pixels], max_iter=iterations, max_eval=iterations)
     losses: list[float] = []
 
     def evaluate() -> Tensor:
@@ -87,7 +87,7 @@ def _optimise(network: FeatureNetwork, content: Tensor, style: Tensor, iteration
         losses.append(float(loss))
         return loss
 
-    optimiser.step(evaluate)
+    optimizer.step(evaluate)
     return {"start": losses[0], "end": losses[-1], "evaluations": len(losses)}
 
 

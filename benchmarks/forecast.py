@@ -3,7 +3,7 @@
 python -m benchmarks.forecast [--launches 494]
 
 Nothing here is measured on a GPU: peaks are the data sheet's, and how much of them is reached are the `SHARES` below.
-The feature network, the image pyramid, colours and the content loss are counted by running the project's own code on
+The feature network, the image pyramid, colors and the content loss are counted by running the project's own code on
 tensors without values; Triton's kernels from their source; the rasterizer from pairs of Gaussian and raster tile.
 """
 
@@ -31,7 +31,7 @@ from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.cost import content_bytes
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
-from sgsst_core.scene.spherical_harmonics import view_colours, view_colours_gradient
+from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
 
 #: H200 SXM, data sheet, dense: operations a second by what is multiplied, bytes a second, bytes of memory and of L2.
@@ -45,7 +45,7 @@ LAUNCHES = 494
 #: Of a view's lists of raster tiles: two sorts in passes, a sum in passes, kernels and copies.
 LIST_LAUNCHES = 40
 #: Instructions a pixel of a pair of Gaussian and raster tile, as the source of `blend_weights` and of its callers has
-#: them: about 30 for the weight, with two functions of a quarter of the rate or less, the rest for three colours.
+#: them: about 30 for the weight, with two functions of a quarter of the rate or less, the rest for three colors.
 PIXEL_INSTRUCTIONS = 45
 #: Visible Gaussians, and pairs each: half of a scene; as the biker's 152,605 at widths of 980 and 5187, most of which
 #: are a few pixels wide, as those of large scenes are. (The plush toy's, which are larger: 12.8 and 236.)
@@ -91,7 +91,7 @@ def _shares(float32: float, tf32: float, bfloat16: float, ieee: float, product: 
 
 
 SHARES = {
-    "optimistic": _shares(0.85, 0.75, 0.75, 0.6, 0.5, 0.85, 0.5, 0.5, 3e-6),
+    "optimiztic": _shares(0.85, 0.75, 0.75, 0.6, 0.5, 0.85, 0.5, 0.5, 3e-6),
     "likely": _shares(0.7, 0.6, 0.6, 0.4, 0.3, 0.7, 0.35, 0.7, 4e-6),
     "pessimistic": _shares(0.5, 0.4, 0.4, 0.25, 0.15, 0.55, 0.25, 1.0, 6e-6),
 }
@@ -255,7 +255,7 @@ def style_gradient(channels: int, positions: int, size: int) -> Work:
 
 
 def render(job: Job) -> list[Work]:
-    """Of kept lists: rank, eight float64 and a colour for each pair; image and transmittance."""
+    """Of kept lists: rank, eight float64 and a color for each pair; image and transmittance."""
     pixels = job.size[0] * job.size[1]
     return [Work(_blending(job), job.pairs * (4 + 64 + 8 + 12) + 16 * pixels, "lanes")]
 
@@ -284,16 +284,16 @@ def lists(job: Job) -> list[Work]:
 
 
 def rest(job: Job) -> list[Work]:
-    """Colours' frozen part, from spherical harmonics of degree 3: every coefficient read once, in one launch."""
+    """Colors' frozen part, from spherical harmonics of degree 3: every coefficient read once, in one launch."""
     return [Work(0, (15 * 12 + 12 + 12) * job.gaussians)]
 
 
-def colours(job: Job) -> list[Work]:
-    """Colours of a view whose frozen part is kept, and the way back; Adam: four tensors read, three written."""
+def colors(job: Job) -> list[Work]:
+    """Colors of a view whose frozen part is kept, and the way back; Adam: four tensors read, three written."""
     values = meta(job.gaussians, 3)
     with Counted() as counted:
-        view_colours(values, values)
-        view_colours_gradient(values, values)
+        view_colors(values, values)
+        view_colors_gradient(values, values)
     return [*counted.works, Work(0, (3 + 7) * 12 * job.gaussians)]
 
 
@@ -304,14 +304,14 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
         job: scene and views.
         precision: of the feature network.
         coarse: of phase 1, on the coarsest scale alone.
-        everything_kept: as if the memory held content features, lists and frozen colours of all views.
+        everything_kept: as if the memory held content features, lists and frozen colors of all views.
     """
     loss = make_loss(precision)
     count = loss.scale_count(*job.size)
     passes = Passes(loss, job.size, [count - 1] if coarse else range(count))
     forward, backward = passes.network()
     moments, style = passes.style()
-    kept = dict.fromkeys(("content", "lists", "colours"), 1.0) if everything_kept else kept_shares(job, loss, coarse)
+    kept = dict.fromkeys(("content", "lists", "colors"), 1.0) if everything_kept else kept_shares(job, loss, coarse)
     missing = {name: 1 - share for name, share in kept.items()}
     anew = [*forward, *render(job), *passes.scaled()]
     frozen = rest(job)
@@ -327,13 +327,13 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
         "render": Part(render(job)),
         "raster gradient": Part(raster_gradient(job)),
         "lists anew": Part(lists(job), missing["lists"], LIST_LAUNCHES),
-        "colours and Adam": Part(colours(job)),
-        "frozen colours anew": Part(frozen, missing["colours"] * (1 + missing["content"]), len(frozen)),
+        "colors and Adam": Part(colors(job)),
+        "frozen colors anew": Part(frozen, missing["colors"] * (1 + missing["content"]), len(frozen)),
     }
 
 
 def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
-    """Of the views, those whose content features, lists and frozen colours fit the memory (`Views`, `KeptLists`)."""
+    """Of the views, those whose content features, lists and frozen colors fit the memory (`Views`, `KeptLists`)."""
     views = memory_limit() * MEMORY_SHARES["views"]
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.scale_count(*job.size)
@@ -344,7 +344,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
             rasterizer_options("triton", make_settings(), int(memory_limit()))["max_list_bytes"],
             LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs,
         ),
-        "colours": (views / 4, 12.0 * job.gaussians),
+        "colors": (views / 4, 12.0 * job.gaussians),
     }
     return {name: min(1.0, room // each / job.views) for name, (room, each) in of_a_view.items()}
 
@@ -386,7 +386,7 @@ def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Milliseconds of a step as Markdown, by precision: likely, and in brackets optimistic and pessimistic."""
+    """Milliseconds of a step as Markdown, by precision: likely, and in brackets optimiztic and pessimistic."""
     lines = ["| part of a step, ms | " + " | ".join(found) + " |", "|---|" + "---:|" * len(found)]
     first = next(iter(found.values()))["sos"]["likely"]
 
@@ -394,7 +394,7 @@ def table(found: Mapping[str, Mapping[str, Any]]) -> str:
         cells = []
         for each in found.values():
             values = {n: factor * (v[part] if part else v) for n, v in each[kind].items()}
-            low, mid, high = (values[n] for n in ("optimistic", "likely", "pessimistic"))
+            low, mid, high = (values[n] for n in ("optimiztic", "likely", "pessimistic"))
             cells.append(f"{mid:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})")
         return f"| {name} | " + " | ".join(cells) + " |"
 

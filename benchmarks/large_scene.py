@@ -36,11 +36,11 @@ from sgsst_core.rasterizer.raster_lists import build_raster_lists, lists_of_subs
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
-from sgsst_core.scene.spherical_harmonics import reference_rest_colours, rest_colours
+from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.unseen import NEIGHBOURS, neighbours_change
+from sgsst_core.stylizing.unseen import NEIGHBORS, neighbors_change
 from sgsst_core.timing import Timer
 
 PARTS = ("reading", "harmonics", "survey", "first step", "unseen")
@@ -79,12 +79,12 @@ def middle(action: Callable[[Camera], object], cameras: list[Camera]) -> float:
 def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Spherical harmonics of a view, and how much faster than their slow twin they are, on a part of the scene."""
     part = scene.subset(torch.arange(min(_HARMONICS_SAMPLE, len(scene))))
-    rest_colours(part.sh_rest, part.means, cameras[0])  # compiles
+    rest_colors(part.sh_rest, part.means, cameras[0])  # compiles
     slow = middle(
-        lambda camera: reference_rest_colours(held(part.sh_rest), part.means, camera, scene.sh_degree), cameras
+        lambda camera: reference_rest_colors(held(part.sh_rest), part.means, camera, scene.sh_degree), cameras
     )
-    fast = middle(lambda camera: rest_colours(part.sh_rest, part.means, camera), cameras)
-    whole = middle(lambda camera: rest_colours(scene.sh_rest, scene.means, camera), cameras)
+    fast = middle(lambda camera: rest_colors(part.sh_rest, part.means, camera), cameras)
+    whole = middle(lambda camera: rest_colors(scene.sh_rest, scene.means, camera), cameras)
     return {"harmonics_seconds": whole, "ratio_reference_to_harmonics": slow / fast}
 
 
@@ -102,13 +102,13 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
     lists_of_subset(build_raster_lists(scene.subset(torch.arange(1)), cameras[0]), places[1:2].numpy())  # compiles
     found: dict[str, list[float]] = {"handed": [], "render": [], "gradient": [], "plain": [], "survey": []}
-    colours = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
+    colors = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
     for camera in cameras:
         whole = rasterizer.lists(camera)
         found["handed"].append(timed(lambda whole=whole: lists_of_subset(whole, places.numpy())))  # type: ignore[misc]
-        image = rasterizer.render(colours, camera)
-        found["render"].append(timed(lambda camera=camera: rasterizer.render(colours, camera)))  # type: ignore[misc]
-        gradient = timed(lambda image=image, camera=camera: rasterizer.colour_gradient(image, camera))  # type: ignore[misc]
+        image = rasterizer.render(colors, camera)
+        found["render"].append(timed(lambda camera=camera: rasterizer.render(colors, camera)))  # type: ignore[misc]
+        gradient = timed(lambda image=image, camera=camera: rasterizer.color_gradient(image, camera))  # type: ignore[misc]
         found["gradient"].append(gradient)
         found["plain"].append(timed(lambda camera=camera: plain_survey(rasterizer, camera)))  # type: ignore[misc]
         found["survey"].append(timed(lambda camera=camera: rasterizer.survey(camera)))  # type: ignore[misc]
@@ -124,7 +124,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Neighbours of what the views do not see; against a search on one core in the order of the file."""
+    """Neighbors of what the views do not see; against a search on one core in the order of the file."""
     rasterizer = CpuRasterizer(scene, max_list_bytes=0)
     weights = torch.zeros(len(scene), dtype=torch.float64)
     for camera in cameras:
@@ -133,10 +133,10 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
     def plain() -> None:
         tree = cKDTree(scene.means[seen].double().numpy())
-        tree.query(scene.means[~seen].double().numpy(), k=NEIGHBOURS)
+        tree.query(scene.means[~seen].double().numpy(), k=NEIGHBORS)
 
     slow = timed(plain)
-    fast = timed(lambda: neighbours_change(scene.means, scene.sh_dc, weights))
+    fast = timed(lambda: neighbors_change(scene.means, scene.sh_dc, weights))
     return {"unseen": int((~seen).sum()), "unseen_seconds": fast, "ratio_plain_to_unseen": slow / fast}
 
 

@@ -52,7 +52,7 @@ _SCENE = """async ([base, frames, width, height]) => {
   const viewer = new Viewer(canvas), pause = () => new Promise((go) => setTimeout(go, 5)), begun = performance.now();
   const since = (start) => performance.now() - start;
   const source = viewer.open(document.querySelector("#given").files[0]);
-  viewer.show({ scene: source, colours: "own" });
+  viewer.show({ scene: source, colors: "own" });
   while (!source.drawn || !viewer.milliseconds.length) await pause();
   const first = since(begun);
   await source.ready;

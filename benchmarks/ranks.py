@@ -78,7 +78,7 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
                 collectives, lambda c, view=view: make(c, scene, view, style, arguments), arguments.rounds
             )
             if rank == 0:
-                results.append({"view": size, **figures, **modelled(figures, len(scene), link, arguments.ranks)})
+                results.append({"view": size, **figures, **modeled(figures, len(scene), link, arguments.ranks)})
                 print(describe(results[-1]), flush=True)
     if rank == 0:
         link_figures = {"bandwidth_gb_s": link.bandwidth / 1e9, "latency_us": link.latency * 1e6}
@@ -163,7 +163,7 @@ def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:
     }
 
 
-def modelled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> dict[str, Any]:
+def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> dict[str, Any]:
     """What the planner's model makes of one rank's seconds."""
     steps = figures["steps"]["alone"]
     network = sum(median(steps, part) for part in NETWORK)

@@ -1,8 +1,8 @@
-"""Forward plus colour backward at 1280x720: `reference` in float32, `cpu` and `cached`, as ratios within one run.
+"""Forward plus color backward at 1280x720: `reference` in float32, `cpu` and `cached`, as ratios within one run.
 
     python -m benchmarks.rasterizer [--scene point_cloud.ply --cameras cameras.json] [--repeats 15]
 
-All do the same work: one image from colours, one colour gradient from an image gradient. What depends on the geometry
+All do the same work: one image from colors, one color gradient from an image gradient. What depends on the geometry
 alone (projection, depth order, tile lists; for `cached` the weights too) is prepared before and timed by itself,
 because a job does it once a view. The rasterizers take turns, each on one thread and on all; a figure is the fastest of
 its turns, the one least disturbed by whatever else the machine was doing.
@@ -30,7 +30,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 WIDTH, HEIGHT = 1280, 720
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
@@ -75,16 +75,16 @@ def timed(action: Callable[[], object]) -> float:
     return time.perf_counter() - started
 
 
-def both(rasterizer: Rasterizer, colours: Tensor, image_gradient: Tensor, camera: Camera, threads: int) -> float:
+def both(rasterizer: Rasterizer, colors: Tensor, image_gradient: Tensor, camera: Camera, threads: int) -> float:
     """Seconds of forward plus backward on so many threads."""
     torch.set_num_threads(threads)
-    render = timed(lambda: rasterizer.render(colours, camera))
-    return render + timed(lambda: rasterizer.colour_gradient(image_gradient, camera))
+    render = timed(lambda: rasterizer.render(colors, camera))
+    return render + timed(lambda: rasterizer.color_gradient(image_gradient, camera))
 
 
 def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     """Fastest seconds of each rasterizer and the ratios between them, in turn on one view."""
-    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
     image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     threads = sorted({1, torch.get_num_threads()})
     cpu = CpuRasterizer(scene)
@@ -92,10 +92,10 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     prepare = timed(lambda: cpu.lists(camera))
     caches = {p: CachedRasterizer(scene, precision=p) for p in ("float32", "half")}
     for cache in caches.values():
-        cache.render(colours, camera)
-    keep = timed(lambda: CachedRasterizer(scene).render(colours, camera)) - prepare
+        cache.render(colors, camera)
+    keep = timed(lambda: CachedRasterizer(scene).render(colors, camera)) - prepare
     reference = ReferenceRasterizer(scene, dtype=torch.float32)
-    reference.render(colours, camera, (0, 1))  # projects and sorts
+    reference.render(colors, camera, (0, 1))  # projects and sorts
     rasterizers: dict[str, Rasterizer] = {
         "reference": reference,
         "cpu": cpu,
@@ -107,7 +107,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
         for name, rasterizer in rasterizers.items():
             for count in threads:
                 if turn < 2 or name != "reference":  # it takes seconds, which is repetition enough
-                    seconds[name][count].append(both(rasterizer, colours, image_gradient, camera, count))
+                    seconds[name][count].append(both(rasterizer, colors, image_gradient, camera, count))
     torch.set_num_threads(threads[-1])
     fastest = {name: {n: min(times) for n, times in runs.items()} for name, runs in seconds.items()}
     best = {name: min(runs.values()) for name, runs in fastest.items()}

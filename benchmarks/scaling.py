@@ -28,13 +28,13 @@ LINKS = {
     "PCIe 4.0 x16": Link(0.8 * 32e9, 10e-6),
     "25 Gb/s Ethernet": Link(0.8 * 25e9 / 8, 30e-6),
 }
-#: Height, width, optimised Gaussians, seconds of render and gradient: a scene of Tanks and Temples, and the garden of
+#: Height, width, optimized Gaussians, seconds of render and gradient: a scene of Tanks and Temples, and the garden of
 #: Mip-NeRF 360 at its full size.
 VIEWS = {"980x545": (545, 980, 2_500_000, 0.006), "5187x3361": (3361, 5187, 5_800_000, 0.030)}
-#: Share of the optimised Gaussians that a view shows: 65 % of the plush toy's in views of its real cameras, 68 % of the
+#: Share of the optimized Gaussians that a view shows: 65 % of the plush toy's in views of its real cameras, 68 % of the
 #: biker's in an orbit. Views of scenes that are walked through show less.
 SHOWN_SHARE = 0.65
-#: Comparing statistics, the optimiser and launching kernels, in every iteration on every rank.
+#: Comparing statistics, the optimizer and launching kernels, in every iteration on every rank.
 FIXED_SECONDS = 0.003
 
 

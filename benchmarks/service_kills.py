@@ -5,7 +5,7 @@ python -m benchmarks.service_kills [--kills 100] [--rank-kills 6] [--seed 0]
 `sgsst serve` runs with its defaults but for what `SETTINGS` says. A job that was accepted and does not end as succeeded
 counts as lost; one whose result was told of twice, or lies on the disk twice, as published twice; one whose PLY is not
 byte for byte that of `sgsst stylize` with the same seed as different. A job on two ranks adds in another order: its
-colours are compared with one rank's instead.
+colors are compared with one rank's instead.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ def sha256(run: Run, job_id: str) -> str:
 
 
 def distance(run: Run, job_id: str, one_rank: Path) -> float:
-    """Of a two-rank job's colours from one rank's, relative to how far these have moved."""
+    """Of a two-rank job's colors from one rank's, relative to how far these have moved."""
     path = run.service.data / "two.ply"
     path.write_bytes(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     two, one, before = (read_scene(each).scene.sh_dc for each in (path, one_rank, run.files["scene"]))

@@ -28,7 +28,7 @@ from sgsst_core.errors import SgsstError
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
 
-#: Largest coefficient of a colour: beyond, a job may say that it diverges.
+#: Largest coefficient of a color: beyond, a job may say that it diverges.
 _MOST = 1e3
 
 
@@ -90,7 +90,7 @@ def drawn(number: int) -> Situation:
     # Whether the loss falls is asked where steps are short, and the loss is one that steps are made for.
     tame = settings["learning_rate"] <= 0.01 and 0 < settings["content_weight"] <= 3e3 and min(width, height) >= 16
     tame &= min(style.shape[:2]) >= 16 and float(style.std()) > 0.05 and settings["style_loss"] == "sos"
-    tame &= settings.get("keep_colours") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
+    tame &= settings.get("keep_colors") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
     falls = tame and "scales" not in settings
     weights = even_network() if number % 2 else None  # even numbers: the original network's sizes of features
     return Situation(scene, style, settings, views(width, height), falls=falls, weights=weights)
@@ -119,17 +119,17 @@ def _scene(rng: random.Random) -> Scene:
         changes["means"] = scene.means[:1].expand(count, 3).clone()
     elif rng.random() < 0.2:
         changes["means"] = scene.means * torch.tensor([_size(rng, 1e-3, 10), _size(rng, 1e-3, 10), 1.0])
-    changes["sh_dc"] = _colours(rng, scene.sh_dc)
+    changes["sh_dc"] = _colors(rng, scene.sh_dc)
     if scene.sh_degree:
         changes["sh_rest"] = held(scene.sh_rest) * _size(rng, 1e-6, _MOST)
     return replace(scene, **changes)
 
 
-def _colours(rng: random.Random, sh_dc: Tensor) -> Tensor:
-    kind = rng.choice(["as they are", "as they are", "one", "grey", "black", "bright", "large"])
+def _colors(rng: random.Random, sh_dc: Tensor) -> Tensor:
+    kind = rng.choice(["as they are", "as they are", "one", "gray", "black", "bright", "large"])
     if kind == "one":
         return sh_dc[:1].expand(len(sh_dc), 3).clone()
-    if kind == "grey":
+    if kind == "gray":
         return sh_dc[:, :1].expand(-1, 3).clone()
     if kind in ("black", "bright"):
         return torch.full_like(sh_dc, rng.uniform(1.7, 4) * (-1 if kind == "black" else 1))
@@ -162,7 +162,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
         "seed": rng.randrange(1 << 20),
     }
     chances: dict[str, list[Any]] = {
-        "keep_colours": ["match", "luminance", "luminance"],
+        "keep_colors": ["match", "luminance", "luminance"],
         "sh_fade": [0.5, 0.999, 1.0],
         "scales": [(1.0,), (0.0, 1.0), (1.0, 1e-6), (1e12, 3.0)],
         "style_scale": [0.25, 0.6, 2.0, 4.0],

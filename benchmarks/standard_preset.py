@@ -73,9 +73,9 @@ def _stored(name: str) -> dict[str, Any]:
 
 
 def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
-    """Loss on all views at the marks of the schedule, relative to that of the scene's own colours [n, 3].
+    """Loss on all views at the marks of the schedule, relative to that of the scene's own colors [n, 3].
 
-    (Not to that of the first step's: `standard` begins with the style's colours.)
+    (Not to that of the first step's: `standard` begins with the style's colors.)
     """
     views = stylizer.views.covered
     start = stylizer.evaluate(views, own[stylizer.plan.seen])

@@ -1,8 +1,8 @@
-"""What lies behind an object scan, and what its colours begin with: a table of ways, judged by another network.
+"""What lies behind an object scan, and what its colors begin with: a table of ways, judged by another network.
 
 python -m benchmarks.surround SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
 
-A way is a surround (background, random, palette), with "+warm" from the style's distribution of colours. All of them
+A way is a surround (background, random, palette), with "+warm" from the style's distribution of colors. All of them
 have the same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`) on
 views between those. Rows are added to the file benchmarks/results/surround.json, under NAME; the figures of more seeds
 are means.
@@ -52,14 +52,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=80)
     parser.add_argument("--up", default="0,-1,0")
     parser.add_argument("--settings", default="{}", help="JSON, on top of the standard preset's")
-    parser.add_argument("--out", type=Path, help="folder for a sheet of pictures and the colours")
+    parser.add_argument("--out", type=Path, help="folder for a sheet of pictures and the colors")
     arguments = parser.parse_args()
     scene, style = read_scene(arguments.scene).scene, load_image(arguments.style)
     up = [float(part) for part in arguments.up.split(",")]
     ring = orbit(scene, 2 * arguments.views, width=arguments.width, height=arguments.height, up=up)
     judge = _judge(scene, style, ring[1::2])
     ways = {"unstylized": _row(judge, scene.sh_dc)}
-    colours = {"unstylized": scene.sh_dc}
+    colors = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
     _print("unstylized", ways["unstylized"])
     base = {"precision": "bfloat16", "steps_coarse": 0, "steps_sos": arguments.steps, "early_stop": False}
@@ -67,13 +67,13 @@ def main() -> None:
         found = []
         for seed in arguments.seeds.split(","):
             settings = base | _settings(way) | {"seed": int(seed)} | json.loads(arguments.settings)
-            colours[way], row = _run(judge, scene, ring[::2], style, settings)
+            colors[way], row = _run(judge, scene, ring[::2], style, settings)
             found.append(row)
         ways[way] = {name: sum(row[name] for row in found) / len(found) for name in found[0]} | {"seeds": len(found)}
         _print(way, ways[way])
         _store(arguments, ways)
     if arguments.out:
-        _keep(arguments.out, arguments.name, judge, style, colours)
+        _keep(arguments.out, arguments.name, judge, style, colors)
 
 
 def _settings(way: str) -> dict[str, Any]:
@@ -88,15 +88,15 @@ def _judge(scene: Scene, style: torch.Tensor, between: list[Camera]) -> Judge:
 
 
 def _row(judge: Judge, sh_dc: torch.Tensor) -> dict[str, float]:
-    judgement = judge.judge(sh_dc)
-    assert judgement is not None, "no view can be judged: give larger ones"
-    return asdict(judgement)
+    judgment = judge.judge(sh_dc)
+    assert judgment is not None, "no view can be judged: give larger ones"
+    return asdict(judgment)
 
 
 def _run(
     judge: Judge, scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
 ) -> tuple[torch.Tensor, dict[str, float]]:
-    """Colours [N, 3], and what is said of them: loss on the background, relative to the start; processor seconds."""
+    """Colors [N, 3], and what is said of them: loss on the background, relative to the start; processor seconds."""
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     start = mean_loss(stylizer.start())
     before = time.process_time()
@@ -123,16 +123,16 @@ def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> 
     write_result("surround", {"pairs": pairs})
 
 
-def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colours: dict[str, torch.Tensor]) -> None:
-    """A sheet with a row for each way: views on black, and the first one on white. And the colours."""
+def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
+    """A sheet with a row for each way: views on black, and the first one on white. And the colors."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = judge.cameras[:SHOWN]
     rows = []
-    for way, sh_dc in colours.items():
+    for way, sh_dc in colors.items():
         pictures = [judge.pictures(sh_dc, camera) for camera in cameras]
         rows.append((way, [*(pair[0] for pair in pictures), pictures[0][1]]))
     write_rows(folder / f"{name}.jpg", style, rows)
-    torch.save(colours, folder / f"{name}.pt")
+    torch.save(colors, folder / f"{name}.pt")
 
 
 if __name__ == "__main__":

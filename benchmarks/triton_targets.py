@@ -53,9 +53,7 @@ _CUTS = {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_M
 _BLOCK = kernels.PROJECTED.value
 #: Types of the arguments that are no constants, as `sgsst_core.rasterizer.triton` passes them.
 _TYPES = {
-    **dict.fromkeys(
-        ("means", "quats", "scales", "logits", "colours", "background", "image", "transmittances"), "*fp32"
-    ),
+    **dict.fromkeys(("means", "quats", "scales", "logits", "colors", "background", "image", "transmittances"), "*fp32"),
     **dict.fromkeys(("image_gradient", "out"), "*fp32"),
     **dict.fromkeys(("camera", "values", "depths"), "*fp64"),
     **dict.fromkeys(("counts", "tiles", "ranks", "slots"), "*i32"),
@@ -63,7 +61,7 @@ _TYPES = {
     **dict.fromkeys(("masks", "slot_pieces", "block_pieces", "slot_starts", "block_starts"), "*i32"),
     **dict.fromkeys(("piece_gaussians", "piece_slots"), "*i32"),
     **dict.fromkeys(("weights", "shift", "firsts", "seconds", "matrix", "mean", "own_mean", "offset"), "*fp32"),
-    **dict.fromkeys(("count", "centred", "target_gram", "target_mean", "target_std", "terms"), "*fp64"),
+    **dict.fromkeys(("count", "centered", "target_gram", "target_mean", "target_std", "terms"), "*fp64"),
     **dict.fromkeys(("positions", "row_step", "column_step", "weight_row_step", "weight_column_step", "spans"), "i32"),
     **dict.fromkeys(("out_row_step", "out_column_step"), "i32"),
     **dict.fromkeys(("total", "visible", "width", "first_row", "last_row", "across"), "i32"),
@@ -159,11 +157,11 @@ KERNELS: dict[str, Target] = {
     **_of_features("float32", _PIXELS, "pixels"),
     **_of_statistics(_WIDEST),
     **_of_statistics(_PIXELS, "_pixels"),
-    "rest_colours": Target(
-        harmonics_kernels.rest_colours,
+    "rest_colors": Target(
+        harmonics_kernels.rest_colors,
         {"DEGREE": 3, "COEFFICIENTS": 15, "BLOCK": harmonics_kernels.BLOCK.value},
         4,
-        {"sh_rest": "*fp32", "centre": "*fp64"},
+        {"sh_rest": "*fp32", "center": "*fp64"},
     ),
 }
 

@@ -25,7 +25,7 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 QUALITIES = (85, 75, 65, 55, 45, 35, 25)
 _LINE = 2  # pixels
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=8, help="cameras of a file")
     parser.add_argument("--resolution", type=int, default=480)
     parser.add_argument("--milliseconds", type=int, default=80, help="of a frame")
-    parser.add_argument("--background", type=float, default=1.0, help="grey behind the Gaussians, 0 to 1")
+    parser.add_argument("--background", type=float, default=1.0, help="gray behind the Gaussians, 0 to 1")
     parser.add_argument("--bytes", type=int, default=2_000_000)
     arguments = parser.parse_args()
     scene, stylized = read_scene(arguments.scene).scene, read_scene(arguments.stylized).scene
@@ -58,13 +58,13 @@ def main() -> None:
     arguments.out.write_bytes(_smallest(frames, arguments.milliseconds, arguments.bytes))
 
 
-def _painter(scene: Scene, grey: float) -> Callable[[Camera], torch.Tensor]:
+def _painter(scene: Scene, gray: float) -> Callable[[Camera], torch.Tensor]:
     """Renders views [H, W, 3] of a scene, in 8 bits."""
-    rasterizer = make_rasterizer("cpu", scene, background=(grey,) * 3)
+    rasterizer = make_rasterizer("cpu", scene, background=(gray,) * 3)
 
     def picture(camera: Camera) -> torch.Tensor:
-        rest = rest_colours(scene.sh_rest, scene.means, camera)
-        return (rasterizer.render(view_colours(scene.sh_dc, rest), camera).clamp(0, 1) * 255).round().to(torch.uint8)
+        rest = rest_colors(scene.sh_rest, scene.means, camera)
+        return (rasterizer.render(view_colors(scene.sh_dc, rest), camera).clamp(0, 1) * 255).round().to(torch.uint8)
 
     return picture
 

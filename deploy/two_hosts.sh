@@ -93,6 +93,6 @@ report = json.load(open(sys.argv[1]))
 ranks, megabytes = report["workers"]["ranks"], int(sys.argv[2]) / 1e6
 print("ranks:", ", ".join(f"{rank['host']} ({rank['device']}, {rank['threads']} threads)" for rank in ranks))
 print(f"sent by host-b over the bridge: {megabytes:.1f} MB in {len(report['history'])} steps")
-# A view of 160 x 120 pixels with its gradient, statistics and colours is more than a megabyte a step.
+# A view of 160 x 120 pixels with its gradient, statistics and colors is more than a megabyte a step.
 sys.exit({rank["host"] for rank in ranks} != {"host-a", "host-b"} or megabytes < len(report["history"]))
 PYTHON

@@ -49,5 +49,5 @@ def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest
         False,
         parameters.settings(),
         _regions(staged, parameters),
-        colours=True,
+        colors=True,
     )

@@ -17,7 +17,7 @@ V = TypeVar("V")
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
 #: Of all memory of a GPU, which a job has to itself.
 GPU_SHARE = 0.7
-#: Of the memory limit: activations of one iteration, view targets and colours, and the rasterizer's lists or weights.
+#: Of the memory limit: activations of one iteration, view targets and colors, and the rasterizer's lists or weights.
 MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 #: One part in so many of the memory limit, of the views' share, is left to raster lists where blend weights are kept:
 #: views whose weights do not fit are rendered from these.

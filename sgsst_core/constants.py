@@ -33,18 +33,18 @@ SH_C3 = (
     -math.sqrt(17.5 / math.pi) / 4,
 )
 
-#: Files store colours around mid-grey, so that coefficients of zero are grey.
-COLOUR_OFFSET = 0.5
+#: Files store colors around mid-gray, so that coefficients of zero are gray.
+COLOR_OFFSET = 0.5
 
 #: Variance in square pixels added to both axes of a projected Gaussian: the pixel's own width, without which a Gaussian
-#: smaller than a pixel falls between the pixel centres.
+#: smaller than a pixel falls between the pixel centers.
 EPS2D = 0.3
 
 #: A Gaussian never hides everything behind it, so that transmittance stays above zero. gsplat 1.6 and the original use
 #: 0.99; gsplat 1.5.3, the version on the package index, uses 0.999.
 ALPHA_MAX = 0.99
 
-#: Below one grey level of an 8-bit image a contribution is skipped. This also gives a Gaussian a finite support.
+#: Below one gray level of an 8-bit image a contribution is skipped. This also gives a Gaussian a finite support.
 ALPHA_MIN = 1.0 / 255.0
 
 #: A pixel is finished when its transmittance would fall to this, which is 1e-4: two opaque Gaussians. Written as they
@@ -54,11 +54,11 @@ TRANSMITTANCE_MIN = (1.0 - ALPHA_MAX) ** 2
 #: Nearest depth that is drawn, in world units: what the original viewers use. gsplat trains with 0.01.
 NEAR = 0.2
 
-#: Where the linearised perspective is evaluated: at most this share of the half field of view outside the image, beyond
-#: which the linearisation of a far-off Gaussian would smear it over the picture.
+#: Where the linearized perspective is evaluated: at most this share of the half field of view outside the image, beyond
+#: which the linearization of a far-off Gaussian would smear it over the picture.
 FRUSTUM_MARGIN = 0.3
 
-#: Edge of a raster tile in pixels. 16 neighbouring pixels of a row fill one 512-bit or two 256-bit vectors.
+#: Edge of a raster tile in pixels. 16 neighboring pixels of a row fill one 512-bit or two 256-bit vectors.
 RASTER_TILE = 16
 
 #: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST). Where full views are no

@@ -81,13 +81,13 @@ class RanksFailedError(SgsstError):
 
 
 class RanksDriftedError(SgsstError):
-    """Ranks that must have the same colours have not: a machine computes wrongly, or not like the others."""
+    """Ranks that must have the same colors have not: a machine computes wrongly, or not like the others."""
 
     code = "ranks-drifted"
 
 
 class DivergedError(SgsstError):
-    """Colours or gradients have left the range in which the optimiser works."""
+    """Colors or gradients have left the range in which the optimizer works."""
 
     code = "diverged"
 

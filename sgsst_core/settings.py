@@ -26,9 +26,9 @@ Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
 KeptWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
-KeptColours = Literal["no", "match", "luminance"]
+KeptColors = Literal["no", "match", "luminance"]
 StyleLossName = Literal["sos", "nnfm", "mixed"]
-#: What lies behind the Gaussians in a step: `Settings.background`, a uniform colour, or one of the style's pixels.
+#: What lies behind the Gaussians in a step: `Settings.background`, a uniform color, or one of the style's pixels.
 PlannedSurround = Literal["background", "random", "palette"]
 Surround = Literal["auto", "background", "random", "palette"]
 #: What can be left out without changing the result, for `Settings.keep`.
@@ -102,7 +102,7 @@ class Settings(BaseModel):
     steps_sos: Annotated[int, Option(unit="steps", metavar="N")] = Field(
         ge=0, le=_MAX_STEPS, description="Steps of phase 2, on all scales."
     )
-    learning_rate: Annotated[float, Option(unit="of a colour, a step", metavar="R")] = Field(
+    learning_rate: Annotated[float, Option(unit="of a color, a step", metavar="R")] = Field(
         gt=0, le=100, allow_inf_nan=False, description="Adam's learning rate; constant where it is given."
     )
     learning_rate_end: Annotated[float, Option(unit="as learning_rate", instead="learning_rate")] = Field(
@@ -123,7 +123,7 @@ class Settings(BaseModel):
     feature_scale: FeatureScale = Field(
         "even",
         description="How much each layer of the network counts; paper: as in the paper's network; even: Gram "
-        "matrix, mean and deviation count about alike, the first layer more, and the pixels' own colours too.",
+        "matrix, mean and deviation count about alike, the first layer more, and the pixels' own colors too.",
     )
     style_loss: StyleLossName = Field(
         "sos",
@@ -141,11 +141,11 @@ class Settings(BaseModel):
     )
     max_resolution: Resolution = None
     background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
-        (0.0, 0.0, 0.0), description="Colour behind the Gaussians."
+        (0.0, 0.0, 0.0), description="Color behind the Gaussians."
     )
     surround: Surround = Field(
         "auto",
-        description="What is behind the Gaussians in a step: the background, a random colour each time, or that of a "
+        description="What is behind the Gaussians in a step: the background, a random color each time, or that of a "
         "random pixel of the style; auto: by how much of the views is uncovered.",
     )
     near: Near = NEAR
@@ -155,14 +155,14 @@ class Settings(BaseModel):
     style_rotation: Annotated[float, Option(unit="degrees", metavar="D")] = Field(
         0.0, ge=-360, le=360, description="Turn the style image by D degrees, against the clock."
     )
-    keep_colours: KeptColours = Field(
+    keep_colors: KeptColors = Field(
         "no",
-        description="match: the style image takes the scene's colours first, so that only its strokes are taken; "
-        "luminance: colours change in luminance alone.",
+        description="match: the style image takes the scene's colors first, so that only its strokes are taken; "
+        "luminance: colors change in luminance alone.",
     )
     sh_fade: Annotated[Share, Option(unit="share", metavar="S")] = Field(
         0.0,
-        description="Fade colours that depend on the direction of view by S, in the result too: 0 leaves spherical "
+        description="Fade colors that depend on the direction of view by S, in the result too: 0 leaves spherical "
         "harmonics as they are, 1 leaves none above degree 0.",
     )
     scales: Annotated[
@@ -189,8 +189,8 @@ class Settings(BaseModel):
     memory_limit: Annotated[int | None, Option(unit="bytes", default="40 % of all, at most")] = Field(
         None, gt=0, le=2**50, description="Bytes of memory to plan with."
     )
-    unseen: Literal["neighbours", "keep"] = Field(
-        "neighbours", description="Colours of Gaussians that no view sees: their neighbours' change, or kept."
+    unseen: Literal["neighbors", "keep"] = Field(
+        "neighbors", description="Colors of Gaussians that no view sees: their neighbors' change, or kept."
     )
     coarsest_side: Annotated[int, Option(unit="pixels", metavar="N")] = Field(
         COARSEST_SHORTER_SIDE,
@@ -199,13 +199,13 @@ class Settings(BaseModel):
         description="Shorter side of the coarsest scale in pixels, at most; the method's is 511.",
     )
     warm_start: Annotated[bool | None, Option(flags="--warm-start/--cold-start", default="on")] = Field(
-        None, description="Begin with colours that are distributed as the style's; by luminance alone, for scans only."
+        None, description="Begin with colors that are distributed as the style's; by luminance alone, for scans only."
     )
     revive: bool = Field(
-        False, description="Let colours that fell below black come back, by gradients that would raise them."
+        False, description="Let colors that fell below black come back, by gradients that would raise them."
     )
     bounded: bool = Field(
-        False, description="Keep colours within 0 to 1, which is what screens show, by bringing them back each step."
+        False, description="Keep colors within 0 to 1, which is what screens show, by bringing them back each step."
     )
     early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales has stopped falling.")
     target_loss: Annotated[
@@ -252,8 +252,8 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
-#: colours below 0 on their way and therefore need `revive` (docs/performance.md, "The standard preset"), and begin with
-#: the style's colours, which steps alone reach slowly (docs/quality.md, "What colours begin with"). Phase 1 pays on
+#: colors below 0 on their way and therefore need `revive` (docs/performance.md, "The standard preset"), and begin with
+#: the style's colors, which steps alone reach slowly (docs/quality.md, "What colors begin with"). Phase 1 pays on
 #: large views, and has given what it can after some 80 steps (docs/performance.md, "At the photos' own size").
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {

@@ -1,4 +1,4 @@
-"""Scenes, cameras and files so small that a step of the optimiser takes a few hundredths of a second."""
+"""Scenes, cameras and files so small that a step of the optimizer takes a few hundredths of a second."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def write_files(folder: Path, scene: Scene | None = None, views: list[Camera] | 
             "img_name": camera.name,
             "width": camera.width,
             "height": camera.height,
-            "position": camera.centre.tolist(),
+            "position": camera.center.tolist(),
             "rotation": camera.world_to_camera[:3, :3].T.tolist(),
             "fx": camera.fx,
             "fy": camera.fy,

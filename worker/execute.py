@@ -11,7 +11,7 @@ import torch
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
-from sgsst_core.files.colours import write_colours
+from sgsst_core.files.colors import write_colors
 from sgsst_core.files.json_files import write_json
 from sgsst_core.files.ply import write_packed, write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
@@ -174,7 +174,7 @@ def _write_ply(job: Job) -> None:
     write_stylized(job.scene_file, job.outputs.ply, stylizer.stylized(), sh_fade=stylizer.settings.sh_fade)
 
 
-def _only_colours_change(job: Job) -> bool:
+def _only_colors_change(job: Job) -> bool:
     """Whether the result has the rows of the scene's file, each with all that it had but for f_dc."""
     file, fade = job.scene_file, job.stylizer.settings.sh_fade
     return file.kept is None and file.copies is None and not (fade and file.scene.sh_degree)
@@ -197,8 +197,8 @@ def _write_reports(
     """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
-        if job.request.colours and _only_colours_change(job):
-            write_colours(outputs.colours, stylizer.stylized())
+        if job.request.colors and _only_colors_change(job):
+            write_colors(outputs.colors, stylizer.stylized())
         near, looked = stylizer.settings.near, stylizer.plan.survey
         findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near, looked=looked)
         report = build_report(stylizer, job.sources, stopped, before, after, findings)

@@ -19,7 +19,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
-from sgsst_core.loss.mixture import StyleMixture, normalised
+from sgsst_core.loss.mixture import StyleMixture, normalized
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -123,7 +123,7 @@ def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
         ImageError: one cannot be used.
         SettingsError: there are too many, or weights that are no shares.
     """
-    weights = normalised([file.weight for file in files])  # before anything is read
+    weights = normalized([file.weight for file in files])  # before anything is read
     names = tuple(file.path.name for file in files)
     return StyleMixture(tuple(load_image(file.path) for file in files), weights, names)
 
@@ -187,7 +187,7 @@ def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> N
 
 
 def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
-    """Prove that a Gaussian's centre lies in a view, and only where none does, render.
+    """Prove that a Gaussian's center lies in a view, and only where none does, render.
 
     Raises:
         CameraError: no camera sees a Gaussian.

@@ -19,9 +19,9 @@ _SIDE = 960
 
 
 class Previews:
-    """Writes the first evaluation view with its present colours now and then; for `loop.Callbacks.preview`.
+    """Writes the first evaluation view with its present colors now and then; for `loop.Callbacks.preview`.
 
-    Before the first step there is one, too, with the colours of a warm start: it shows in seconds where the
+    Before the first step there is one, too, with the colors of a warm start: it shows in seconds where the
     job goes.
 
     Args:
@@ -61,9 +61,9 @@ class Previews:
             camera = resized(camera, _SIDE)
         path = self._folder / f"step_{stylizer.step:07d}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
-        colours = stylizer.shown() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
+        colors = stylizer.shown() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
         with torch.no_grad():
             # The rasterizer's own render: other ranks take no part in it.
-            image = views.rasterizer.render(views.colours(index, colours), camera)
+            image = views.rasterizer.render(views.colors(index, colors), camera)
         save_jpg(path, image)
         return path

@@ -46,7 +46,7 @@ class StylizeRequest:
         resume: go on from the checkpoint beside `out`.
         settings: everything else.
         regions: of the scene, that have a style of their own or are kept; from `region_requests`.
-        colours: write the stylized colours alone, too, where nothing else of the scene changes.
+        colors: write the stylized colors alone, too, where nothing else of the scene changes.
     """
 
     source: SceneRequest
@@ -57,7 +57,7 @@ class StylizeRequest:
     resume: bool
     settings: Settings
     regions: tuple[RegionRequest, ...] = ()
-    colours: bool = False
+    colors: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,9 @@ class Outputs:
         return self._beside(".loss.png")
 
     @property
-    def colours(self) -> Path:
-        """The stylized colours alone."""
-        return self._beside(".colours.f16")
+    def colors(self) -> Path:
+        """The stylized colors alone."""
+        return self._beside(".colors.f16")
 
     @property
     def checkpoint(self) -> Path:
@@ -138,7 +138,7 @@ class Outputs:
     def all(self) -> list[Path]:
         """Every file, but for the older checkpoint, which is never written itself."""
         found = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
-        found.append(self.colours)
+        found.append(self.colors)
         return found if self.packed is None else [*found, self.packed]
 
     @property

@@ -38,7 +38,7 @@ class VariantsRequest:
         style: style image.
         out: folder for table, plot, JSON and scenes.
         variants: names; none for all.
-        seconds: of optimisation, for each variant.
+        seconds: of optimization, for each variant.
         backbone: "auto", "vgg19" or "vgg16".
         settings: on top of the standard preset, for all variants.
     """
@@ -149,7 +149,7 @@ def quality_table(quality: Quality) -> Table:
     )
     front = quality.front()
     for outcome in quality.outcomes:
-        one = outcome.judgement
+        one = outcome.judgment
         table.add_row(
             outcome.name + (" *" if outcome in front else ""),
             f"{one.style:.3f}",

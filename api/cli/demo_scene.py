@@ -5,7 +5,7 @@ datasets with subpixel-accurate ground truth", GCPR 2014). Every pixel of the le
 covers just that pixel as seen from the left camera; what only the right camera sees is added from the right photo, and
 a thin margin behind depth edges is invented, so that the views between and around the two have no cracks.
 
-World: metres, the left camera's axes (x right, y down, z forward), the origin at the left camera.
+World: meters, the left camera's axes (x right, y down, z forward), the origin at the left camera.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage import data
 
-from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
 from sgsst_core.files.ply import write_scene
 from sgsst_core.paintings import STARRY_NIGHT
@@ -34,7 +34,7 @@ Mask = NDArray[np.bool_]
 #: Calibration at the photos' size (741x500), as scikit-image's `stereo_motorcycle` documents it: Middlebury's
 #: (focal 3979.911 px, doffs 124.343 px at 2964x2000, baseline 193.001 mm) divided by 4.
 FOCAL = 994.978
-CENTRE_X, CENTRE_Y = 311.193, 254.877
+CENTER_X, CENTER_Y = 311.193, 254.877
 BASELINE = 0.193001
 #: Difference of the two principal points' x: depth = FOCAL * BASELINE / (disparity + DISPARITY_OFFSET).
 DISPARITY_OFFSET = 31.086
@@ -56,19 +56,19 @@ EDGE_STEP = 3.0
 EDGE_WINDOW = (13, 49)
 #: Pixels beside an edge that may be part of the foreground though the disparity is unknown there.
 RIM = 3.0
-#: Difference of colour (0..1) between the two photos beyond which a guessed disparity is dropped.
-WRONG_COLOUR = 0.2
-#: Four pixels whose colours differ by less (0..1) and whose disparities lie on a plane within FLAT_STEP share one
+#: Difference of color (0..1) between the two photos beyond which a guessed disparity is dropped.
+WRONG_COLOR = 0.2
+#: Four pixels whose colors differ by less (0..1) and whose disparities lie on a plane within FLAT_STEP share one
 #: Gaussian: a third fewer of them for no visible difference.
-FLAT_COLOUR = 0.08
+FLAT_COLOR = 0.08
 FLAT_STEP = 0.3
 
-#: Views of the camera path: an ellipse through the neighbourhood of both cameras, looking at the motorcycle.
+#: Views of the camera path: an ellipse through the neighborhood of both cameras, looking at the motorcycle.
 VIEWS = 10
 VIEW_WIDTH, VIEW_HEIGHT = 720, 480
 #: Focal length of the views; a little longer than the photos', so that the rim of the photos stays outside.
 VIEW_FOCAL = 1.14 * FOCAL
-PATH_RADIUS = (0.12, 0.035, 0.05)  # metres along x, y, z
+PATH_RADIUS = (0.12, 0.035, 0.05)  # meters along x, y, z
 LOOK_AT = (0.13, 0.0, 2.7)
 
 
@@ -88,14 +88,14 @@ class DemoScene:
 
 
 class Samples(NamedTuple):
-    """Pixels to be lifted: position, disparity, its gradient, colour 0..1, and size in pixels; [n] or [n, 3]."""
+    """Pixels to be lifted: position, disparity, its gradient, color 0..1, and size in pixels; [n] or [n, 3]."""
 
     x: Array
     y: Array
     disparity: Array
     slope_x: Array
     slope_y: Array
-    colour: Array
+    color: Array
     size: Array
 
 
@@ -122,11 +122,11 @@ def lift_pair() -> Scene:
     known = np.isfinite(measured)
     disparity, behind_left = _fill(measured.astype(np.float64), known, left)
 
-    # A guessed disparity that would show on the right with another colour than is there was a bad guess.
+    # A guessed disparity that would show on the right with another color than is there was a bad guess.
     moved, _ = _move_to_right(disparity)
     rows, columns, inside = _in_other_photo(disparity, -1)
     shows = inside & (disparity > moved[rows, columns] - EDGE_STEP)
-    wrong = ~known & shows & (np.abs(left - right[rows, columns]).max(axis=2) > WRONG_COLOUR)
+    wrong = ~known & shows & (np.abs(left - right[rows, columns]).max(axis=2) > WRONG_COLOR)
 
     moved, seen = _move_to_right(np.where(wrong, np.inf, disparity))
     filled, behind_right = _fill(moved, seen, right)
@@ -136,9 +136,9 @@ def lift_pair() -> Scene:
     invented_right = behind_right.mask & _hidden(behind_right.disparity, disparity, 1)
     parts = [
         _gaussians(_samples(disparity, left, ~wrong), 0.0),
-        _gaussians(_samples(behind_left.disparity, behind_left.colour, invented_left), 0.0),
+        _gaussians(_samples(behind_left.disparity, behind_left.color, invented_left), 0.0),
         _gaussians(_samples(filled, right, only_right), BASELINE),
-        _gaussians(_samples(behind_right.disparity, behind_right.colour, invented_right), BASELINE),
+        _gaussians(_samples(behind_right.disparity, behind_right.color, invented_right), BASELINE),
     ]
     means, quats, scales, sh_dc = (np.concatenate(columns).astype(np.float32) for columns in zip(*parts, strict=True))
     return Scene(
@@ -152,11 +152,11 @@ def lift_pair() -> Scene:
 
 
 class _Behind(NamedTuple):
-    """The surface behind depth edges: where it is invented, its disparity and colour."""
+    """The surface behind depth edges: where it is invented, its disparity and color."""
 
     mask: Mask
     disparity: Array
-    colour: Array
+    color: Array
 
 
 def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
@@ -170,15 +170,15 @@ def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
     rows, columns = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
     nearest = disparity[rows, columns]
     distance, (near_rows, near_columns) = ndimage.distance_transform_edt(~known, return_indices=True)
-    # Beside an edge an unknown pixel may still be foreground: its colour tells.
+    # Beside an edge an unknown pixel may still be foreground: its color tells.
     unlike_known = np.abs(photo - photo[near_rows, near_columns]).sum(axis=2)
     unlike_source = np.abs(photo - photo[rows, columns]).sum(axis=2)
     front = (distance <= RIM) & (unlike_known < unlike_source)
     filled = np.where(known | front, disparity[near_rows, near_columns], nearest)
     mask = known & ~source & (nearest < disparity - EDGE_STEP)
-    # Copies of the nearest pixel make streaks; invented colours are better blurred.
-    colour = ndimage.gaussian_filter(photo[rows, columns], (3, 3, 0))
-    return filled, _Behind(mask, nearest, colour)
+    # Copies of the nearest pixel make streaks; invented colors are better blurred.
+    color = ndimage.gaussian_filter(photo[rows, columns], (3, 3, 0))
+    return filled, _Behind(mask, nearest, color)
 
 
 def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
@@ -221,7 +221,7 @@ def _samples(disparity: Array, photo: Array, chosen: Mask) -> Samples:
     off = blocks - mean
     plane = off[..., 0] * mean[..., 3] + off[..., 1] * mean[..., 4]
     alike = (np.abs(off[..., 2] - plane) < FLAT_STEP).all(axis=(1, 3))
-    alike &= (np.ptp(blocks[..., 5:], axis=(1, 3)) < FLAT_COLOUR).all(axis=-1)
+    alike &= (np.ptp(blocks[..., 5:], axis=(1, 3)) < FLAT_COLOR).all(axis=-1)
     alike &= chosen[:height, :width].reshape(height // 2, 2, width // 2, 2).all(axis=(1, 3))
     single = chosen.copy()
     single[:height, :width] &= ~alike.repeat(2, axis=0).repeat(2, axis=1)
@@ -250,9 +250,9 @@ def _gaussians(samples: Samples, camera_x: float) -> tuple[Array, Array, Array, 
     """
     shifted = samples.disparity + DISPARITY_OFFSET
     depth = FOCAL * BASELINE / shifted
-    centre_x = CENTRE_X + (DISPARITY_OFFSET if camera_x > 0 else 0.0)
-    ray = np.stack([(samples.x - centre_x) / FOCAL, (samples.y - CENTRE_Y) / FOCAL, np.ones_like(depth)], axis=1)
-    centre = depth[:, None] * ray + [camera_x, 0.0, 0.0]
+    center_x = CENTER_X + (DISPARITY_OFFSET if camera_x > 0 else 0.0)
+    ray = np.stack([(samples.x - center_x) / FOCAL, (samples.y - CENTER_Y) / FOCAL, np.ones_like(depth)], axis=1)
+    center = depth[:, None] * ray + [camera_x, 0.0, 0.0]
 
     tangents = np.zeros((len(depth), 3, 2))
     tangents[:, 0, 0] = tangents[:, 1, 1] = depth / FOCAL
@@ -267,7 +267,7 @@ def _gaussians(samples: Samples, camera_x: float) -> tuple[Array, Array, Array, 
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
 
     quats = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]  # w first
-    return centre, quats, np.log(radii), (samples.colour - COLOUR_OFFSET) / SH_C0
+    return center, quats, np.log(radii), (samples.color - COLOR_OFFSET) / SH_C0
 
 
 def camera_path() -> list[dict[str, object]]:

@@ -388,7 +388,7 @@ def demo(
 
 #: Of the options of a job, those that `bench` gives all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
-BenchSeconds = Annotated[float, typer.Option(min=1, help="Of optimisation, for each variant.")]
+BenchSeconds = Annotated[float, typer.Option(min=1, help="Of optimization, for each variant.")]
 
 
 @bench_app.command("error-time")
@@ -428,7 +428,7 @@ def bench_quality(
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Run variants of a job for the same time each, and judge results by a network that none of them optimises."""
+    """Run variants of a job for the same time each, and judge results by a network that none of them optimizes."""
     from api.cli.bench import point_line, quality_table, run_quality
 
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)

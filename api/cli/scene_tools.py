@@ -23,7 +23,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_cameras
 from worker.request import SceneRequest, StylizeRequest, check_choice, check_folder
@@ -117,8 +117,8 @@ def render_views(
     ensure_writable_folder(out)
     paths = [out / name for name in view_file_names(cameras)]
     for index, (camera, path) in enumerate(zip(cameras, paths, strict=True)):
-        colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
-        save_png(path, rasterizer.render(colours, camera))
+        colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+        save_png(path, rasterizer.render(colors, camera))
         progress(index + 1, len(cameras))
     return paths
 

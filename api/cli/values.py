@@ -13,7 +13,7 @@ from sgsst_core.settings import STRENGTHS
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
 _STRENGTHS = "(" + ", ".join(f"{word} {weight:g}" for word, weight in STRENGTHS.items()) + ")."
-_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Form:
     hint: str
 
 
-def parse_colour(text: str) -> tuple[float, float, float]:
+def parse_color(text: str) -> tuple[float, float, float]:
     """RGB in 0..1 from "black", "white" or three numbers 0 to 255: "40,40,48"."""
-    if text.lower() in _COLOURS:
-        return _COLOURS[text.lower()]
+    if text.lower() in _COLORS:
+        return _COLORS[text.lower()]
     try:
         red, green, blue = (float(part) / 255 for part in text.split(","))
     except ValueError:
@@ -73,7 +73,7 @@ def parse_weights(text: str) -> tuple[float, ...]:
 
 #: Units whose values are written in another way than in JSON.
 FORMS = {
-    "RGB, 0 to 1": Form(parse_colour, "COLOUR", ": black, white, or R,G,B from 0 to 255."),
+    "RGB, 0 to 1": Form(parse_color, "COLOR", ": black, white, or R,G,B from 0 to 255."),
     "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),
     "weights of scales": Form(parse_weights, "W,W,...", ": 1,0,0.5 for the first and the third."),
     "bytes": Form(parse_bytes, "SIZE", ", such as 8GB."),

@@ -29,7 +29,7 @@ def main() -> None:
     settings = ServiceSettings()
     set_up(settings.log_format)
     # as a socket, of which the family is known: uvicorn takes a bare descriptor for a Unix socket's and leaves Nagle's
-    # algorithm on, by which every answer waits 40 ms for the client's acknowledgement of its head
+    # algorithm on, by which every answer waits 40 ms for the client's acknowledgment of its head
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None
     Connection.head_seconds = settings.receive_seconds
     Connection.most = settings.max_connections

@@ -96,19 +96,19 @@ function checked(camera) {
 /**
  * About the ring that the service chooses for `orbit`: it knows the subject better.
  *
- * @param {{centre: Vector, radius: number, low: Vector, high: Vector}} middle
+ * @param {{center: Vector, radius: number, low: Vector, high: Vector}} middle
  * @param {{count: number, up: Vector, elevation: number, radius?: number}} ring elevation in degrees
  * @returns {JobCamera[]}
  */
 export function ringCameras(middle, { count, up, elevation, radius }) {
-  const centre = middle.low.map((low, i) => (low + middle.high[i]) / 2), half = Math.hypot(...difference(middle.high, centre));
+  const center = middle.low.map((low, i) => (low + middle.high[i]) / 2), half = Math.hypot(...difference(middle.high, center));
   const distance = radius ?? 3.1 * half, slant = (elevation * Math.PI) / 180, axis = unit(up);
   const aside = unit(cross(axis, Math.abs(axis[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1])), front = cross(aside, axis);
   return Array.from({ length: count }, (_, i) => {
     const turn = (2 * Math.PI * i) / count;
     const level = sum(times(aside, Math.sin(turn)), times(front, -Math.cos(turn)));
     const out = sum(times(level, Math.cos(slant)), times(axis, Math.sin(slant)));
-    const position = sum(centre, times(out, distance)), forward = times(out, -1), right = unit(cross(forward, axis));
+    const position = sum(center, times(out, distance)), forward = times(out, -1), right = unit(cross(forward, axis));
     return { name: `${i + 1}`, position, axes: [right, cross(forward, right), forward], fx: 1.5, fy: 1.5, width: 1, height: 1 };
   });
 }
@@ -143,11 +143,11 @@ export function cameraLines(cameras, size) {
  * How large frames are drawn that stand about a scene.
  *
  * @param {JobCamera[]} cameras
- * @param {{centre: Vector, radius: number} | null} middle
+ * @param {{center: Vector, radius: number} | null} middle
  */
 export function frameSize(cameras, middle) {
   if (!cameras.length) return 1;
-  const away = cameras.map(({ position }) => Math.hypot(...difference(position, middle?.centre ?? [0, 0, 0]))).sort((a, b) => a - b);
+  const away = cameras.map(({ position }) => Math.hypot(...difference(position, middle?.center ?? [0, 0, 0]))).sort((a, b) => a - b);
   return 0.08 * (away[away.length >> 1] || 1);
 }
 

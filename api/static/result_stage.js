@@ -1,5 +1,5 @@
 // @ts-check
-/** Runs of one scene in 3D: the original and each run's colours, two of them on the sides of the wipe. */
+/** Runs of one scene in 3D: the original and each run's colors, two of them on the sides of the wipe. */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
@@ -70,12 +70,12 @@ export class ResultStage {
     const { viewer } = this.stage;
     if (!viewer || this.signal.aborted) return;
     const scene = viewer.open(new URL(`/v1/jobs/${job.id}/inputs/scene`, location.href).href);
-    this.stage.show({ scene, colours: "own" });
+    this.stage.show({ scene, colors: "own" });
     try {
       await scene.headerRead;
       scene.ready.then(() => this.standFirst(), (error) => this.tell(error));
       this.original = scene;
-      this.choices.set("original", { name: say.original, side: { scene, colours: "own" } });
+      this.choices.set("original", { name: say.original, side: { scene, colors: "own" } });
     } catch {
       scene.end(); // a form that cannot be shown: what came out of it is shown alone
       viewer.sides = null;
@@ -95,17 +95,17 @@ export class ResultStage {
     const fade = job.parameters.sh_fade ?? 0;
     if (this.original && sceneOf(job) === sceneOf(this.jobs[0])) {
       try {
-        const answer = await ask("GET", artifactPath(job.id, "colours.f16"), { signal: this.signal });
-        await this.original.addColours(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
-        this.choices.set(job.id, { name, side: { scene: this.original, colours: job.id, fade } });
+        const answer = await ask("GET", artifactPath(job.id, "colors.f16"), { signal: this.signal });
+        await this.original.addColors(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
+        this.choices.set(job.id, { name, side: { scene: this.original, colors: job.id, fade } });
         return;
       } catch (error) {
         if (!(error instanceof Problem) || error.status !== 404) throw error;
       }
     }
     const scene = viewer.open(new URL(artifactPath(job.id, "stylized.ply"), location.href).href);
-    this.choices.set(job.id, { name, side: { scene, colours: "own" } });
-    if (!this.original) this.stage.show({ scene, colours: "own" });
+    this.choices.set(job.id, { name, side: { scene, colors: "own" } });
+    if (!this.original) this.stage.show({ scene, colors: "own" });
     await scene.headerRead;
   }
 

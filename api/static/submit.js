@@ -219,7 +219,7 @@ export class SubmitView {
     }
     const scene = (this.opened = viewer.open(file));
     viewer.onReload = () => this.sceneChanged();
-    this.stage.show({ scene, colours: "own" });
+    this.stage.show({ scene, colors: "own" });
     try {
       const header = await scene.headerRead;
       this.slots.scene.say(`${file.name} · ${words.scene.header(header)}`);

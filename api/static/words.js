@@ -49,7 +49,7 @@ export const words = {
     cut: "The file ends too early.",
     unreadable: "The scene could not be read.",
     notThere: "The scene could not be fetched.",
-    otherColours: "These colours are of another scene.",
+    otherColors: "These colors are of another scene.",
     tooMany: (/** @type {number} */ n) => `${count(n)} Gaussians are more than this device can show.`,
     header: (/** @type {{count: number, degree: number, size: number}} */ found) => `${several(found.count, "Gaussian")} · SH degree ${found.degree} · ${size(found.size)}`,
     loading: (/** @type {number} */ done, /** @type {number} */ all) => `${count(done)} of ${count(all)} Gaussians`,

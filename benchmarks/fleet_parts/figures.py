@@ -26,7 +26,7 @@ def figures(fleet: Fleet, seconds: float, warm_up: float) -> dict[str, Any]:
         "jobs": len(records),
         "ended": len(ended),
         "offered_load": round(sum(r.job.seconds(1) + r.job.start_seconds() for r in records) / (gpus * seconds), 3),
-        "utilisation": round(held / (gpus * (seconds - warm_up)), 3),
+        "utilization": round(held / (gpus * (seconds - warm_up)), 3),
         "of_steps_worth_on_one_gpu": round(worth / max(stepping, 1e-9), 3),
         "host_failures": fleet.failures,
         "lost_gpu_hours": round(sum(record.lost for record in records) / 3600, 2),

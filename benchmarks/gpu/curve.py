@@ -25,10 +25,10 @@ from sgsst_core.stylizing.stylizer import Stylizer
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 #: Largest difference from the CPU's loss, as a share of it. Means over rounds of all views are compared, because Adam
-#: moves colours with gradients of rounding's size as far as any others, and single losses scatter by as much.
+#: moves colors with gradients of rounding's size as far as any others, and single losses scatter by as much.
 BOUND = 1e-3
 VIEWS = 6
-#: The paper's. At 0.02, losses of runs whose colours begin 3e-7 apart come to differ by a percent.
+#: The paper's. At 0.02, losses of runs whose colors begin 3e-7 apart come to differ by a percent.
 LEARNING_RATE = 2.5e-3
 
 

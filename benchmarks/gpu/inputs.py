@@ -14,7 +14,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 
-#: Standard deviation of a Gaussian over the distance to its neighbours: some thirty reach each point, as in scans.
+#: Standard deviation of a Gaussian over the distance to its neighbors: some thirty reach each point, as in scans.
 _OVERLAP = 1.0
 _CHANNELS = (64, 128, 256, 512, 512)
 
@@ -39,11 +39,11 @@ def surface_scene(count: int, degree: int = 0, seed: int = 0) -> Scene:
 
 def views(count: int, width: int, height: int) -> list[Camera]:
     """Cameras around the ball, which fills most of the height."""
-    up, centre = torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3)
+    up, center = torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3)
     angles = torch.arange(count) * (2 * math.pi / max(count, 1))
     return [
         look_at(
-            f"view_{index}", torch.stack([3 * angle.sin(), torch.zeros(()), -3 * angle.cos()]), centre, up,
+            f"view_{index}", torch.stack([3 * angle.sin(), torch.zeros(()), -3 * angle.cos()]), center, up,
             width=width, height=height, focal=1.3 * height,
         )
         for index, angle in enumerate(angles)

@@ -1,4 +1,4 @@
-"""Every rasterizer that works here against `reference` in float64: image, coverage, colour gradient."""
+"""Every rasterizer that works here against `reference` in float64: image, coverage, color gradient."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 #: Relative distance from a cut-off within which float32 may decide otherwise, and bounds of images and gradients.
 #: gsplat projects in float32 and takes exponentials with the fast intrinsic.
@@ -46,15 +46,15 @@ def compare(
     alpha_max = getattr(fast, "alpha_max", None)
     options = {} if alpha_max is None else {"alpha_max": alpha_max}
     reference = ReferenceRasterizer(scene, background=BACKGROUND, **options)
-    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, camera))
+    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
     pixels = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     band = reference.near_cutoff(camera, close)
     pixels[band] = 0
-    image = _off(fast.render(colours, camera), reference.render(colours, camera)).amax(-1)
+    image = _off(fast.render(colors, camera), reference.render(colors, camera)).amax(-1)
     coverage = _off(fast.coverage(camera), reference.coverage(camera))
-    expected = reference.colour_gradient(pixels, camera)
-    gradient = float(_off(fast.colour_gradient(pixels, camera), expected).norm() / expected.norm())
-    brightest = max(1.0, float(colours.max()))
+    expected = reference.color_gradient(pixels, camera)
+    gradient = float(_off(fast.color_gradient(pixels, camera), expected).norm() / expected.norm())
+    brightest = max(1.0, float(colors.max()))
     found.check(f"{fast.name}/image", float(image[~band].max()) / brightest, image_bound)
     found.check(f"{fast.name}/coverage", float(coverage[~band].max()), image_bound)
     found.check(f"{fast.name}/gradient", gradient, gradient_bound)

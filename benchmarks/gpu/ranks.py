@@ -25,12 +25,12 @@ from worker.ranks.process_group import ProcessGroupCollectives
 RANKS, STEPS = 2, 3
 #: Of the first step's gradient, in the Euclidean norm. Near-ties of max pooling may fall the other way.
 GRADIENT_BOUND = 1e-4
-#: Of the colours' change, likewise: Adam moves colours with gradients of rounding's size as far as any others.
-COLOURS_BOUND = 1e-2
+#: Of the colors' change, likewise: Adam moves colors with gradients of rounding's size as far as any others.
+COLORS_BOUND = 1e-2
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Compare the gradient of the first step, and the colours after a few."""
+    """Compare the gradient of the first step, and the colors after a few."""
     expected_gradient, expected = follow(ALONE, sizes)
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -39,15 +39,15 @@ def run(sizes: Sizes, found: Findings) -> None:
         multiprocessing.spawn(run_rank, (address, folder, sizes), nprocs=RANKS)  # type: ignore[attr-defined]
         results = [torch.load(Path(folder) / f"{rank}.pt") for rank in range(RANKS)]
     start = surface_scene(sizes.gaussians[0], degree=3).sh_dc
-    gradient, colours = results[0]
+    gradient, colors = results[0]
     found.add("ranks", RANKS)
-    found.check("ranks_that_differ", float(sum(not torch.equal(own[1], colours) for own in results)), 0.0)
+    found.check("ranks_that_differ", float(sum(not torch.equal(own[1], colors) for own in results)), 0.0)
     found.check("gradient", _error(gradient, expected_gradient, torch.zeros(())), GRADIENT_BOUND)
-    found.check("colours", _error(colours, expected, start), COLOURS_BOUND)
+    found.check("colors", _error(colors, expected, start), COLORS_BOUND)
 
 
 def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
-    """Gradient of a view before the first step, and colours [N, 3] after all of them."""
+    """Gradient of a view before the first step, and colors [N, 3] after all of them."""
     quick = sizes == QUICK
     settings = make_settings(
         "standard", steps_coarse=0, steps_sos=STEPS, early_stop=False, keep=("ranks", "unseen"), rebalance=False,

@@ -13,7 +13,7 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import kernel_rest_colours
+from sgsst_core.scene.spherical_harmonics import kernel_rest_colors
 from sgsst_core.scene.stored_harmonics import held
 
 DEGREE = 3
@@ -49,24 +49,24 @@ def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: 
 
 
 def _passes(rasterizer: Rasterizer, camera: Camera, place: str, repeats: int, found: Findings) -> None:
-    colours, pixels = _operands(rasterizer, camera)
-    found.add(f"{place}/forward_seconds", seconds(lambda: rasterizer.render(colours, camera), device(), repeats))
-    backward = seconds(lambda: rasterizer.colour_gradient(pixels, camera), device(), repeats)
+    colors, pixels = _operands(rasterizer, camera)
+    found.add(f"{place}/forward_seconds", seconds(lambda: rasterizer.render(colors, camera), device(), repeats))
+    backward = seconds(lambda: rasterizer.color_gradient(pixels, camera), device(), repeats)
     found.add(f"{place}/backward_seconds", backward)
 
 
 def _operands(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(2)
     scene: Scene = rasterizer.scene  # type: ignore[attr-defined]  # all of them have one
-    colours = torch.rand((len(scene), 3), generator=generator)
+    colors = torch.rand((len(scene), 3), generator=generator)
     pixels = torch.randn((camera.height, camera.width, 3), generator=generator)
-    return colours.to(rasterizer.device), pixels.to(rasterizer.device)
+    return colors.to(rasterizer.device), pixels.to(rasterizer.device)
 
 
 def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
     """Of the kernel, which a GPU takes; in the interpreter it is asked for by name."""
     sh_rest, means = held(scene.sh_rest).to(device()), scene.means.to(device())
-    taken = seconds(lambda: kernel_rest_colours(sh_rest, means, camera, DEGREE), device(), repeats)
+    taken = seconds(lambda: kernel_rest_colors(sh_rest, means, camera, DEGREE), device(), repeats)
     found.add(f"{place}/seconds", taken)
     found.add(f"{place}/gigabytes_per_second", (sh_rest.nbytes + 2 * means.nbytes) / taken / 1e9)
 
@@ -75,8 +75,8 @@ def _kept(scene: Scene, camera: Camera, place: str, repeats: int, found: Finding
     """Computing and keeping a view's weights, and both passes with them."""
     forget_peak(device())
     rasterizer = make_rasterizer("cached", scene, device=device())
-    colours, _ = _operands(rasterizer, camera)
-    first = waited_seconds(lambda: rasterizer.render(colours, camera), device())
+    colors, _ = _operands(rasterizer, camera)
+    first = waited_seconds(lambda: rasterizer.render(colors, camera), device())
     found.add(f"{place}/first_render_seconds", first)
     found.add(f"{place}/bytes", rasterizer.kept_bytes)  # type: ignore[attr-defined]  # `cached` counts them
     _passes(rasterizer, camera, place, repeats, found)

@@ -59,7 +59,7 @@ class JobSize:
         return self.steps_coarse * coarse + self.steps_sos * ((raster + network) / gpus + beside)
 
     def _talking(self, gpus: int) -> float:
-        """Seconds of a step in which GPUs wait for each other: the image there and its gradient back, the colours'
+        """Seconds of a step in which GPUs wait for each other: the image there and its gradient back, the colors'
         gradient, statistics.
         """
         if gpus == 1:

@@ -21,7 +21,7 @@ _RESULTS = {
     "report.html": f"{_STEM}.report.html",
     "before_after.jpg": f"{_STEM}.before_after.jpg",
     "loss.png": f"{_STEM}.loss.png",
-    "colours.f16": f"{_STEM}.colours.f16",
+    "colors.f16": f"{_STEM}.colors.f16",
 }
 #: Names of files that become visible with the job's end, and not before.
 RESULTS = frozenset((RESULT, *_RESULTS))

@@ -25,7 +25,7 @@ from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 #: plans (`sgsst_core.budget`), so that it rounds the same beside another one.
 _MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
 #: What a job needs at least beside its scene, and how often the bytes of the scene: as it was read, as it is
-#: rendered, and twice for what the views and the optimiser keep of each Gaussian. A job of 4 million Gaussians (1 GB)
+#: rendered, and twice for what the views and the optimizer keep of each Gaussian. A job of 4 million Gaussians (1 GB)
 #: had 5.8 GB at its peak, one of 50,000 had 0.95 GB.
 _LEAST_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4

@@ -1,7 +1,7 @@
 """Error against run time: variants of one job with the same time budget, judged by one exact loss.
 
-Every variant gets the same seconds of optimisation. At the same moments its colours are evaluated on all views by the
-float32 loss of all scales (`exact.ExactTwin`), which is the paper's, whatever a variant itself optimises; evaluation
+Every variant gets the same seconds of optimization. At the same moments its colors are evaluated on all views by the
+float32 loss of all scales (`exact.ExactTwin`), which is the paper's, whatever a variant itself optimizes; evaluation
 does not count. Nor does preparing the views, once for each, which in a short budget would hide the rest; its seconds
 are stated. All variants are in memory at once. What lies on the Pareto front reaches its error sooner than anything
 else does.
@@ -27,7 +27,7 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.exact import ExactTwin
 from sgsst_core.report.charts import RELATIVE_LOSS, STYLE, draw_legend, draw_points, scale_name, set_log_x, set_log_y
 from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
-from sgsst_core.report.palette import INK, colour_of
+from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings, make_settings
@@ -96,19 +96,19 @@ VARIANTS = {
         Variant("coarse-only", "the coarsest scale alone", _coarse_only),
         Variant("one-scale", "the paper's loss at full size alone", _full_size_only),
         Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
-        Variant("cold-start", "standard, from the scene's own colours", settings={"warm_start": False}),
+        Variant("cold-start", "standard, from the scene's own colors", settings={"warm_start": False}),
         Variant(
             "fixed-surround", "standard, with the background behind every step", settings={"surround": "background"}
         ),
-        Variant("random-surround", "standard, with a random colour behind each step", settings={"surround": "random"}),
-        Variant("no-revive", "standard; colours that fall below 0 stay there", settings={"revive": False}),
+        Variant("random-surround", "standard, with a random color behind each step", settings={"surround": "random"}),
+        Variant("no-revive", "standard; colors that fall below 0 stay there", settings={"revive": False}),
         Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
         Variant("tf32", "standard with TF32 convolutions", settings={"precision": "tf32"}),
         Variant("half-weights", "standard with blend weights in half precision", settings={"kept_weights": "half"}),
         Variant("no-kept-weights", "standard, blend weights computed anew", settings={"kept_weights": "none"}),
         Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
-        Variant("nnfm", "standard with ARF's nearest-neighbour style loss", settings={"style_loss": "nnfm"}),
-        Variant("mixed", "standard with nearest neighbours beside the statistics", settings={"style_loss": "mixed"}),
+        Variant("nnfm", "standard with ARF's nearest-neighbor style loss", settings={"style_loss": "nnfm"}),
+        Variant("mixed", "standard with nearest neighbors beside the statistics", settings={"style_loss": "mixed"}),
         Variant("pruned", "standard without hardly visible Gaussians", settings={"prune_weight": PRUNE_WEIGHT}),
     )
 }
@@ -116,7 +116,7 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Point:
-    """A variant's colours at one moment; losses are relative to the unstylized scene's."""
+    """A variant's colors at one moment; losses are relative to the unstylized scene's."""
 
     seconds: float
     step: int
@@ -183,7 +183,7 @@ def error_time(
     """Run variants on one scene, each for so many seconds.
 
     Args:
-        seconds: of optimisation, for each variant.
+        seconds: of optimization, for each variant.
         progress: called after each evaluation.
         settings: for all variants, on top of the standard preset.
     """
@@ -238,7 +238,7 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         stylizer.views.target(index, scales, stylizer.behind(index))
         for phase in phases:
             stylizer.keep_weights(index, phase.scales(chosen))
-        stylizer.views.render(index, stylizer.views.colours(index, stylizer.sh_dc.detach()))
+        stylizer.views.render(index, stylizer.views.colors(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 
 
@@ -286,7 +286,7 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
     }
 
 
-#: As many as have no divisor in common with the number of colours: the pairs of both last for 42 variants.
+#: As many as have no divisor in common with the number of colors: the pairs of both last for 42 variants.
 _MARKERS = "osD^vP*"
 
 
@@ -321,8 +321,8 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floa
         for curve in curves
     ]
     for place, curve in enumerate(curves):
-        look = {"marker": _MARKERS[place % len(_MARKERS)], "color": colour_of(place), "label": curve.variant.name}
+        look = {"marker": _MARKERS[place % len(_MARKERS)], "color": color_of(place), "label": curve.variant.name}
         draw_points(axes, seconds[place], losses[place], markersize=4, linewidth=1, **look)
-    set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimisation")
+    set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimization")
     axes.set_title("mean of the scales" if scale is None else scale_name(scale))
     return joined(losses)

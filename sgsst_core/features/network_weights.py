@@ -43,7 +43,7 @@ class BackboneWeights:
         convolutions: layer name ("conv1_1") to weight [out, in, 3, 3] and bias [out], float32, in network order.
         input_scale, input_shift: [3] float32; the network's input is rgb (0..1) * input_scale + input_shift.
         scales: layer ("relu1_1") to the factor by which its features have been made larger; empty as installed.
-        grey: the network is shown the luminance of pictures alone (`scene.luminance.grey`).
+        gray: the network is shown the luminance of pictures alone (`scene.luminance.gray`).
     """
 
     name: str
@@ -53,7 +53,7 @@ class BackboneWeights:
     input_scale: Tensor  # [3]
     input_shift: Tensor  # [3]
     scales: dict[str, float] = field(default_factory=dict)
-    grey: bool = False
+    gray: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def load_perceptual(name: str = "alex", folder: Path | None = None) -> dict[str,
         name: "alex": "conv1.weight" [64, 3, 11, 11] .. "conv5.bias", "input_scale", "input_shift" (as for
             `BackboneWeights`) and the heads "linear1.weight" [64] .. "linear5.weight" [256];
             "vgg16": the heads alone; the features are `load_network_weights("vgg16")`'s, whose factor kappa
-            falls out when LPIPS normalises them to unit length.
+            falls out when LPIPS normalizes them to unit length.
 
     Raises:
         WeightsError: as `load_network_weights`.

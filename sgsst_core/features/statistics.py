@@ -1,9 +1,9 @@
 """Weighted second-order statistics of features, merged over partition tiles.
 
-A layer's features F [n, c] are summarised by (count, mean, C) with C = sum_p a_p (F_p - mean)(F_p - mean)^T.
+A layer's features F [n, c] are summarized by (count, mean, C) with C = sum_p a_p (F_p - mean)(F_p - mean)^T.
 Gram matrix and standard deviation both follow from it: G = C / n + mean mean^T, sigma = sqrt(diag(C) / n).
 The reverse, sigma^2 = diag(G) - mean^2, cancels: at a mean-to-sigma ratio of a few thousand no digit is left in
-float32 and the root is taken of a negative number. Features are centred before they are multiplied (in their own
+float32 and the root is taken of a negative number. Features are centered before they are multiplied (in their own
 precision, block by block) and everything is merged in float64 by the pairwise update of Chan, Golub and LeVeque,
 "Updating Formulae and a Pairwise Algorithm for Computing Sample Variances" (1979).
 """
@@ -17,7 +17,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-#: Values of a block: what is centred stays in a processor's cache until it has been multiplied.
+#: Values of a block: what is centered stays in a processor's cache until it has been multiplied.
 BLOCK_VALUES = 1 << 18
 #: Positions that are summed in the features' precision before float64 takes over: a float32 sum over so few keeps six
 #: digits whatever the size of the tile.
@@ -32,17 +32,17 @@ _FAR = 8.0
 
 @dataclass(frozen=True)
 class LayerStatistics:
-    """Count, mean and centred second moment of one layer, float64.
+    """Count, mean and centered second moment of one layer, float64.
 
     Attributes:
         count: scalar tensor, number of positions or sum of their weights.
         mean: [c].
-        centred: [c, c], sum of a_p (F_p - mean)(F_p - mean)^T.
+        centered: [c, c], sum of a_p (F_p - mean)(F_p - mean)^T.
     """
 
     count: Tensor  # []
     mean: Tensor  # [c]
-    centred: Tensor  # [c, c]
+    centered: Tensor  # [c, c]
 
     @staticmethod
     def zero(channels: int, device: torch.device | str = "cpu") -> LayerStatistics:
@@ -65,12 +65,12 @@ class LayerStatistics:
 
     def gram(self) -> Tensor:
         """G = F^T F / n, [c, c]; zeros where there is no position."""
-        return self.centred / self.divisor + torch.outer(self.mean, self.mean)
+        return self.centered / self.divisor + torch.outer(self.mean, self.mean)
 
     def std(self) -> Tensor:
         """Population standard deviation, [c]; zeros where there is no position."""
         # Rounding of the merge may leave -1e-30 where the exact value is 0.
-        return (self.centred.diagonal().clamp_min(0) / self.divisor).sqrt()
+        return (self.centered.diagonal().clamp_min(0) / self.divisor).sqrt()
 
 
 def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
@@ -83,8 +83,8 @@ def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
     share = second.count / torch.where(count > 0, count, 1.0)
     delta = second.mean - first.mean
     mean = first.mean + delta * share
-    centred = first.centred + second.centred + torch.outer(delta, delta) * (first.count * share)
-    return LayerStatistics(count, mean, centred)
+    centered = first.centered + second.centered + torch.outer(delta, delta) * (first.count * share)
+    return LayerStatistics(count, mean, centered)
 
 
 def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
@@ -95,8 +95,8 @@ def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
 def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """Statistics of features [h, w, c], with optional position weights [h, w] >= 0.
 
-    Products run in the features' precision (float32 for half-precision features) on centred blocks; sums over spans of
-    blocks are kept in float64. Blocks are centred at the mean of some positions. Should it turn out to lie far from
+    Products run in the features' precision (float32 for half-precision features) on centered blocks; sums over spans of
+    blocks are kept in float64. Blocks are centered at the mean of some positions. Should it turn out to lie far from
     that of all of them, which on a GPU would be waited for, they are gone through again with the right one.
     """
     height, width, channels = features.shape
@@ -147,7 +147,7 @@ def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
 
 
 def _is_far(shift: Tensor, found: LayerStatistics) -> bool:
-    """Whether digits cancelled as the shift was taken out of sums about it. Waits for the device."""
+    """Whether digits canceled as the shift was taken out of sums about it. Waits for the device."""
     offset = (found.mean - shift).abs()
     rounding = torch.finfo(shift.dtype).eps * shift.abs()
     return bool(((offset > _FAR * found.std()) & (offset > _FAR * rounding)).any())
@@ -158,13 +158,13 @@ def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor 
     channels = features.shape[-1]
     total = _ShiftedSums(channels, shift)
     for rows, block in blocks_of(features):
-        centred = centre(features[rows], shift, block).reshape(-1, channels)
+        centered = center(features[rows], shift, block).reshape(-1, channels)
         weights = None if position_weights is None else position_weights[rows].reshape(-1).to(shift.dtype)
-        total.add(centred, weights)
+        total.add(centered, weights)
     return total.statistics()
 
 
-def centre(features: Tensor, mean: Tensor, out: Tensor) -> Tensor:
+def center(features: Tensor, mean: Tensor, out: Tensor) -> Tensor:
     """Features [n, w, c] less a mean [c], in the precision of `out` [n, w, c], which is returned."""
     if features.dtype == out.dtype:
         return torch.sub(features, mean, out=out)
@@ -187,29 +187,29 @@ class _ShiftedSums:
         self._strip = max(32, channels // 8) if shift.device.type == "cpu" else channels
         self._positions = 0
 
-    def add(self, centred: Tensor, position_weights: Tensor | None) -> None:
-        """Add positions centred [n, c], which are overwritten, with their weights [n]."""
+    def add(self, centered: Tensor, position_weights: Tensor | None) -> None:
+        """Add positions centered [n, c], which are overwritten, with their weights [n]."""
         if position_weights is None:
-            self.total.count.add_(centred.shape[0])
-            first = centred.sum(dim=0)
+            self.total.count.add_(centered.shape[0])
+            first = centered.sum(dim=0)
         else:
             self.total.count.add_(position_weights.sum(dtype=torch.float64))
             # With the roots of the weights in both factors, the product is symmetric, and half of it is enough.
             roots = position_weights.sqrt()
-            centred *= roots[:, None]
-            first = (centred * roots[:, None]).sum(dim=0)
+            centered *= roots[:, None]
+            first = (centered * roots[:, None]).sum(dim=0)
         # A sum in pairs: a product with a vector may add up one position after the other, and lose two more digits.
         self._first.add_(first)
-        for left in range(0, centred.shape[1], self._strip):
+        for left in range(0, centered.shape[1], self._strip):
             strip = slice(left, left + self._strip)
-            self._second[strip, left:].addmm_(centred[:, strip].T, centred[:, left:])
-        self._positions += len(centred)
+            self._second[strip, left:].addmm_(centered[:, strip].T, centered[:, left:])
+        self._positions += len(centered)
         if self._positions >= SPAN_POSITIONS:
             self._end_span()
 
     def _end_span(self) -> None:
         self.total.mean.add_(self._first)
-        self.total.centred.add_(self._second)
+        self.total.centered.add_(self._second)
         self._first.zero_()
         self._second.zero_()
         self._positions = 0
@@ -221,7 +221,7 @@ class _ShiftedSums:
         some = count > 0
         offset = first / torch.where(some, count, 1.0)
         mean = torch.where(some, self.shift.double() + offset, 0.0)
-        upper = self.total.centred.triu()
+        upper = self.total.centered.triu()
         second = upper + upper.triu(1).T
         return LayerStatistics(count, mean, second - torch.outer(offset, offset) * count)
 
@@ -233,5 +233,5 @@ def layer_statistics_reference(features: Tensor, position_weights: Tensor | None
     a = equal if position_weights is None else position_weights.double().reshape(-1)
     count = a.sum()
     mean = (a[:, None] * flat).sum(0) / count
-    centred = (flat - mean) * a[:, None].sqrt()
-    return LayerStatistics(count, mean, centred.T @ centred)
+    centered = (flat - mean) * a[:, None].sqrt()
+    return LayerStatistics(count, mean, centered.T @ centered)

@@ -21,13 +21,13 @@ from torch import Tensor
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
-from sgsst_core.scene.luminance import grey, grey_gradient
+from sgsst_core.scene.luminance import gray, gray_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
-#: The picture itself as a layer before the first, not the paper's: three channels, a cell for each pixel, its colour
+#: The picture itself as a layer before the first, not the paper's: three channels, a cell for each pixel, its color
 #: times `PIXEL_UNIT`. That is about the units of a 0-255 input, and a power of two: nothing is rounded, so that the
-#: deviation of a picture of nearly one colour is right, where the shift of the input would leave rounding of it.
+#: deviation of a picture of nearly one color is right, where the shift of the input would leave rounding of it.
 PIXELS = "pixels"
 PIXEL_UNIT = 256.0
 #: Layer whose features make up the content loss.
@@ -137,7 +137,7 @@ class FeatureNetwork:
     """VGG up to the deepest layer asked for.
 
     Args:
-        weights: convolutions and input normalisation, in feature units of a 0-255 input.
+        weights: convolutions and input normalization, in feature units of a 0-255 input.
         layers: the layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`); what lies behind the
             deepest of them is left out. One of them at least is a convolution's.
         dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
@@ -175,11 +175,11 @@ class FeatureNetwork:
         self.halo = HALO[weights.name]
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
-        # The normalisation stays in at least float32: in bfloat16, 255 grey levels would lose their last bits twice.
+        # The normalization stays in at least float32: in bfloat16, 255 gray levels would lose their last bits twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
-        self._grey = weights.grey
+        self._gray = weights.gray
         self._steps = self._build(weights)
         self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
@@ -239,7 +239,7 @@ class FeatureNetwork:
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
         rgb = rgb.to(self.device, self._input_dtype)
-        rgb = grey(rgb) if self._grey else rgb
+        rgb = gray(rgb) if self._gray else rgb
         kept = Activations({}, size=(height, width))
         if PIXELS in self.layers:
             kept.features[PIXELS] = rgb * PIXEL_UNIT
@@ -303,7 +303,7 @@ class FeatureNetwork:
             own = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
             feature_gradient(PIXELS, features, own)
             pixels = torch.add(pixels, own, alpha=PIXEL_UNIT)
-        return grey_gradient(pixels) if self._grey else pixels
+        return gray_gradient(pixels) if self._gray else pixels
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
         """Gradient [1, 3, h, w] with respect to what went into the first step; None where no layer has one."""

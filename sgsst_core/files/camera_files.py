@@ -1,6 +1,6 @@
 """Camera files: INRIA `cameras.json`, COLMAP sparse models, nerfstudio and Blender `transforms.json`.
 
-All become `Camera`: pinhole, world to camera, x right, y down, z forward, pixel centres at +0.5 (COLMAP's own
+All become `Camera`: pinhole, world to camera, x right, y down, z forward, pixel centers at +0.5 (COLMAP's own
 convention; the JSON forms share it for the principal point).
 """
 

@@ -1,6 +1,6 @@
 """PlayCanvas' compressed PLY: 16 bytes for a Gaussian, and one for each coefficient of its spherical harmonics.
 
-Positions and logarithms of scales have 11, 10 and 11 bits and colours 8, between bounds that 256 Gaussians share;
+Positions and logarithms of scales have 11, 10 and 11 bits and colors 8, between bounds that 256 Gaussians share;
 opacities have 8 bits, rotations 3 times 10. Bytes of spherical harmonics are between -4 and 4. The layout is that of
 `splat-transform` (https://github.com/playcanvas/splat-transform).
 """
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.files.ply_header import element_offsets
-from sgsst_core.files.quantised import (
+from sgsst_core.files.quantized import (
     OPACITY_LOGITS,
     SH_C0,
     byte_table,
@@ -70,7 +70,7 @@ def read_compressed_ply(path: Path, file: RowFile, header: SceneHeader, into: Ar
 
 
 def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
-    position, rotation, scale, colour = (rows[name].astype(np.uint32) for name in _PACKED)
+    position, rotation, scale, color = (rows[name].astype(np.uint32) for name in _PACKED)
     chunk = np.arange(len(rows)) // CHUNK_ROWS
 
     def between(prefix: str, axes: str, share: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -85,10 +85,10 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
     with np.errstate(over="ignore"):
         into["means"][:] = between("", "xyz", _three(position))
         into["scales"][:] = between("scale_", "xyz", _three(scale))
-        share = np.stack([(colour >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
+        share = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
         shown = between("", "rgb", share) if "min_r" in (chunks.dtype.names or ()) else share
         into["sh_dc"][:] = (shown - 0.5) / SH_C0
-    into["opacities"][:] = OPACITY_LOGITS[colour & 255]
+    into["opacities"][:] = OPACITY_LOGITS[color & 255]
     parts = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
     into["quats"][:] = with_largest(rotation >> 30, (parts - 0.5) * np.sqrt(2))
 
@@ -164,13 +164,13 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         found += [low, high]
         extent = high.astype(np.float64) - low
         shares.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
-    colour = [to_steps(shares[2][:, i], 255) for i in range(3)]
+    color = [to_steps(shares[2][:, i], 255) for i in range(3)]
     packed = np.stack(
         [
             _pack_three(shares[0]),
             _pack_rotations(arrays["quats"]),
             _pack_three(shares[1]),
-            colour[0] << 24 | colour[1] << 16 | colour[2] << 8 | opacity_bytes(arrays["opacities"]).astype(np.uint32),
+            color[0] << 24 | color[1] << 16 | color[2] << 8 | opacity_bytes(arrays["opacities"]).astype(np.uint32),
         ],
         axis=1,
     )

@@ -1,6 +1,6 @@
 """Spherical harmonics that fade as a scene's rows are written again: `f_rest_*` times one factor, in float32.
 
-What is written is what a job has optimised with: `Scene.faded` multiplies the same float32 numbers by the same one.
+What is written is what a job has optimized with: `Scene.faded` multiplies the same float32 numbers by the same one.
 """
 
 from __future__ import annotations

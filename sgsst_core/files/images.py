@@ -31,10 +31,10 @@ _SHOWN = 10
 def load_image(path: Path) -> Tensor:
     """Read any image that Pillow reads; of an animated one the first frame.
 
-    EXIF orientation is applied, transparency composited on white; palettes, grey, 16 bit and CMYK become RGB.
+    EXIF orientation is applied, transparency composited on white; palettes, gray, 16 bit and CMYK become RGB.
 
     Returns:
-        [H, W, 3] float32 in 0..1, sRGB values as stored (no linearisation, no colour profile).
+        [H, W, 3] float32 in 0..1, sRGB values as stored (no linearization, no color profile).
 
     Raises:
         ImageError: missing, not an image, truncated, or more than MAX_PIXELS; the size is checked before decoding.
@@ -142,7 +142,7 @@ def save_png(path: Path, image: Tensor) -> None:
 
 
 def save_jpg(path: Path, image: Tensor) -> None:
-    """Write [H, W, 3] as JPEG of high quality with full colour resolution; otherwise as `save_png`."""
+    """Write [H, W, 3] as JPEG of high quality with full color resolution; otherwise as `save_png`."""
     _save(
         path, image, lambda picture, target: picture.save(target, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
     )
@@ -175,15 +175,15 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
     """[H, W, 3] of a decoded image of any mode."""
-    if image.mode.startswith(("I", "F")):  # more than 8 bits, always grey: Pillow would cut them off at 255
+    if image.mode.startswith(("I", "F")):  # more than 8 bits, always gray: Pillow would cut them off at 255
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)
         if not np.isfinite(values).all():
             raise ImageError(f"{path}: holds NaN or infinite pixels. Give another image.")
-        grey = np.clip(values / np.float32(_full_scale(image.mode, float(values.max()))), 0, 1)
+        gray = np.clip(values / np.float32(_full_scale(image.mode, float(values.max()))), 0, 1)
         key = image.info.get("transparency")
         if isinstance(key, int):
-            grey[values == key] = 1
-        return np.repeat(grey[:, :, None], 3, axis=2)
+            gray[values == key] = 1
+        return np.repeat(gray[:, :, None], 3, axis=2)
     if image.has_transparency_data:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)

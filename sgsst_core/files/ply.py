@@ -1,10 +1,10 @@
-"""3DGS scenes in files: reading them, and writing PLYs back with new colours and nothing else changed.
+"""3DGS scenes in files: reading them, and writing PLYs back with new colors and nothing else changed.
 
 The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
 f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
 They may come in any order and numeric type, among any others.
 
-Packed scenes (`scene_headers`) are read as well; with new colours they become PLYs as trainers write them.
+Packed scenes (`scene_headers`) are read as well; with new colors they become PLYs as trainers write them.
 """
 
 from __future__ import annotations
@@ -289,7 +289,7 @@ def _check_properties(path: Path, header: PlyHeader) -> int:
     for name in _DC:
         if kinds[name][0] != "f":
             raise SceneError(
-                f"{path}: {name} is stored as integers; new colours need float or double. Convert it first."
+                f"{path}: {name} is stored as integers; new colors need float or double. Convert it first."
             )
     rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
     if len(rest) not in _REST_DEGREES:
@@ -490,9 +490,9 @@ def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
 _NewColumns = dict[str, NDArray[np.float32]]
 
 
-def _new_columns(source: SceneFile, colours: Tensor) -> _NewColumns:
-    """What may differ from the file: colours [N, 3], and of a scene that was refined, shapes."""
-    columns = dict(zip(_DC, colours.numpy().T, strict=True))
+def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
+    """What may differ from the file: colors [N, 3], and of a scene that was refined, shapes."""
+    columns = dict(zip(_DC, colors.numpy().T, strict=True))
     if source.copies is not None:
         columns["opacity"] = source.scene.opacities.numpy()
         for names, values in ((_BASE["means"], source.scene.means), (_BASE["scales"], source.scene.scales)):

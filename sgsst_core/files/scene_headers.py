@@ -24,7 +24,7 @@ Form = Literal["ply", "compressed.ply", "spz", "splat"]
 PackedForm = Literal["compressed.ply", "spz"]
 PACKED_FORMS: tuple[PackedForm, ...] = ("compressed.ply", "spz")
 
-#: Coefficients of one colour above degree 0, by the degree of the spherical harmonics.
+#: Coefficients of one color above degree 0, by the degree of the spherical harmonics.
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 #: Gaussians that share the bounds of a compressed PLY.
 CHUNK_ROWS = 256
@@ -68,7 +68,7 @@ class SpzHeader:
     Attributes:
         version: 1 to 4.
         fractional_bits: of the positions' fixed point numbers; version 1 has 16-bit floats instead.
-        sections: bytes of positions, alphas, colours, scales, rotations and spherical harmonics, when decompressed.
+        sections: bytes of positions, alphas, colors, scales, rotations and spherical harmonics, when decompressed.
         streams: of version 4, one for each section that is not empty; the others are one gzip stream.
     """
 
@@ -286,8 +286,8 @@ def _looks_like_splat(head: bytes) -> bool:
 
 
 def splat_rows(data: bytes | np.ndarray) -> np.ndarray:
-    """Records of .splat: position and scale [3] float32, colour with alpha [4] and rotation (wxyz) [4] bytes."""
-    kinds = [("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)]
+    """Records of .splat: position and scale [3] float32, color with alpha [4] and rotation (wxyz) [4] bytes."""
+    kinds = [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
     return np.frombuffer(data, np.dtype(kinds))
 
 
@@ -317,6 +317,6 @@ def _looks_like_ksplat(head: bytes, size: int) -> bool:
     if size < _KSPLAT_HEADER_BYTES or head[0] != 0 or head[1] < 1:
         return False
     sections, filled, _, count, level = struct.unpack_from("<IIIIH", head, 4)
-    centre = struct.unpack_from("<3f", head, 24)
+    center = struct.unpack_from("<3f", head, 24)
     fits = 0 < sections <= (size - _KSPLAT_HEADER_BYTES) // 1024 and filled <= sections and 0 < count <= size
-    return fits and level <= 2 and all(map(math.isfinite, centre))
+    return fits and level <= 2 and all(map(math.isfinite, center))

@@ -1,6 +1,6 @@
 """antimatter15's .splat: 32 bytes for a Gaussian, without spherical harmonics above degree 0.
 
-Position and standard deviations are float32; colour, opacity and rotation (wxyz) have 8 bits each.
+Position and standard deviations are float32; color, opacity and rotation (wxyz) have 8 bits each.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from sgsst_core.files.compressed_ply import Arrays
-from sgsst_core.files.quantised import OPACITY_LOGITS, SH_C0
+from sgsst_core.files.quantized import OPACITY_LOGITS, SH_C0
 from sgsst_core.files.scene_headers import SPLAT_BYTES, SceneHeader, splat_rows
 from sgsst_core.scene.stored_harmonics import RowFile
 
@@ -29,6 +29,6 @@ def read_splat(file: RowFile, header: SceneHeader, into: Arrays) -> None:
         into["means"][part] = rows["position"]
         with np.errstate(divide="ignore", invalid="ignore"):  # found afterwards
             into["scales"][part] = np.log(rows["scale"].astype(np.float64))
-        into["sh_dc"][part] = (rows["colour"][:, :3] / 255 - 0.5) / SH_C0
-        into["opacities"][part] = OPACITY_LOGITS[rows["colour"][:, 3]]
+        into["sh_dc"][part] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
+        into["opacities"][part] = OPACITY_LOGITS[rows["color"][:, 3]]
         into["quats"][part] = (rows["rotation"].astype(np.float64) - 128) / 128

@@ -1,6 +1,6 @@
 """Niantic's SPZ: 16 to 20 bytes for a Gaussian and one for each coefficient of its spherical harmonics, compressed.
 
-Positions are fixed point numbers of 24 bits; logarithms of scales, colours, opacities and spherical harmonics have 8
+Positions are fixed point numbers of 24 bits; logarithms of scales, colors, opacities and spherical harmonics have 8
 bits, rotations 3 times 8 or, from version 3 on, 10. Values lie attribute by attribute, and are unpacked as they come
 out of the stream: what it becomes is never in memory at once. The layout is that of https://github.com/nianticlabs/spz.
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.compressed_ply import Arrays
-from sgsst_core.files.quantised import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
+from sgsst_core.files.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
 from sgsst_core.files.scene_headers import COEFFICIENTS, SceneHeader, SpzSection
 from sgsst_core.scene.stored_harmonics import RowFile
 
@@ -40,8 +40,8 @@ _FLIP_QUATS = np.array([1, 1, -1, -1], np.float32)
 _FLIP_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 _SCALES = byte_table(np.arange(256) / 16 - 10)
-#: Degree 0; a wider range than 0..1 of colours.
-_COLOURS = byte_table((np.arange(256) / 255 - 0.5) / 0.15)
+#: Degree 0; a wider range than 0..1 of colors.
+_COLORS = byte_table((np.arange(256) / 255 - 0.5) / 0.15)
 _HARMONICS = byte_table((np.arange(256) - 128) / 128)
 _FIRST_BYTES = byte_table(np.arange(256) / 127.5 - 1)
 
@@ -65,7 +65,7 @@ def read_spz(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> No
     unpack: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
         (into["means"], _halves if spz.version == 1 else lambda data: _fixed_point(data, spz.fractional_bits)),
         (into["opacities"], lambda data: OPACITY_LOGITS[data]),
-        (into["sh_dc"], lambda data: _COLOURS[data].reshape(-1, 3)),
+        (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
         (into["sh_rest"], lambda data: _unpack_harmonics(data, header.sh_degree)),

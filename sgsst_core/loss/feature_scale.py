@@ -28,10 +28,10 @@ from sgsst_core.settings import FeatureScale, Settings
 
 #: Of every layer but the first, `even`: Gram matrix, mean and standard deviation then count about alike at the start.
 EVEN_SCALE = 8.0
-#: Of the first layer, `even`. It alone knows colours as such, and with the others' factor its share of the loss is less
+#: Of the first layer, `even`. It alone knows colors as such, and with the others' factor its share of the loss is less
 #: than a hundredth: palettes came out better with this one, and styles no worse (docs/quality.md).
-EVEN_COLOUR_SCALE = 16.0
-#: Of the pixels, `even`. Colours that begin as the style's would be given up for strokes: with this factor palettes
+EVEN_COLOR_SCALE = 16.0
+#: Of the pixels, `even`. Colors that begin as the style's would be given up for strokes: with this factor palettes
 #: came out nearer by 3 to 16 levels on six pairs, for up to 0.02 of style (docs/quality.md).
 EVEN_PIXEL_SCALE = 28.0
 #: What the original VGG19 logs in the first iteration of a published run (installation guide of J. Johnson,
@@ -62,19 +62,19 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
 
 
 def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
-    """The network as a job with these settings uses it: at its scale, and shown luminance alone where colours stay."""
+    """The network as a job with these settings uses it: at its scale, and shown luminance alone where colors stay."""
     scaled = at_scale(weights, settings.feature_scale)
-    return replace(scaled, grey=True) if settings.keep_colours == "luminance" else scaled
+    return replace(scaled, gray=True) if settings.keep_colors == "luminance" else scaled
 
 
 def even_scales(weights: BackboneWeights) -> dict[str, float]:
     """Factors of layers, `even`: of features powers of two, so that they change by them and by no rounding."""
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
-    return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOUR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
+    return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
 
 
 def is_original(weights: BackboneWeights) -> bool:
-    """Whether they are those of the original network, which takes colours of 0 to 255 as they are."""
+    """Whether they are those of the original network, which takes colors of 0 to 255 as they are."""
     return bool((weights.input_scale == 255).all())
 
 

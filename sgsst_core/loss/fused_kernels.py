@@ -11,19 +11,19 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.fused_kernels import load_centred, load_weights, places_of
+from sgsst_core.features.fused_kernels import load_centered, load_weights, places_of
 
 
 @triton.jit
 def compare(
-    count, mean, centred, target_gram, target_mean, target_std, terms, matrix, own_mean, offset,
+    count, mean, centered, target_gram, target_mean, target_std, terms, matrix, own_mean, offset,
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """`terms.style_loss`, in float64; ROWS channels a program, and COLUMNS, all channels at least.
 
     Args:
-        count, mean, centred: of the view's statistics.
+        count, mean, centered: of the view's statistics.
         target_gram, target_mean, target_std: of the style.
         terms: [CHANNELS, 5] float64, what each channel adds to each term.
         matrix, own_mean, offset: [CHANNELS, CHANNELS], [CHANNELS], [CHANNELS] float32, of `terms.StyleGradient`.
@@ -39,16 +39,16 @@ def compare(
     share = tl.where(some, 1.0 / divisor, 0.0)
     own, means = tl.load(mean + i, mask=row, other=0.0), tl.load(mean + j, mask=column, other=0.0)
     wanted = tl.load(target_gram + entry, mask=both, other=0.0)
-    gram_error = tl.load(centred + entry, mask=both, other=0.0) / divisor + own[:, None] * means[None, :] - wanted
+    gram_error = tl.load(centered + entry, mask=both, other=0.0) / divisor + own[:, None] * means[None, :] - wanted
     mean_error = own - tl.load(target_mean + i, mask=row, other=0.0)
-    std = tl.sqrt(tl.maximum(tl.load(centred + i * CHANNELS + i, mask=row, other=0.0), 0.0) / divisor)
+    std = tl.sqrt(tl.maximum(tl.load(centered + i * CHANNELS + i, mask=row, other=0.0), 0.0) / divisor)
     std_error = std - tl.load(target_std + i, mask=row, other=0.0)
     slope = tl.where(std > EPS * tl.abs(own), std_error / tl.where(std > 0, std, 1.0), 0.0)
     weight: tl.constexpr = GRAM / (CHANNELS * CHANNELS)
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
-    # Features are centred about the rounded mean: what it leaves out is a part of the offset.
+    # Features are centered about the rounded mean: what it leaves out is a part of the offset.
     drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * share
     tl.store(matrix + entry, (line * share).to(tl.float32), mask=both)
     tl.store(own_mean + i, own.to(tl.float32), mask=row)
@@ -85,10 +85,10 @@ def add_style_gradient(
     k = tl.zeros([], tl.int32)
     while k < CHANNELS:
         channel = k + tl.arange(0, K)
-        centred = load_centred(features, mean, row_step, column_step, width, position, channel, there, CHANNELS)
+        centered = load_centered(features, mean, row_step, column_step, width, position, channel, there, CHANNELS)
         part_of = places_of(channel < CHANNELS, own, CHANNELS)
         part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :], mask=part_of, other=0.0)
-        sums += tl.dot(centred, part, input_precision=PRECISION)
+        sums += tl.dot(centered, part, input_precision=PRECISION)
         k += K
     a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
     sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]

@@ -41,7 +41,7 @@ def fused_style_loss(
     columns = block_of_channels(channels)
     rows = block_of_entries(channels) // columns
     kernels.compare[(-(-channels // rows),)](
-        statistics.count, statistics.mean, statistics.centred, *target, terms, matrix, mean, offset,
+        statistics.count, statistics.mean, statistics.centered, *target, terms, matrix, mean, offset,
         GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
         COLUMNS=columns,
     )  # fmt: skip

@@ -47,7 +47,7 @@ class StyleMixture:
         Raises:
             SettingsError: no pictures, or weights that are no shares.
         """
-        return StyleMixture(tuple(pictures), normalised(weights), tuple(names))
+        return StyleMixture(tuple(pictures), normalized(weights), tuple(names))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> StyleMixture:
         """Every picture changed; itself where none is."""
@@ -66,7 +66,7 @@ class StyleMixture:
         return ", ".join(f"{name} {share:.0%}" for name, share in shares)
 
 
-def normalised(weights: Sequence[float]) -> tuple[float, ...]:
+def normalized(weights: Sequence[float]) -> tuple[float, ...]:
     """Weights of style pictures as shares that add up to 1; that of one picture alone is exactly 1.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Nearest-neighbour feature matching (NNFM), after Zhang et al., "ARF: Artistic Radiance Fields" (ECCV 2022).
+"""Nearest-neighbor feature matching (NNFM), after Zhang et al., "ARF: Artistic Radiance Fields" (ECCV 2022).
 
 E_nearest = w_n / n sum_p a_p (1 - max_k u_p . s_k)
 
@@ -8,7 +8,7 @@ same of the style; a_p: position weights, n: their sum. The gradient takes the n
 dE/dF_p = -(w_n / n) a_p (s_k(p) - cos_p u_p) / |F_p|
 
 A sum over positions: a partition tile needs no other tile, and ranks add up what they find. The search is a product of
-matrices, block by block. As in ARF, features are not centred.
+matrices, block by block. As in ARF, features are not centered.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch import Tensor
 from sgsst_core.features.partition import Rectangle
 
 #: Vectors of a style that are searched at most. There are more in styles of more than 360 x 360 pixels: then they are
-#: thinned, evenly. Neighbouring ones see nearly the same pixels, and with more the search would take longer than the
+#: thinned, evenly. Neighboring ones see nearly the same pixels, and with more the search would take longer than the
 #: passes of the network.
 MOST_VECTORS = 1 << 13
 #: Positions and style vectors that are compared at a time: their similarities stay in a processor's cache, or make a

@@ -2,7 +2,7 @@
 
 Every Gaussian belongs to one region; those that no selection names are the rest. The loss of a view is the sum over its
 regions of the SOS loss with the region's style, where positions weigh as much as the region's Gaussians have of their
-blend weights: blending is linear in the colours, so that these weights are rendered, with 1 as the colour of the
+blend weights: blending is linear in the colors, so that these weights are rendered, with 1 as the color of the
 region's Gaussians and 0 as that of all others. Statistics of one region hold nothing of another, but for what features
 see beyond its border.
 """

@@ -658,7 +658,7 @@ class _ScalePass:
         return torch.cat([nothing[2:], *(nothing[:1] if found is None else found[None] for found in sums)])
 
     def _match(self, tile: PartitionTile, activations: Activations) -> Tensor | None:
-        """Match the cells that a tile owns; their share of the nearest-neighbour term, None where nothing is matched.
+        """Match the cells that a tile owns; their share of the nearest-neighbor term, None where nothing is matched.
 
         What was found is kept for the second pass: a few bytes a cell, and the search takes long.
         """

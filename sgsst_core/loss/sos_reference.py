@@ -32,7 +32,7 @@ class RegionReference:
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
     """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
     rgb = rgb.double()
-    if network_weights.grey:
+    if network_weights.gray:
         rgb = (rgb @ torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64))[..., None].expand(rgb.shape)
     features = {PIXELS: rgb * PIXEL_UNIT}
     x = rgb * network_weights.input_scale.double() + network_weights.input_shift.double()

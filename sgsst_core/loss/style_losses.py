@@ -1,6 +1,6 @@
 """What views are compared with a style by, and which layers of the feature network each of these losses reads.
 
-`sos` is the paper's: Gram matrices, means and standard deviations of `STYLE_LAYERS`. `nnfm` puts the nearest-neighbour
+`sos` is the paper's: Gram matrices, means and standard deviations of `STYLE_LAYERS`. `nnfm` puts the nearest-neighbor
 term (`nearest`) in their place, `mixed` adds it to them. Every scale of the SOS loss has the same terms.
 
 Where weights have a factor for `PIXELS` (`feature_scale`), means and standard deviations of these are compared as well.
@@ -14,13 +14,13 @@ from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS
 from sgsst_core.loss.terms import MEAN_WEIGHT, PAPERS_WEIGHTS, STD_WEIGHT, TermWeights
 from sgsst_core.settings import StyleLossName
 
-#: What brings ImageNet-normalised features, in which ARF's weights are meant, to the units of a 0-255 input.
+#: What brings ImageNet-normalized features, in which ARF's weights are meant, to the units of a 0-255 input.
 _FEATURE_UNITS = 255 * 0.226
-#: w_n: with content_weight 1, nearest neighbours and content are weighted as ARF does it for scenes seen from all sides
-#: (content weight 5e-3 in the units of ImageNet-normalised features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
+#: w_n: with content_weight 1, nearest neighbors and content are weighted as ARF does it for scenes seen from all sides
+#: (content weight 5e-3 in the units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
 NNFM_WEIGHT = _FEATURE_UNITS**2 / 5e-3
 #: w_n beside the statistics, whose gradient falls to a tenth in 20 to 30 steps: with this weight the gradients
-#: of both, with respect to the colours, are as long as each other then. For four pairs of scene and painting that takes
+#: of both, with respect to the colors, are as long as each other then. For four pairs of scene and painting that takes
 #: 1.8e8 to 1.7e9, of which this is the geometric mean: scenes are as different as that, but the same job has the same
 #: loss, whoever runs or resumes it.
 MIXED_WEIGHT = 5e8

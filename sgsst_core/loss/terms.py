@@ -20,17 +20,17 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.fused_statistics import can_be_fused, has_kernels
-from sgsst_core.features.statistics import LayerStatistics, blocks_of, centre
+from sgsst_core.features.statistics import LayerStatistics, blocks_of, center
 from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 
 #: What the loss of a scale is the sum of: names, as files and reports have them, to what people read. The order is that
-#: in which they are added up, shown and given their colours.
+#: in which they are added up, shown and given their colors.
 TERMS = {
     "gram": "Gram matrix",
     "mean": "mean",
     "std": "standard deviation",
     "content": "content",
-    "nearest": "nearest neighbours",
+    "nearest": "nearest neighbors",
 }
 
 #: w_G = GRAM_WEIGHT / c^2: the numerator.
@@ -87,7 +87,7 @@ class LossTerms(Mapping[str, float]):
 
     @property
     def total(self) -> float:
-        """What is minimised: the sum of all terms."""
+        """What is minimized: the sum of all terms."""
         # `sum` would round otherwise from Python 3.12 on, and results would depend on the interpreter.
         return reduce(operator.add, self._values.values())
 
@@ -118,9 +118,9 @@ class LossTerms(Mapping[str, float]):
 
 @dataclass(frozen=True)
 class StyleGradient:
-    """dE/dF of one layer as an affine map of centred features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
+    """dE/dF of one layer as an affine map of centered features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
 
-    The map acts on centred features because at mean-to-sigma ratios of 1e4 the product matrix F and a separate
+    The map acts on centered features because at mean-to-sigma ratios of 1e4 the product matrix F and a separate
     offset would cancel each other down to their last digits in float32. In float64, but float32 where a GPU's kernels
     made it, which is what it is applied in to float32 features anyway.
     """
@@ -137,7 +137,7 @@ class StyleGradient:
         """The same map about the mean as float32 has it, with what that leaves out in the offset.
 
         `add_to` takes the mean away in the features' precision. Where they lie nearer to each other than the rounding
-        of their mean, as pixels of one colour do, that would be most of the result.
+        of their mean, as pixels of one color do, that would be most of the result.
         """
         mean = self.mean.float().double()
         return StyleGradient(self.matrix, mean, self.offset + self.matrix @ (mean - self.mean))
@@ -156,15 +156,15 @@ class StyleGradient:
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
         for rows, block in blocks_of(features):
-            centred, target = centre(features[rows], mean, block).view(-1, len(mean)), gradient[rows]
-            weights = centred.new_ones(1) if position_weights is None else position_weights[rows].reshape(-1)
-            weights = weights.to(precision).expand(len(centred))
+            centered, target = center(features[rows], mean, block).view(-1, len(mean)), gradient[rows]
+            weights = centered.new_ones(1) if position_weights is None else position_weights[rows].reshape(-1)
+            weights = weights.to(precision).expand(len(centered))
             if position_weights is not None:
-                centred *= weights[:, None]
+                centered *= weights[:, None]
             if target.dtype == precision and target.is_contiguous():
-                target.view(centred.shape).addmm_(centred, matrix).addr_(weights, offset)
+                target.view(centered.shape).addmm_(centered, matrix).addr_(weights, offset)
             else:
-                target += torch.addr(centred @ matrix, weights, offset).view(target.shape)
+                target += torch.addr(centered @ matrix, weights, offset).view(target.shape)
 
 
 def style_loss(

@@ -91,7 +91,7 @@ class Collectives(Protocol):
         ...
 
     def split_group(self, groups: int) -> Collectives:
-        """The group of this rank when neighbouring ranks form so many groups of equal size."""
+        """The group of this rank when neighboring ranks form so many groups of equal size."""
         ...
 
 

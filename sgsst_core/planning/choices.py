@@ -23,25 +23,25 @@ from sgsst_core.settings import PlannedSurround, Precision, Settings
 #: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
 LEAST_VISITS = 5
 #: With this share of pixels uncovered, views show an object without background. (Those of a room that was captured from
-#: some places only have holes of a few per cent.)
+#: some places only have holes of a few percent.)
 SCAN_SHARE = 0.2
 #: What is behind such an object in a step, if nothing else was asked for (docs/quality.md).
 SCAN_SURROUND: PlannedSurround = "palette"
 
 
-def optimised_gaussians(looked: Survey, settings: Settings) -> Tensor:
-    """[N] bool, Gaussians whose colours the views decide.
+def optimized_gaussians(looked: Survey, settings: Settings) -> Tensor:
+    """[N] bool, Gaussians whose colors the views decide.
 
     Raises:
         SettingsError: pruning would leave none.
     """
-    optimised = looked.total_blend_weights > settings.prune_weight
-    if not optimised.any():
+    optimized = looked.total_blend_weights > settings.prune_weight
+    if not optimized.any():
         raise SettingsError(
             f"--prune-weight {settings.prune_weight:g} would leave out every Gaussian: the largest total blend weight "
             f"is {float(looked.total_blend_weights.max()):.3g}. Give a smaller one."
         )
-    return optimised
+    return optimized
 
 
 def is_scan(looked: Survey, *, weighted: bool) -> bool:
@@ -50,17 +50,17 @@ def is_scan(looked: Survey, *, weighted: bool) -> bool:
 
 
 def starts_warm(settings: Settings, *, scan: bool) -> bool:
-    """Whether colours begin as the style's: what they have in common, steps reach slowly (docs/quality.md).
+    """Whether colors begin as the style's: what they have in common, steps reach slowly (docs/quality.md).
 
     By luminance alone that is known of scans only, beside which nothing tells how bright they should be.
     """
     if settings.warm_start is None:
-        return scan or settings.keep_colours != "luminance"
+        return scan or settings.keep_colors != "luminance"
     return settings.warm_start
 
 
 def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
-    """Whether a job that begins with the style's colours is given them once more behind the last step.
+    """Whether a job that begins with the style's colors is given them once more behind the last step.
 
     A loss without statistics lets them go in its steps; ARF (Zhang et al. 2022) transfers them a second time, too. With
     statistics it would undo what steps have found (docs/quality.md).
@@ -75,10 +75,10 @@ def surround_of(settings: Settings, *, scan: bool) -> PlannedSurround:
     return settings.surround
 
 
-def rendered_gaussians(optimised: Tensor, settings: Settings) -> Tensor:
-    """[N] bool, Gaussians that are rendered: the optimised ones, or all for comparison."""
+def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
+    """[N] bool, Gaussians that are rendered: the optimized ones, or all for comparison."""
     everything = "unseen" in settings.keep and not settings.prune_weight
-    return torch.ones_like(optimised) if everything else optimised
+    return torch.ones_like(optimized) if everything else optimized
 
 
 def pruned_gaussians(looked: Survey, seen: Tensor) -> Tensor:

@@ -15,15 +15,15 @@ from sgsst_core.parallel.division import Piece, Size
 #: One of the layers whose features are matched with the style's: they have the same cells.
 _MATCHED = "relu3_1"
 
-#: Bytes an optimised Gaussian costs beside the scene: colours, gradient and two moments, float32.
-OPTIMISER_BYTES = 4 * 3 * 4
+#: Bytes an optimized Gaussian costs beside the scene: colors, gradient and two moments, float32.
+OPTIMIZER_BYTES = 4 * 3 * 4
 
-#: And what a step makes anew on the CPU: a view's colours, their gradients and its parts by raster tile.
+#: And what a step makes anew on the CPU: a view's colors, their gradients and its parts by raster tile.
 STEP_BYTES = 4 * 3 * 4
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Of a Gaussian of a scene in float32: position, rotation, scale, opacity and coefficients of three colours."""
+    """Of a Gaussian of a scene in float32: position, rotation, scale, opacity and coefficients of three colors."""
     return 4 * (3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2)
 
 
@@ -52,7 +52,7 @@ class RasterCost:
         keeping_seconds: of making a view's kept weights; None where that was not measured, on the CPU.
         first_seconds: that the first render of a view takes beside later ones: its lists of Gaussians are made then.
         lists_bytes: of a view's lists, mean; 0 where that is not known.
-        colours_seconds: of what spherical harmonics add to the colours of a view.
+        colors_seconds: of what spherical harmonics add to the colors of a view.
     """
 
     seconds: float
@@ -62,7 +62,7 @@ class RasterCost:
     keeping_seconds: float | None = None
     first_seconds: float = 0.0
     lists_bytes: int = 0
-    colours_seconds: float = 0.0
+    colors_seconds: float = 0.0
 
     @property
     def least_visits(self) -> float | None:

@@ -19,7 +19,7 @@ from sgsst_core.planning.choices import (
     GPU_RASTERIZERS,
     LEAST_VISITS,
     is_scan,
-    optimised_gaussians,
+    optimized_gaussians,
     precision_of,
     rendered_gaussians,
     starts_warm,
@@ -43,7 +43,7 @@ from sgsst_core.settings import KeptWeights, Settings
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
 UNCOVERED_SHARE = 0.01
-#: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few per cent.
+#: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few percent.
 LEAST_PASSES = 200
 
 
@@ -123,8 +123,8 @@ class _Deciding:
     def _without_decisions(self) -> Plan:
         probe, settings = self.probe, self.settings
         looked = probe.survey
-        decided = optimised_gaussians(looked, settings)
-        optimised = decided if probe.kept is None else decided & ~probe.kept
+        decided = optimized_gaussians(looked, settings)
+        optimized = decided if probe.kept is None else decided & ~probe.kept
         weighted = settings.position_weights == "on" or (
             settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
         )
@@ -135,7 +135,7 @@ class _Deciding:
         form = self._kept_form((steps_coarse + settings.steps_sos) * settings.views_per_step / views)
         return Plan(
             survey=looked,
-            optimised=optimised,
+            optimized=optimized,
             seen=rendered_gaussians(decided, settings),
             covered=probe.distinct,
             weighted=weighted,
@@ -204,7 +204,7 @@ class _Deciding:
             *decisions.of_scene(probe, plan, settings),
             *decisions.of_views(probe, plan, settings, self.work, shared),
             *decisions.of_surround(plan, settings, self.visits),
-            *decisions.of_colours(settings),
+            *decisions.of_colors(settings),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),
             *decisions.of_search(plan, self._passes_of_a_size(plan.steps_coarse, plan.weighted)),

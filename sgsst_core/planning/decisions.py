@@ -18,7 +18,7 @@ from sgsst_core.planning.choices import (
     precision_of,
     pruned_gaussians,
 )
-from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Work
+from sgsst_core.planning.cost import OPTIMIZER_BYTES, LaunchCost, RasterCost, Work
 from sgsst_core.planning.plan import Decision, Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
@@ -34,15 +34,15 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
     scene = probe.scene
     pruned = int(pruned_gaussians(plan.survey, plan.seen).sum())
     unseen = int((~plan.seen).sum()) - pruned
-    change = "keep their colours" if settings.unseen == "keep" else "take their neighbours' colour change at the end"
+    change = "keep their colors" if settings.unseen == "keep" else "take their neighbors' color change at the end"
     decisions = []
     if unseen:
         decisions.append(
             Decision(
                 "unseen Gaussians",
-                f"{unseen:,} of {scene.gaussians:,} are not rendered and not optimised; they {change}",
+                f"{unseen:,} of {scene.gaussians:,} are not rendered and not optimized; they {change}",
                 "their blend weights are 0 in every pixel of every view",
-                bytes=unseen * OPTIMISER_BYTES,
+                bytes=unseen * OPTIMIZER_BYTES,
             )
         )
     if pruned:
@@ -50,10 +50,10 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
         decisions.append(
             Decision(
                 "pruned Gaussians",
-                f"{pruned:,} of {scene.gaussians:,} are not rendered and not optimised; they {change}",
+                f"{pruned:,} of {scene.gaussians:,} are not rendered and not optimized; they {change}",
                 f"their blend weights over all views add up to at most {settings.prune_weight:g} each",
-                bytes=pruned * OPTIMISER_BYTES,
-                error=f"of colours in 0..255, no pixel of a view changes by more than "
+                bytes=pruned * OPTIMIZER_BYTES,
+                error=f"of colors in 0..255, no pixel of a view changes by more than "
                 f"{255 * probe.pruned_error.largest:.3g}, the mean pixel by no more than "
                 f"{255 * probe.pruned_error.mean:.2g}",
             )
@@ -88,14 +88,14 @@ def _of_fading(probe: Probe, fade: float) -> Decision:
             f"degrees 1 to {scene.sh_degree} are faded out: no view directions are computed, and the result has zeros",
             "asked for",
             bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - 1) * 4,
-            error="no colour depends on the direction of view any more",
+            error="no color depends on the direction of view any more",
         )
     return Decision(
         "spherical harmonics",
         f"coefficients of degrees 1 to {scene.sh_degree} are {1 - fade:.3g} times as large, in the result too; "
         f"evaluated up to degree {scene.used_degree}",
         "asked for",
-        error="colours depend less on the direction of view",
+        error="colors depend less on the direction of view",
     )
 
 
@@ -140,22 +140,22 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
 
 
 def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision]:
-    """What is behind the Gaussians in a step, and what their colours begin with, where it is not the plain way."""
+    """What is behind the Gaussians in a step, and what their colors begin with, where it is not the plain way."""
     share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
     decisions = []
     if plan.surround != "background":
-        colour = {"random": "a random colour", "palette": "the colour of a random pixel of the style"}[plan.surround]
-        reason = f"{share}: colours would be fitted to one that stays" if settings.surround == "auto" else "asked for"
+        color = {"random": "a random color", "palette": "the color of a random pixel of the style"}[plan.surround]
+        reason = f"{share}: colors would be fitted to one that stays" if settings.surround == "auto" else "asked for"
         cost = visits.content.always + visits.images.always
         if cost:
             reason += f"; content features are computed with it, {cost:.2g} s in every iteration"
-        decisions.append(Decision("surround", f"{colour} each time", reason, error=_ANOTHER_LOSS))
+        decisions.append(Decision("surround", f"{color} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
-        reason = "steps change slowly what all colours have in common"
+        reason = "steps change slowly what all colors have in common"
         if is_scan(plan.survey, weighted=plan.weighted):
             reason = f"{share}: nothing beside the object tells how bright it should be"
-        by_luminance = settings.keep_colours == "luminance"
-        begins = "luminance begins with the style's mean and spread" if by_luminance else "colours begin as the style's"
+        by_luminance = settings.keep_colors == "luminance"
+        begins = "luminance begins with the style's mean and spread" if by_luminance else "colors begin as the style's"
         if ends_with_transfer(settings, warm=True):
             begins += f"; the same once more behind the last step, because {settings.style_loss} lets them go"
         decisions.append(
@@ -169,14 +169,14 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
     return decisions
 
 
-def of_colours(settings: Settings) -> list[Decision]:
-    """What becomes of the scene's colours, where they do not simply become the style's."""
-    if settings.keep_colours != "luminance":
+def of_colors(settings: Settings) -> list[Decision]:
+    """What becomes of the scene's colors, where they do not simply become the style's."""
+    if settings.keep_colors != "luminance":
         return []
     return [
         Decision(
-            "colours",
-            "luminance alone is compared and optimised: each Gaussian keeps its chroma",
+            "colors",
+            "luminance alone is compared and optimized: each Gaussian keeps its chroma",
             "asked for",
             error=_ANOTHER_LOSS,
         )
@@ -404,7 +404,7 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
             )
         )
     if settings.early_stop and plan.surround != "background":
-        reason = "losses with different colours behind the Gaussians do not tell whether they still fall"
+        reason = "losses with different colors behind the Gaussians do not tell whether they still fall"
         decisions.append(Decision("early stop", "none: every step is made", reason))
     elif settings.early_stop:
         decisions.append(
@@ -450,7 +450,7 @@ def of_precision(probe: Probe, settings: Settings) -> list[Decision]:
     if precision_of(asked, ratio) == "float32":
         reason = f"{asked} was asked for, but takes {1 / ratio:.1f} times as long as float32 on this processor"
         return [Decision("precision", "features in float32", reason)]
-    known = "that of the colours is measured during the run"
+    known = "that of the colors is measured during the run"
     if error is not None:
         known = (
             f"the first view's pixel gradient is off by {error.relative_error:.2g} of its norm (cosine "

@@ -23,11 +23,11 @@ from sgsst_core.planning.visits import RENDER, Visits
 from sgsst_core.settings import Settings
 
 #: From the last step to the last file: seconds in any case, for pictures and report, and for each Gaussian, whose
-#: neighbours are searched and which is written (measured at 4 million on two cores; a guess elsewhere).
+#: neighbors are searched and which is written (measured at 4 million on two cores; a guess elsewhere).
 ENDING_SECONDS = 1.5
 ENDING_SECONDS_A_GAUSSIAN = 4e-6
 #: Of them the search, which every moment takes where some Gaussians are unseen.
-_NEIGHBOURS_SECONDS_A_GAUSSIAN = 1.5e-6
+_NEIGHBORS_SECONDS_A_GAUSSIAN = 1.5e-6
 #: Renders that the depth of a held-out view takes.
 _DEPTH_RENDERS = 2
 
@@ -95,12 +95,12 @@ def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, 
     render = RENDER * raster.seconds
     pruned = bool(pruned_gaussians(plan.survey, plan.seen).any())
     approximated = plan.precision != "float32" or plan.kept_weights == "half" or pruned
-    unseen = settings.unseen == "neighbours" and not bool(plan.seen.all())
-    neighbours = _NEIGHBOURS_SECONDS_A_GAUSSIAN * probe.scene.gaussians if unseen else 0.0
+    unseen = settings.unseen == "neighbors" and not bool(plan.seen.all())
+    neighbors = _NEIGHBORS_SECONDS_A_GAUSSIAN * probe.scene.gaussians if unseen else 0.0
     return Prices(
-        setup=RENDERED * (raster.first_seconds + raster.colours_seconds + _DEPTH_RENDERS * render),
+        setup=RENDERED * (raster.first_seconds + raster.colors_seconds + _DEPTH_RENDERS * render),
         view=RENDERED * render + forward,
-        moment=neighbours + (2 * expected.seconds if approximated else 0.0),
+        moment=neighbors + (2 * expected.seconds if approximated else 0.0),
     )
 
 

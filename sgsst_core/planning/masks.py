@@ -1,7 +1,7 @@
 """Which Gaussians masks of some views show: each votes by its blend weights.
 
 A Gaussian's share is that part of its blend weights in the masked views that lies where masks are white. Most are in or
-out by a wide margin; those between, of which views disagree, follow the majority of their neighbours, and so do those
+out by a wide margin; those between, of which views disagree, follow the majority of their neighbors, and so do those
 that no masked view shows: a border runs between Gaussians, not through a cloud of single votes.
 """
 
@@ -18,8 +18,8 @@ from sgsst_core.scene.camera import Camera
 
 #: A Gaussian of more than the first share of votes is in, of less than the second out.
 IN, OUT = 0.6, 0.4
-#: Neighbours that decide about a Gaussian between, or not shown.
-NEIGHBOURS = 8
+#: Neighbors that decide about a Gaussian between, or not shown.
+NEIGHBORS = 8
 
 
 def count_votes(
@@ -35,8 +35,8 @@ def count_votes(
     inside, total = (torch.zeros(gaussians, dtype=torch.float64) for _ in range(2))
     for camera, load in zip(cameras, masks, strict=True):
         mask = load().to(rasterizer.device, rasterizer.dtype)
-        # The gradient of a rendered colour is what a Gaussian contributes to it: the transpose of blending.
-        votes = rasterizer.colour_gradient(torch.stack([mask, torch.ones_like(mask), mask], dim=2), camera).cpu()
+        # The gradient of a rendered color is what a Gaussian contributes to it: the transpose of blending.
+        votes = rasterizer.color_gradient(torch.stack([mask, torch.ones_like(mask), mask], dim=2), camera).cpu()
         inside += votes[:, 0].double()
         total += votes[:, 1].double()
     return inside, total
@@ -55,7 +55,7 @@ def decide_by_votes(means: Tensor, inside: Tensor, total: Tensor) -> Tensor:
     if not bool(decided.any()) or not bool(open_.any()):
         return result
     places = means.double().numpy()
-    count = min(NEIGHBOURS, int(decided.sum()))
+    count = min(NEIGHBORS, int(decided.sum()))
     _, nearest = cKDTree(places[decided]).query(places[open_], k=count, workers=torch.get_num_threads())
     votes = result[decided][torch.as_tensor(nearest).reshape(-1, count)].double().mean(dim=1)
     result[open_] = torch.where(votes == 0.5, result[open_], votes > 0.5)

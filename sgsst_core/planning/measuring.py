@@ -4,7 +4,7 @@ The loss before and after is taken on some of the job's views; held-out views ar
 what is allowed goes to the loss at most, and its views are fewer where they would take more. What it leaves is for
 held-out views: they and their moments become fewer from level to level (`LEVELS`). The plan takes the first level whose
 expected seconds are allowed; the first view that is really measured says whether a later level is needed
-(`quality.measure`). Nothing is measured before the first step, and nothing changes a colour.
+(`quality.measure`). Nothing is measured before the first step, and nothing changes a color.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, measuring_memory
-from sgsst_core.planning.cost import OPTIMISER_BYTES, STEP_BYTES, gaussian_bytes, image_bytes
+from sgsst_core.planning.cost import OPTIMIZER_BYTES, STEP_BYTES, gaussian_bytes, image_bytes
 from sgsst_core.planning.measuring import LEVELS, RENDERED
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe
-from sgsst_core.planning.visits import COLOUR_BYTES, Visits
+from sgsst_core.planning.visits import COLOR_BYTES, Visits
 from sgsst_core.settings import Settings
 
 #: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.
@@ -17,7 +17,7 @@ MEASURING_BYTES = 100 << 20
 #: Bytes of each Gaussian of a scene that is projected: of its shape, kept between views, and of its projection, its
 #: depth and their order while a view's lists are built.
 SHAPE_BYTES, BUILDING_BYTES = 32, 104
-#: Of each Gaussian while neighbours of unseen ones are searched: the result, its difference, positions, their tree.
+#: Of each Gaussian while neighbors of unseen ones are searched: the result, its difference, positions, their tree.
 SEARCH_BYTES = 120
 #: Of a view's lists, what gradients of their entries take in a rasterizer's backward pass.
 SLOTS_SHARE = 0.25
@@ -56,14 +56,14 @@ class PeakMemory:
         passing = image_bytes(probe.sizes) + self.activations * (2 if self.plan.graphs else 1) + self.matching
         if probe.machine.device != "cpu":
             computing = passing + self._content() + self._weights()
-            return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMISER_BYTES
+            return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMIZER_BYTES
         everything = probe.scene.gaussians
         building = everything * BUILDING_BYTES
-        kept = self._scene() + self._lists_and_weights() + self._content() + self._colours() + self._held_out()
-        kept += gaussians * OPTIMISER_BYTES + measuring
+        kept = self._scene() + self._lists_and_weights() + self._content() + self._colors() + self._held_out()
+        kept += gaussians * OPTIMIZER_BYTES + measuring
         searching = everything * SEARCH_BYTES if self._unseen_are_searched() else 0
         rastering = gaussians * STEP_BYTES + int(SLOTS_SHARE * probe.raster.lists_bytes)
-        passing = max(passing + self._exact_activations() + gaussians * COLOUR_BYTES, rastering, searching)
+        passing = max(passing + self._exact_activations() + gaussians * COLOR_BYTES, rastering, searching)
         return probe.process_bytes + max(building, kept + passing), None
 
     @property
@@ -96,9 +96,9 @@ class PeakMemory:
         ranks = self._ranks
         return int(min(self._all_visited * weights.bytes / ranks, weights.fitting(ranks))) if weights else 0
 
-    def _colours(self) -> int:
-        colours = self.visits.colours
-        return int(min(self._all_visited * colours.bytes, colours.room))
+    def _colors(self) -> int:
+        colors = self.visits.colors
+        return int(min(self._all_visited * colors.bytes, colors.room))
 
     def _lists_and_weights(self) -> int:
         """What they take beside the lists that the survey has kept, all in one budget."""
@@ -138,14 +138,14 @@ class PeakMemory:
         gaussians, pixels = self.probe.scene.gaussians, max(height * width for height, width in self.probe.sizes)
         views = LEVELS[self.level].views
         if views:
-            colours = RENDERED * views * gaussians * COLOUR_BYTES if self.probe.scene.used_degree else 0
+            colors = RENDERED * views * gaussians * COLOR_BYTES if self.probe.scene.used_degree else 0
             coverage = views * pixels * _COVERAGE_BYTES if self.plan.weighted else 0
-            kept += gaussians * SHAPE_BYTES + min(colours, memory // 8) + min(coverage, memory // 8)
+            kept += gaussians * SHAPE_BYTES + min(colors, memory // 8) + min(coverage, memory // 8)
             kept += min(views * pixels * _WARP_BYTES, memory // 2)
         if self._approximated():
             share = self.loss_views / len(self.plan.covered)
             kept += int(min(share * self._exact_size() * self.visits.content.bytes, memory // 2))
-            kept += int(min(share * self.visits.colours.bytes, memory // 4))
+            kept += int(min(share * self.visits.colors.bytes, memory // 4))
         return kept
 
     def _exact_activations(self) -> int:
@@ -166,4 +166,4 @@ class PeakMemory:
         return self.plan.precision != "float32" or self.plan.kept_weights == "half" or self._pruned()
 
     def _unseen_are_searched(self) -> bool:
-        return self.settings.unseen == "neighbours" and not bool(self.plan.seen.all())
+        return self.settings.unseen == "neighbors" and not bool(self.plan.seen.all())

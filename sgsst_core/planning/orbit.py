@@ -110,7 +110,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     if count is None:
         count = sum(max(_LEAST_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
     cameras = trial.cameras(count, elevations)
-    radius = float((cameras[0].centre - middle_of(subject, up.direction)).norm())
+    radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
     hidden = [share < _SHOWS for ring in chosen for share in views[ring].subject]
     return Orbit(
         cameras,
@@ -198,8 +198,8 @@ class _Trial:
 
     def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest) -> None:
         self._subject, self._up, self._request = subject, up, request
-        colourless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
-        self._scene = sampled(colourless, _TRIAL_GAUSSIANS)
+        colorless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
+        self._scene = sampled(colorless, _TRIAL_GAUSSIANS)
         self._rasterizer = make_rasterizer("cpu", self._scene, near=request.near)
         self._framed = subject.holds(self._scene.means)
 

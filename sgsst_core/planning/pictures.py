@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def soft_picture(side: int) -> Tensor:
-    """Random colours 16 pixels apart and all between them, [side, side, 3] in 0..1, always the same ones."""
+    """Random colors 16 pixels apart and all between them, [side, side, 3] in 0..1, always the same ones."""
     cells = torch.rand((1, 3, side // 16 + 1, side // 16 + 1), generator=torch.Generator().manual_seed(0))
     picture = torch.nn.functional.interpolate(cells, size=(side, side), mode="bilinear")[0]
     return picture.permute(1, 2, 0).contiguous()

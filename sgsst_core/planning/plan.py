@@ -79,12 +79,12 @@ class Plan:
 
     Attributes:
         survey: what the views show.
-        optimised: [N] bool, Gaussians whose colours the views decide.
-        seen: [N] bool, Gaussians that are rendered: the optimised ones, or all for comparison.
+        optimized: [N] bool, Gaussians whose colors the views decide.
+        seen: [N] bool, Gaussians that are rendered: the optimized ones, or all for comparison.
         covered: indices of the views that are stylized.
         weighted: statistics are weighted by coverage.
         surround: what is behind the Gaussians in a step.
-        warm_start: the job begins with the style's colours.
+        warm_start: the job begins with the style's colors.
         steps_coarse: of phase 1; 0 where it is left out.
         memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
         device: on which the feature network computes.
@@ -105,7 +105,7 @@ class Plan:
     """
 
     survey: Survey
-    optimised: Tensor
+    optimized: Tensor
     seen: Tensor
     covered: tuple[int, ...]
     weighted: bool

@@ -29,7 +29,7 @@ from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import (
     GPU_RASTERIZERS,
     LEAST_VISITS,
-    optimised_gaussians,
+    optimized_gaussians,
     precision_of,
     pruned_gaussians,
     rasterizer_anew,
@@ -54,7 +54,7 @@ from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Precision, Settings
 from sgsst_core.timing import Timer, wait_for
@@ -289,7 +289,7 @@ def measure(workshop: Workshop, looked: Survey, link: Link, maps: int = 0) -> Pr
         SettingsError: pruning would leave no Gaussian.
     """
     scene, cameras, settings = workshop.scene, workshop.cameras, workshop.settings
-    seen = rendered_gaussians(optimised_gaussians(looked, settings), settings)
+    seen = rendered_gaussians(optimized_gaussians(looked, settings), settings)
     distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
     network = _network_facts(workshop, cameras[distinct[0]], maps)
     launches = _launch_cost(workshop, [cameras[index] for index in distinct])
@@ -450,7 +450,7 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     known: dict[str, Any] = {
         "first_seconds": more,
         "lists_bytes": lists_bytes,
-        "colours_seconds": _colours_seconds(scene, sample[middle], rasterizer.device),
+        "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
     if rasterizer.name == "cuda":
         return RasterCost(mean, **known)
@@ -491,14 +491,14 @@ def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[f
     return seconds / len(cameras), size // len(cameras)
 
 
-def _colours_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
-    """Of what spherical harmonics add to a view's colours, for the second time: the first one compiles."""
+def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
+    """Of what spherical harmonics add to a view's colors, for the second time: the first one compiles."""
     seconds = 0.0
     if scene.sh_degree:
         sh_rest, means = scene.sh_rest.to(device), scene.means.to(device)
         for _ in range(2):
             started = time.perf_counter()
-            rest_colours(sh_rest, means, camera)
+            rest_colors(sh_rest, means, camera)
             wait_for(device)
             seconds = time.perf_counter() - started
     return seconds
@@ -517,11 +517,11 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
 
 def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
     """Of some renders with gradient: the first one prepares the view, where that has not been done."""
-    colours = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
+    colors = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
     seconds = []
     for _ in range(visits):
         started = time.perf_counter()
-        rasterizer.colour_gradient(rasterizer.render(colours, camera), camera)
+        rasterizer.color_gradient(rasterizer.render(colors, camera), camera)
         wait_for(rasterizer.device)
         seconds.append(time.perf_counter() - started)
     return seconds

@@ -19,7 +19,7 @@ _FOLLOWED = 2000
 
 @dataclass(frozen=True)
 class ImageError:
-    """Bounds on what leaving Gaussians out changes in a pixel, per unit of the colours' range: largest and mean."""
+    """Bounds on what leaving Gaussians out changes in a pixel, per unit of the colors' range: largest and mean."""
 
     largest: float
     mean: float
@@ -31,8 +31,8 @@ def pruned_image_error(
     """Bound the change of every pixel of every view when some Gaussians are not rendered.
 
     Take them away one by one, the farthest first. What is taken away showed w (c - b) of its pixel, with its blend
-    weight w, its colour c, and b the blend of what lies behind it; the weights of those in front stay the same. So
-    no pixel changes by more than the sum of the pruned weights times the range of the colours, plus the transmittance
+    weight w, its color c, and b the blend of what lies behind it; the weights of those in front stay the same. So
+    no pixel changes by more than the sum of the pruned weights times the range of the colors, plus the transmittance
     at which blending stops.
 
     Args:

@@ -61,8 +61,8 @@ class IterationWork:
         halo: pixels around a partition tile.
         pixel: seconds a pixel through the network, both passes and statistics.
         raster: seconds of render and gradient on one rank.
-        fixed: seconds that every rank needs, however many there are: comparing statistics, the optimiser.
-        gaussians: that are optimised.
+        fixed: seconds that every rank needs, however many there are: comparing statistics, the optimizer.
+        gaussians: that are optimized.
         shown: that the view shows, for which alone its gradient travels; None for all.
         matching: seconds of the search for nearest style vectors on one rank.
         whole_image: the full-size image and its gradient are exchanged (phase 1 with kept weights needs neither).

@@ -1,7 +1,7 @@
 """Which Gaussians are cut into smaller ones before a job (`Settings.refine`), and into how many.
 
-A Gaussian can carry one colour from each side, so that no stroke is finer than it. Those are cut that are large where
-the views show them, as far as the loss's gradient asks for different colours within them.
+A Gaussian can carry one color from each side, so that no stroke is finer than it. Those are cut that are large where
+the views show them, as far as the loss's gradient asks for different colors within them.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _LEAST_WEIGHT = 8.0
 #: Of one Gaussian; a flat one in the most pieces along both axes.
 _MOST_CHILDREN = MOST_PIECES**2
 #: A Gaussian's deviation over its distance from a camera that shows it: beyond, its parts lie elsewhere in the picture
-#: than the projection of the whole, which takes the perspective as linear about the centre.
+#: than the projection of the whole, which takes the perspective as linear about the center.
 _LARGEST_REACH = 1.0
-#: Of the gradient's magnitude under a Gaussian, what must cancel in its sum; with less, it asks for one colour.
+#: Of the gradient's magnitude under a Gaussian, what must cancel in its sum; with less, it asks for one color.
 _LEAST_DISAGREEMENT = 0.1
 #: Gaussians whose sizes are computed together: some tens of megabytes in float64.
 _CHUNK = 1 << 17
@@ -80,12 +80,12 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
     (huge Gaussians) is infinite.
     """
     pose = camera.world_to_camera.double()
-    centres = scene.means[rows].double() @ pose[:3, :3].T + pose[:3, 3]
+    centers = scene.means[rows].double() @ pose[:3, :3].T + pose[:3, 3]
     deviations = scene.scales[rows].double().exp()
     axes = pose[:3, :3] @ rotations(scene.quats[rows].double()) * deviations[:, None, :]  # [n, camera axis, own axis]
-    depth = centres[:, 2:].clamp_min(torch.finfo(torch.float64).tiny)
-    across = camera.fx / depth * (axes[:, 0] - centres[:, :1] / depth * axes[:, 2])
-    down = camera.fy / depth * (axes[:, 1] - centres[:, 1:2] / depth * axes[:, 2])
+    depth = centers[:, 2:].clamp_min(torch.finfo(torch.float64).tiny)
+    across = camera.fx / depth * (axes[:, 0] - centers[:, :1] / depth * axes[:, 2])
+    down = camera.fy / depth * (axes[:, 1] - centers[:, 1:2] / depth * axes[:, 2])
     lengths = torch.hypot(across, down)
     reach = deviations.amax(dim=1) / depth[:, 0]
     return lengths.nan_to_num(torch.inf), reach.nan_to_num(torch.inf)
@@ -94,12 +94,12 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
 def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor) -> tuple[Tensor, Tensor]:
     """How much of a picture's gradient [H, W, 3] cancels under each Gaussian, and how much there is: both [N] float64.
 
-    There is sum |g| w over pixels and channels, w the blend weights; of it |sum g w| reaches the Gaussian's colour. The
+    There is sum |g| w over pixels and channels, w the blend weights; of it |sum g w| reaches the Gaussian's color. The
     difference is what its pixels disagree about. Two passes of the rasterizer, of |g| and of g: G-Style (Kovács,
     Hermosilla, Raidou 2024) cuts by the magnitude of gradients, too, which it accumulates over steps.
     """
-    whole = rasterizer.colour_gradient(image_gradient.abs(), camera).double()
-    summed = rasterizer.colour_gradient(image_gradient, camera).double().abs()
+    whole = rasterizer.color_gradient(image_gradient.abs(), camera).double()
+    summed = rasterizer.color_gradient(image_gradient, camera).double().abs()
     return (whole - summed).clamp_min(0).sum(dim=1).cpu(), whole.sum(dim=1).cpu()
 
 
@@ -169,11 +169,11 @@ def refine_decision(refinement: Refinement, settings: Settings) -> Decision:
     back = f"; {refinement.taken_back:,} stay whole, whose parts would change the picture"
     back = back if refinement.taken_back else ""
     if not refinement.split or refinement.psnr is None:
-        return Decision(item, "none is cut", f"none is large where the gradient asks for several colours{back}")
+        return Decision(item, "none is cut", f"none is large where the gradient asks for several colors{back}")
     return Decision(
         item,
         f"{refinement.split:,} are cut, which makes {refinement.gaussians:,} of {before:,}",
-        f"they are larger than {refinement.size:.2g} pixels in the views, and the gradient asks for several colours "
+        f"they are larger than {refinement.size:.2g} pixels in the views, and the gradient asks for several colors "
         f"in them; at most {settings.refine:g} times as many were asked for{back}",
         error=f"the unstylized picture has {refinement.psnr:.1f} dB against that of before, no measured view less than "
         f"{refinement.lowest_psnr:.1f} dB",

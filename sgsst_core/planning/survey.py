@@ -21,7 +21,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Below this coverage nothing can be seen of a pixel's colour in 8 bits.
+#: Below this coverage nothing can be seen of a pixel's color in 8 bits.
 SEEN_COVERAGE = 1 / 255
 
 

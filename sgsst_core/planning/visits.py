@@ -1,6 +1,6 @@
 """What a view costs beside an iteration's passes: what is made at its first visit, and made anew where it is not kept.
 
-Lists of Gaussians, colours of spherical harmonics, blend weights and content features of a view are made when it is
+Lists of Gaussians, colors of spherical harmonics, blend weights and content features of a view are made when it is
 first visited, and kept as far as each of them fits its share of the memory. What fits costs seconds once; what does not
 costs them at every visit.
 """
@@ -19,9 +19,9 @@ from sgsst_core.settings import Settings
 KEEPING_RENDERS = 3
 #: A render without its gradient, in renders with it.
 RENDER = 0.5
-#: Bytes of the colours of a Gaussian in a view: what its spherical harmonics add.
-COLOUR_BYTES = 12
-#: Of a pixel of the content image at all scales, float32, which is kept where steps have different colours behind it.
+#: Bytes of the colors of a Gaussian in a view: what its spherical harmonics add.
+COLOR_BYTES = 12
+#: Of a pixel of the content image at all scales, float32, which is kept where steps have different colors behind it.
 _IMAGE_BYTES = 16
 #: Of a pixel of a region's map at all scales, float32.
 MAP_BYTES = 16 / 3
@@ -83,20 +83,20 @@ class Visits:
         lists: of the rasterizer that computes weights anew.
         surveyed: lists that the survey has made, of all views.
         handed: share of the seconds of lists that are kept which the survey's save the job.
-        colours: of spherical harmonics.
+        colors: of spherical harmonics.
         weights: kept ones; None where none are.
         content: features at all scales, with the render that they are of; `content_coarse`: of the coarsest alone.
         maps: of the regions' shares.
-        images: of the content, which features with another colour behind them are computed from.
+        images: of the content, which features with another color behind them are computed from.
         raster: seconds of a render and its gradient, weights computed anew; `raster_kept`: with kept ones.
-        in_coarse: phase 1 makes lists, colours and weights, so that phase 2 finds them.
+        in_coarse: phase 1 makes lists, colors and weights, so that phase 2 finds them.
         coarse_weights: phase 1 makes weights of its own.
     """
 
     lists: Made
     surveyed: Made
     handed: float
-    colours: Made
+    colors: Made
     weights: Made | None
     content: Made
     content_coarse: Made
@@ -121,7 +121,7 @@ class Visits:
         surveyed = Made(0.0, len(probe.sizes) * raster.lists_bytes, weighed)
         room_of_lists = weighed if plan.kept_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
         lists = Made(raster.first_seconds, views * raster.lists_bytes, room_of_lists)
-        colours = views * int(plan.seen.sum()) * COLOUR_BYTES if probe.scene.used_degree else 0
+        colors = views * int(plan.seen.sum()) * COLOR_BYTES if probe.scene.used_degree else 0
         weights = None
         if plan.kept_weights != "none":
             size = (raster.bytes if plan.kept_weights == "float32" else raster.half_bytes) or 0
@@ -132,7 +132,7 @@ class Visits:
         room_of_content = 0 if "content" in settings.keep else room / (4 if probe.maps else 2)
         share = coarse.pixels / work.pixels  # of the content's bytes, as of its pixels
         images = Made(0.0)
-        if plan.surround != "background" and settings.content_weight:  # features are another colour's at every visit
+        if plan.surround != "background" and settings.content_weight:  # features are another color's at every visit
             pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
             room_of_images, room_of_content = room_of_content / 2, 0
             images, rendered = Made(rendered, _IMAGE_BYTES * pixels, room_of_images), 0.0
@@ -141,7 +141,7 @@ class Visits:
             lists=lists,
             surveyed=surveyed,
             handed=min(surveyed.kept / lists.kept, 1.0) * (1 if plan.seen.all() else 1 - _CUT),
-            colours=Made(raster.colours_seconds, colours, room / 4),
+            colors=Made(raster.colors_seconds, colors, room / 4),
             weights=weights,
             content=Made(rendered + work.pixels * forward, content, room_of_content),
             content_coarse=Made(rendered + coarse.pixels * forward, content * share, room_of_content),
@@ -157,7 +157,7 @@ class Visits:
         anew = self.raster + self.lists.always
         if self.weights is not None:
             anew = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * anew
-        return anew + self.colours.always
+        return anew + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
         """Seconds of every visit beside rendering and the network: content that is not kept."""
@@ -166,7 +166,7 @@ class Visits:
     def first(self, *, coarse: bool) -> float:
         """Seconds of a view's first visit in a phase beside those of its later visits."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
-        lists = (1 - self.handed) * self.lists.once + self.colours.once + self.maps.once
+        lists = (1 - self.handed) * self.lists.once + self.colors.once + self.maps.once
         keeping = self.weights.once if self.weights else 0.0
         if coarse:
             return content + lists + (0.0 if self.coarse_weights else keeping)

@@ -1,10 +1,10 @@
 """Multi-view consistency: how much a scene's pictures differ where two cameras see the same point of it.
 
 View j is warped into view i by the scene's own rendered depth and compared with it where both see the same surface:
-RMSE, and LPIPS averaged over the same pixels. Short range compares neighbours, long range views 7 apart (the two ranges
+RMSE, and LPIPS averaged over the same pixels. Short range compares neighbors, long range views 7 apart (the two ranges
 of Huang et al., "Learning to Stylize Novel Views", ICCV 2021).
 
-A scene without style has a distance above zero as well: view-dependent colours, interpolation (the warped view is
+A scene without style has a distance above zero as well: view-dependent colors, interpolation (the warped view is
 a little smoother), and depth that is a mean over translucent Gaussians. Numbers are to be read before and after
 stylization.
 """
@@ -25,14 +25,14 @@ from sgsst_core.scene.gaussians import Scene
 
 #: Views between the two of a pair.
 SHORT_RANGE, LONG_RANGE = 1, 7
-#: A pixel has a depth where the Gaussians cover more of it than this; below, the background mixes into its colour.
+#: A pixel has a depth where the Gaussians cover more of it than this; below, the background mixes into its color.
 COVERED = 0.9
-#: Depths of one surface in two views differ by no more than this share. On scans of objects the colours' error begins
+#: Depths of one surface in two views differ by no more than this share. On scans of objects the colors' error begins
 #: to rise at 0.01, where one limb hides another; on a scene trained from few photos, whose translucent Gaussians have
 #: no one depth, only at 0.05, and there a smaller value compares fewer pixels and gives nearly the same RMSE.
 DEPTH_TOLERANCE = 0.02
 #: Of an interpolated pixel, what may come from outside the view, from uncovered pixels or from another surface: enough
-#: for rounding of a position that falls on a pixel centre, too little to be seen in 8 bits.
+#: for rounding of a position that falls on a pixel center, too little to be seen in 8 bits.
 _FOREIGN_SHARE = 1e-3
 #: With a smaller share of pixels to compare, a pair says nothing about the scene.
 MINIMUM_COMPARED = 0.01
@@ -51,7 +51,7 @@ class PairConsistency:
     Attributes:
         first, second: indices of the views; the second was warped into the first.
         compared: share of the first view's pixels that could be compared.
-        rmse: root mean square difference of the colours (0..1) over those pixels; None where they are too few.
+        rmse: root mean square difference of the colors (0..1) over those pixels; None where they are too few.
         lpips: LPIPS averaged over those pixels; None where they are too few, the view is too small for it, or it was
             not asked for.
     """
@@ -114,7 +114,7 @@ def consistency(
 
     Args:
         images: picture [H, W, 3] of a view by its index, compared as a screen shows it: clamped to 0..1.
-        cameras: one for each view, neighbours in space being neighbours in the list.
+        cameras: one for each view, neighbors in space being neighbors in the list.
         rasterizer: of the scene's geometry.
         scene: whose geometry says where views overlap.
         gap: `SHORT_RANGE`, `LONG_RANGE` or any other distance in the list, at least 1.
@@ -155,19 +155,19 @@ def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[i
 
 
 def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> DepthMap:
-    """Depth of a view, from the rasterizer itself: it is linear in the colours, and z is a colour like any other.
+    """Depth of a view, from the rasterizer itself: it is linear in the colors, and z is a color like any other.
 
     Numerator (sum of w z) and denominator (sum of w) are channels of one image, so that whatever rounding the blend
     weights have falls out of their ratio. What the background adds is the image of black Gaussians.
     """
     pose = camera.world_to_camera.double()
-    colours = torch.zeros((len(scene), 3), dtype=rasterizer.dtype)
-    colours[:, 1] = 1
+    colors = torch.zeros((len(scene), 3), dtype=rasterizer.dtype)
+    colors[:, 1] = 1
     for start in range(0, len(scene), _GAUSSIANS):
         part = slice(start, start + _GAUSSIANS)
         # float64: in a world moved far away both terms are large
-        colours[part, 0] = (scene.means[part].double() @ pose[2, :3] + pose[2, 3]).to(rasterizer.dtype)
-    sums = rasterizer.render(colours, camera) - rasterizer.render(torch.zeros_like(colours), camera)
+        colors[part, 0] = (scene.means[part].double() @ pose[2, :3] + pose[2, 3]).to(rasterizer.dtype)
+    sums = rasterizer.render(colors, camera) - rasterizer.render(torch.zeros_like(colors), camera)
     weighted, weights = sums[..., 0], sums[..., 1]
     known = (weights > COVERED) & weighted.isfinite() & (weighted > 0)
     depth = torch.where(known, weighted / torch.where(known, weights, 1.0), 1.0)
@@ -180,7 +180,7 @@ def project_pixels(
     camera: Camera,
     other: Camera,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where pixel centres at a depth lie in another view: x, y in pixels and z there, each [h, W] float64.
+    """Where pixel centers at a depth lie in another view: x, y in pixels and z there, each [h, W] float64.
 
     x and y are without meaning where z <= 0, behind the other camera; they are finite there too.
     """
@@ -202,7 +202,7 @@ def project_pixels(
 class Warp:
     """The pixels of a view that another view sees as well, and how they are interpolated there.
 
-    It follows from the geometry alone, and so is the same for all colours of a scene.
+    It follows from the geometry alone, and so is the same for all colors of a scene.
 
     Attributes:
         size: (H, W) of the view.
@@ -224,12 +224,12 @@ class Warp:
     def apply(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """The other view's picture [H', W', 3] as the view would see it: [H, W, 3], and where that is valid, [H, W]."""
         flat = image.reshape(-1, 3)
-        colours = flat.new_zeros((len(self.pixels), 3))
+        colors = flat.new_zeros((len(self.pixels), 3))
         for source, weight in zip(self.sources, self.weights, strict=True):
-            colours += weight[:, None].to(flat.dtype) * flat[source]
+            colors += weight[:, None].to(flat.dtype) * flat[source]
         height, width = self.size
         warped = flat.new_zeros((height * width, 3))
-        warped[self.pixels] = colours
+        warped[self.pixels] = colors
         valid = torch.zeros(height * width, dtype=torch.bool, device=flat.device)
         valid[self.pixels] = True
         return warped.view(height, width, 3), valid.view(height, width)

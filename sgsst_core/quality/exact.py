@@ -59,12 +59,12 @@ def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
 
 @dataclass(frozen=True)
 class GradientError:
-    """A colour gradient against the exact one.
+    """A color gradient against the exact one.
 
     Attributes:
         step: after which it was measured.
         view: name of the camera.
-        relative_error: |g - exact| / |exact|, Euclidean, over the optimised Gaussians.
+        relative_error: |g - exact| / |exact|, Euclidean, over the optimized Gaussians.
         cosine: of the angle between the two.
         seconds: of the gradient as the job computes it.
         seconds_exact: of the exact one.
@@ -116,7 +116,7 @@ class ExactLoss:
 
 
 class ExactTwin(ExactLoss):
-    """Evaluates loss and gradient of a job's colours exactly.
+    """Evaluates loss and gradient of a job's colors exactly.
 
     Args:
         stylizer: the job; it is not changed.
@@ -146,27 +146,27 @@ class ExactTwin(ExactLoss):
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
-        """Mean SOS loss over views of colours [N, 3] of the whole scene, split by scale."""
+        """Mean SOS loss over views of colors [N, 3] of the whole scene, split by scale."""
         return evaluate(self.views, self.style_targets, indices, sh_dc[self.shown].to(self.views.rasterizer.device))
 
     def gradient(self, index: int, sh_dc: Tensor, scales: list[int]) -> tuple[Tensor, float]:
-        """dE/dsh_dc [N, 3] of colours [N, 3] of the whole scene, and the seconds it took with its targets at hand."""
+        """dE/dsh_dc [N, 3] of colors [N, 3] of the whole scene, and the seconds it took with its targets at hand."""
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
         gradient = torch.zeros_like(sh_dc)
         values = sh_dc[self.shown].to(self.views.rasterizer.device)
         started = time.perf_counter()
-        colours = self.views.colours(index, values)
-        image = self.views.render(index, colours)
+        colors = self.views.colors(index, values)
+        image = self.views.render(index, colors)
         pixels = self.loss.evaluate(image, style, target, scales).image_gradient
         assert pixels is not None
-        gradient[self.shown] = self.views.gradient(index, pixels.to(image.device), colours).cpu()
+        gradient[self.shown] = self.views.gradient(index, pixels.to(image.device), colors).cpu()
         return gradient, time.perf_counter() - started
 
     def gradient_error(self, *, start: bool = False) -> GradientError:
-        """Compare the job's gradient of its latest view with the exact one, at the colours that it would end with now.
+        """Compare the job's gradient of its latest view with the exact one, at the colors that it would end with now.
 
         Args:
-            start: compare that of the first view at the unstylized colours, whatever the present ones are.
+            start: compare that of the first view at the unstylized colors, whatever the present ones are.
         """
         stylizer = self._stylizer
         if start or not stylizer.history:
@@ -174,10 +174,10 @@ class ExactTwin(ExactLoss):
         else:
             index, phase = stylizer.history[-1].view, stylizer.phase
         scales = phase.scales(stylizer.scales(index))
-        colours = stylizer.scene.sh_dc if start else stylizer.stylized()
-        with stylizer.with_colours(colours) if start or stylizer.transfers_last else nullcontext():
+        colors = stylizer.scene.sh_dc if start else stylizer.stylized()
+        with stylizer.with_colors(colors) if start or stylizer.transfers_last else nullcontext():
             approximate, seconds = stylizer.gradient(index, scales)
-        exact, seconds_exact = self.gradient(index, colours, scales)
+        exact, seconds_exact = self.gradient(index, colors, scales)
         seen = stylizer.plan.seen
         difference = Difference.of(approximate, exact[seen])
         return GradientError(

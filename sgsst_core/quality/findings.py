@@ -34,19 +34,19 @@ LARGE_SCALE, SMALL_SCALE = 1.0, 1e-7
 NEEDLE = 1e3
 #: exp(177)^4 overflows float64, and with it the determinant of the projected covariance.
 OVERFLOW_SCALE = 177.0
-#: Coefficients of trained scenes stay within a few units; 20 is a colour of 6.
+#: Coefficients of trained scenes stay within a few units; 20 is a color of 6.
 LARGE_COEFFICIENT = 20.0
 #: Scene extents from the world's origin at which float32 positions step by a thousandth of the extent.
 FAR_WORLD = 1e4
-#: Total blend weight below which a Gaussian changes no view by a grey level.
+#: Total blend weight below which a Gaussian changes no view by a gray level.
 HARDLY_SEEN = 1.0 / 255.0
-#: Degrees; beyond, the perspective bends so much within one Gaussian that its linearisation is coarse.
+#: Degrees; beyond, the perspective bends so much within one Gaussian that its linearization is coarse.
 WIDE, NARROW = 140.0, 1.0
 #: Share of a view without Gaussians that is worth telling.
 UNCOVERED = 0.01
 #: A style image longer than this many times its width.
 LONG_STYLE = 4.0
-#: Standard deviation of a style image's values below which it has no texture: one grey level.
+#: Standard deviation of a style image's values below which it has no texture: one gray level.
 FLAT_STYLE = 1.0 / 255.0
 #: Points that the extent of the scene is taken from.
 _SAMPLE = 50_000
@@ -126,7 +126,7 @@ class _Scene:
 
     def __init__(self, file: SceneFile) -> None:
         self.file, self.scene = file, file.scene
-        self.centre, self.extent = scene_extent(file.scene)
+        self.center, self.extent = scene_extent(file.scene)
 
     def ask(self, look: _Look, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
         """A finding for each question that some Gaussian is an answer to, from a look at each part of the scene."""
@@ -169,12 +169,12 @@ class _Scene:
             length = self.scene.quats[part].double().norm(dim=1)
             return [(length == 0, length), ((length > 0) & (length < low), length), (length > high, length)]
 
-        normalised = "normalised in float64, as all are"
+        normalized = "normalized in float64, as all are"
         return self.ask(
             look,
             _Question("quaternion of length 0", "never drawn: it is no rotation"),
-            _Question(f"quaternion shorter than {low:g}", normalised, largest=False),
-            _Question(f"quaternion longer than {high:g}", normalised),
+            _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
+            _Question(f"quaternion longer than {high:g}", normalized),
         )
 
     def sizes(self) -> list[Finding]:
@@ -216,7 +216,7 @@ class _Scene:
 
         return self.ask(
             look,
-            _Question("opacity below 1/255", "never drawn, not optimised", largest=False),
+            _Question("opacity below 1/255", "never drawn, not optimized", largest=False),
             _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with {ALPHA_MAX:g}, as in training"),
         )
 
@@ -230,24 +230,24 @@ class _Scene:
         return found
 
     def place(self) -> list[Finding]:
-        far = float(self.centre.norm()) / self.extent
+        far = float(self.center.norm()) / self.extent
         if far < FAR_WORLD:
             return []
-        step = float(np.spacing(np.float32(self.centre.abs().max())))
+        step = float(np.spacing(np.float32(self.center.abs().max())))
         done = (
             "differences are taken in float64 on the CPU, but what lies between the file's float32 positions is lost: "
             "move the scene to the origin before training. gsplat on a GPU loses more"
         )
-        worst = f"centre {far:.3g} extents away; positions step by {step:.3g}, {step / self.extent:.1e} of the extent"
+        worst = f"center {far:.3g} extents away; positions step by {step:.3g}, {step / self.extent:.1e} of the extent"
         return [Finding("scene", "world far from its origin", len(self.scene), len(self.scene), worst, done)]
 
 
 def scene_extent(scene: Scene) -> tuple[Tensor, float]:
     """Median position [3] float64, and the 98 % quantile of the distances to it (1 for a scene of one point)."""
     points = scene.means[:: max(1, len(scene) // _SAMPLE)].double()
-    centre = points.median(dim=0).values
-    extent = float(torch.quantile((points - centre).norm(dim=1), 0.98))
-    return centre, extent or 1.0
+    center = points.median(dim=0).values
+    extent = float(torch.quantile((points - center).norm(dim=1), 0.98))
+    return center, extent or 1.0
 
 
 def view_findings(
@@ -289,7 +289,7 @@ def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
             angles,
             [angle > WIDE for angle in angles],
             cameras,
-            "drawn; a Gaussian's perspective is linearised at its centre, but no farther outside the view than "
+            "drawn; a Gaussian's perspective is linearized at its center, but no farther outside the view than "
             f"{FRUSTUM_MARGIN:.0%} of half its width",
         ),
         *_of_views(
@@ -318,8 +318,8 @@ def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
 
 def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]:
     """Cameras with Gaussians closer than the near plane."""
-    centres = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.centre[None].double() for camera in cameras)])
-    close = [float(count) for count in closer(scene.means, centres, near)]
+    centers = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.center[None].double() for camera in cameras)])
+    close = [float(count) for count in closer(scene.means, centers, near)]
     return _of_views(
         f"camera inside the scene: Gaussians within {near:g} of it (value: how many)",
         close,
@@ -329,20 +329,20 @@ def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]
     )
 
 
-def closer(means: Tensor, centres: Tensor, distance: float) -> list[int]:
-    """How many of the points [N, 3] are closer than a distance to each of some centres [V, 3] float64.
+def closer(means: Tensor, centers: Tensor, distance: float) -> list[int]:
+    """How many of the points [N, 3] are closer than a distance to each of some centers [V, 3] float64.
 
-    Points are first held against all centres by their x alone, which hardly any of them passes.
+    Points are first held against all centers by their x alone, which hardly any of them passes.
     """
-    along = centres[:, 0].sort().values.contiguous()
-    counts = [0] * len(centres)
+    along = centers[:, 0].sort().values.contiguous()
+    counts = [0] * len(centers)
     for part in _parts(len(means)):
         points = means[part].double()
         x = points[:, 0].contiguous()
         reach = distance * (1 + 1e-9) + 1e-12 * x.abs()  # more than rounding takes away
         points = points[torch.searchsorted(along, x + reach, right=True) > torch.searchsorted(along, x - reach)]
-        for view in range(len(centres) if len(points) else 0):
-            counts[view] += int(((points - centres[view]).norm(dim=1) < distance).sum())
+        for view in range(len(centers) if len(points) else 0):
+            counts[view] += int(((points - centers[view]).norm(dim=1) < distance).sum())
     return counts
 
 
@@ -401,11 +401,11 @@ def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
         look,
         _Question(
             "in no view",
-            "neither drawn nor optimised; at the end they take their neighbours' colour change (`paper`: none)",
+            "neither drawn nor optimized; at the end they take their neighbors' color change (`paper`: none)",
         ),
         _Question(
             "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)",
-            "optimised as all others, and as fast: from other viewpoints their colours may be extreme",
+            "optimized as all others, and as fast: from other viewpoints their colors may be extreme",
             largest=False,
         ),
         subject="views",
@@ -418,8 +418,8 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
     found = []
     spread = float(style.double().std(dim=(0, 1), correction=0).max())
     if spread < FLAT_STYLE:
-        done = "its features hardly vary: the scene is drawn to one flat colour"
-        found.append(Finding("style", "one colour throughout", 1, 1, f"standard deviation {spread:.2g}", done))
+        done = "its features hardly vary: the scene is drawn to one flat color"
+        found.append(Finding("style", "one color throughout", 1, 1, f"standard deviation {spread:.2g}", done))
     aspect = max(height, width) / min(height, width)
     if aspect > LONG_STYLE:
         done = "used whole; its shorter side decides to what size it is brought down"

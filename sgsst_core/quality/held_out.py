@@ -1,6 +1,6 @@
 """Quality on views that were never trained on, measured at moments of a run.
 
-No camera is taken away from the training: held-out views lie halfway between neighbouring cameras. What is measured is
+No camera is taken away from the training: held-out views lie halfway between neighboring cameras. What is measured is
 how far their style is from the style image's (the Gram terms of the SOS loss) and how well they agree with each other
 (multi-view consistency). Geometry is frozen, so that coverage and warps are the same at every moment and are kept.
 """
@@ -36,17 +36,17 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.arguments import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene, sampled
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.regions import RegionMaps
 
 #: Views whose Gram distance is measured, and pairs of each range that are compared, at most.
 MOST_VIEWS = 4
-#: Two cameras farther apart than so many median steps are no neighbours: the capture was broken off between them.
+#: Two cameras farther apart than so many median steps are no neighbors: the capture was broken off between them.
 JUMP = 4.0
 #: Nor are two that are turned against each other by more than this, about the field of view of a photo: halfway between
 #: them, nothing need be in view that either sees.
 LARGEST_TURN = math.radians(60)
-#: Median depth and coverage of a held-out view are at least the smaller of its neighbours' divided by this, and at most
+#: Median depth and coverage of a held-out view are at least the smaller of its neighbors' divided by this, and at most
 #: the larger times this. Inside an object or behind a wall they are not; on the chord of an arc of 60 degrees they
 #: change by no more than a third.
 LIKENESS = 2.0
@@ -58,26 +58,26 @@ _OUTLOOK_GAUSSIANS = 250_000
 _COSINE_ROUNDING = 1e-6
 
 
-def neighbours(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
-    """The pairs that held-out cameras lie between: each two neighbours; neighbours in space follow each other.
+def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
+    """The pairs that held-out cameras lie between: each two neighbors; neighbors in space follow each other.
 
-    The list's order counts. Where the next camera is mostly no neighbour (see `JUMP` and `LARGEST_TURN`) the list is
+    The list's order counts. Where the next camera is mostly no neighbor (see `JUMP` and `LARGEST_TURN`) the list is
     not in the order of a capture, and a walk from each camera to the nearest one takes its place. Fewer than two
     cameras have nothing between them, and neither have two of one pose.
     """
     if len(cameras) < 2:
         return []
-    centres = torch.stack([camera.centre for camera in cameras])
+    centers = torch.stack([camera.center for camera in cameras])
     rotations = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
-    walk = _walk(centres, rotations)
-    steps = (centres[walk[1:]] - centres[walk[:-1]]).norm(dim=1)
+    walk = _walk(centers, rotations)
+    steps = (centers[walk[1:]] - centers[walk[:-1]]).norm(dim=1)
     reach = JUMP * float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
 
     def pairs(order: Sequence[int]) -> list[tuple[Camera, Camera]]:
         return [
             (cameras[i], cameras[j])
             for i, j in itertools.pairwise(order)
-            if float((centres[i] - centres[j]).norm()) <= reach
+            if float((centers[i] - centers[j]).norm()) <= reach
             and bool(_similarly_turned(rotations[i], rotations[j]))
             and not torch.allclose(cameras[i].world_to_camera, cameras[j].world_to_camera)
         ]
@@ -86,16 +86,16 @@ def neighbours(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     return in_order if 2 * len(in_order) >= len(cameras) - 1 else max(in_order, pairs(walk), key=len)
 
 
-def _walk(centres: Tensor, rotations: Tensor) -> list[int]:
+def _walk(centers: Tensor, rotations: Tensor) -> list[int]:
     """An order of cameras [n, 3], [n, 3, 3] that goes to the nearest one left, similarly turned ones first."""
-    left = torch.ones(len(centres), dtype=torch.bool)
+    left = torch.ones(len(centers), dtype=torch.bool)
     left[0] = False
     order = [0]
     while bool(left.any()):
         here = order[-1]
         similar = left & _similarly_turned(rotations, rotations[here])
         candidates = (similar if bool(similar.any()) else left).nonzero()[:, 0]
-        order.append(int(candidates[(centres[candidates] - centres[here]).norm(dim=1).argmin()]))
+        order.append(int(candidates[(centers[candidates] - centers[here]).norm(dim=1).argmin()]))
         left[order[-1]] = False
     return order
 
@@ -122,7 +122,7 @@ class HeldOutMoment:
     long: Consistency | None
 
     def as_dict(self, step: int, seconds: float) -> dict[str, Any]:
-        """The measurement after `step` iterations and `seconds` of optimisation, as values that JSON can hold."""
+        """The measurement after `step` iterations and `seconds` of optimization, as values that JSON can hold."""
         return {
             "step": step,
             "seconds": seconds,
@@ -147,7 +147,7 @@ class HeldOut:
         lpips: None leaves LPIPS out.
         first: `HeldOutMoment.gram` of the run's first measurement, where a session before this one has made it.
         most: views whose Gram distance is measured, and pairs of each range that are compared, at most.
-        memory: bytes that coverage, colours, warps and pictures may take; what does not fit is computed again.
+        memory: bytes that coverage, colors, warps and pictures may take; what does not fit is computed again.
         rasterizer_of: makes one of a part of the scene, for a first look at the views of a large one; None looks at
             all of it.
         maps: renders the share of each region, which `style_targets` are those of; None where the scene has none.
@@ -199,7 +199,7 @@ class HeldOut:
         self._coverage: Shelf[int, Tensor] = Shelf(memory // 8, _tensor_bytes)
         self._warps: Shelf[tuple[int, int], Warp] = Shelf(memory // 2, lambda warp: warp.nbytes)
         self._picture_memory = memory // 4
-        parents = neighbours([cameras[index] for index in covered])
+        parents = neighbors([cameras[index] for index in covered])
         self.cameras = [between(*pair) for pair in parents]
         self.views, self.pairs = self._choose(parents, most)
 
@@ -216,7 +216,7 @@ class HeldOut:
         if self._rasterizer_of is not None and len(rough) > _OUTLOOK_GAUSSIANS:
             rough = sampled(rough, _OUTLOOK_GAUSSIANS)
             rasterizer = self._rasterizer_of(rough)
-        looks: dict[CameraKey, tuple[float, float | None]] = {}  # a camera is the neighbour of two
+        looks: dict[CameraKey, tuple[float, float | None]] = {}  # a camera is the neighbor of two
 
         def outlook(view: Camera) -> tuple[float, float | None]:
             key = camera_key(view)
@@ -232,7 +232,7 @@ class HeldOut:
     def _is_clear(
         self, camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], tuple[float, float | None]]
     ) -> bool:
-        """Whether a held-out camera sees much the same as its neighbours do, rather than the inside of something."""
+        """Whether a held-out camera sees much the same as its neighbors do, rather than the inside of something."""
         (covered, depth), *others = (outlook(view) for view in (camera, *parents))
         return (
             covered > 0
@@ -242,7 +242,7 @@ class HeldOut:
 
     @torch.no_grad()
     def measure(self, sh_dc: Tensor) -> HeldOutMoment:
-        """Measure the scene with colours sh_dc [N, 3].
+        """Measure the scene with colors sh_dc [N, 3].
 
         Raises:
             ValueError: a picture holds NaN or infinity.
@@ -269,8 +269,8 @@ class HeldOut:
         if self.scene.sh_degree == 0:
             rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
         else:
-            rest = self._rest.get(index, lambda: rest_colours(self._sh_rest, self._means, camera))
-        return shown(self.rasterizer.render(view_colours(sh_dc, rest), camera), camera, self.rasterizer.device)
+            rest = self._rest.get(index, lambda: rest_colors(self._sh_rest, self._means, camera))
+        return shown(self.rasterizer.render(view_colors(sh_dc, rest), camera), camera, self.rasterizer.device)
 
     def _gram(self, picture: Callable[[int], Tensor]) -> dict[int, float]:
         """Scale to Gram distance, the mean over the views that have the scale."""

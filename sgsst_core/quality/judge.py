@@ -1,8 +1,8 @@
-"""How a stylized scene looks, judged by a network that no run optimises.
+"""How a stylized scene looks, judged by a network that no run optimizes.
 
-A job's own loss cannot tell whether its result is good: it is what was minimised. AlexNet's features (those of LPIPS)
+A job's own loss cannot tell whether its result is good: it is what was minimized. AlexNet's features (those of LPIPS)
 are not, and so its Gram matrices say how near a picture's textures are to the style's, its distances how much is left
-of the content, and plain colours how near the palette is. Only what Gaussians cover counts, and every view is judged
+of the content, and plain colors how near the palette is. Only what Gaussians cover counts, and every view is judged
 on black and on white behind them: an object scan has no surround of its own.
 """
 
@@ -27,7 +27,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.regions import JobStyles
 
 #: Longer side in pixels at which views are judged: figures of one scene at several resolutions can be compared, and a
@@ -37,23 +37,23 @@ JUDGED_SIDE = 1024
 _BEHIND = (0.0, 1.0)
 #: Views that Gaussians cover by less than this share are not judged.
 _LEAST_COVERAGE = 1e-3
-#: Colours are compared in steps of 8 bits.
+#: Colors are compared in steps of 8 bits.
 _LEVELS = 255.0
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Judgment:
     """Means over views, and over black and white behind them.
 
     Attributes:
         style: mean over AlexNet's five layers of |G - G_style| / |G_style|, Frobenius norms of Gram matrices (mean over
             positions of F F^T); 0 is the style's texture.
-        palette: Frechet distance of the RGB colours, in levels of 8 bits: sqrt(|m - m_style|^2 + tr(C + C_style -
+        palette: Frechet distance of the RGB colors, in levels of 8 bits: sqrt(|m - m_style|^2 + tr(C + C_style -
             2 (C C_style)^1/2)); 0 is the style's mean and covariance.
         content: LPIPS (AlexNet) against the unstylized scene; 0 is the same picture.
         features: mean over the layers of 1 - cosine of AlexNet's features against the unstylized scene's.
         swing: mean over views of how much `style` differs between black and white.
-        saturated: share of the Gaussians of whose colour a channel is outside [0, 1].
+        saturated: share of the Gaussians of whose color a channel is outside [0, 1].
     """
 
     style: float
@@ -65,7 +65,7 @@ class Judgement:
 
 
 class Judge:
-    """Judges colours of one scene by one style.
+    """Judges colors of one scene by one style.
 
     Args:
         lpips: with AlexNet.
@@ -78,7 +78,7 @@ class Judge:
         background: [3], what the rasterizer has behind the Gaussians.
 
     Attributes:
-        cameras: those that are judged; without any there is no judgement.
+        cameras: those that are judged; without any there is no judgment.
     """
 
     def __init__(
@@ -105,8 +105,8 @@ class Judge:
         ]
 
     @torch.no_grad()
-    def judge(self, sh_dc: Tensor) -> Judgement | None:
-        """Of colours sh_dc [N, 3]; None without views.
+    def judge(self, sh_dc: Tensor) -> Judgment | None:
+        """Of colors sh_dc [N, 3]; None without views.
 
         Raises:
             ValueError: a picture holds NaN or infinity.
@@ -119,11 +119,11 @@ class Judge:
             fmean(fmean(one[place] for one in view) for view in views) for place in range(4)
         )
         swing = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        return Judgement(style, palette, content, features, swing, saturated(sh_dc))
+        return Judgment(style, palette, content, features, swing, saturated(sh_dc))
 
     @torch.no_grad()
     def pictures(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
-        """Pictures [H, W, 3] of colours sh_dc [N, 3] on black and on white."""
+        """Pictures [H, W, 3] of colors sh_dc [N, 3] on black and on white."""
         image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
         return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
 
@@ -158,11 +158,11 @@ class Judge:
         """Image [H, W, 3] over the rasterizer's background, and coverage [H, W]."""
         rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
         if self.scene.sh_degree:
-            rest = rest_colours(self._sh_rest, self._means, camera)
-        return self._rasterizer.render(view_colours(sh_dc, rest), camera), self._rasterizer.coverage(camera)
+            rest = rest_colors(self._sh_rest, self._means, camera)
+        return self._rasterizer.render(view_colors(sh_dc, rest), camera), self._rasterizer.coverage(camera)
 
     def _on(self, image: Tensor, coverage: Tensor, camera: Camera, behind: float) -> Tensor:
-        """The picture with another colour behind the Gaussians."""
+        """The picture with another color behind the Gaussians."""
         return shown(image + (1 - coverage)[..., None] * (behind - self._background), camera, self._lpips.device)
 
     def _parts(self, camera: Camera, coverage: Tensor) -> list[tuple[_StyleJudge, Tensor, float]]:
@@ -186,7 +186,7 @@ class _StyleJudge:
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
 
     def palette(self, picture: Tensor, weights: Tensor) -> float:
-        """Frechet distance of the colours of a picture [H, W, 3] with position weights [H, W]."""
+        """Frechet distance of the colors of a picture [H, W, 3] with position weights [H, W]."""
         return frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette)
 
     def distance(self, features: list[Tensor], weights: Tensor) -> float:
@@ -217,13 +217,13 @@ class _StyleJudge:
 
 
 def saturated(sh_dc: Tensor) -> float:
-    """Share of colours sh_dc [N, 3] of which a channel is outside [0, 1], where no screen shows it."""
-    colours = 0.5 + SH_C0 * sh_dc.double()
-    return float(((colours < 0) | (colours > 1)).any(dim=1).double().mean())
+    """Share of colors sh_dc [N, 3] of which a channel is outside [0, 1], where no screen shows it."""
+    colors = 0.5 + SH_C0 * sh_dc.double()
+    return float(((colors < 0) | (colors > 1)).any(dim=1).double().mean())
 
 
 def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
-    """Of two normal distributions of colours (mean [3], covariance [3, 3]) in 0..1, in levels of 8 bits."""
+    """Of two normal distributions of colors (mean [3], covariance [3, 3]) in 0..1, in levels of 8 bits."""
     (mean, covariance), (other_mean, other) = first, second
     other_mean, other = other_mean.to(mean), other.to(covariance)
     root = _square_root(covariance)
@@ -240,13 +240,13 @@ def _square_root(matrix: Tensor) -> Tensor:
     return root
 
 
-def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean [3] and covariance [3, 3], float64, of colours [n, 3]."""
-    colours, weights = colours.double(), weights.double()
+def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean [3] and covariance [3, 3], float64, of colors [n, 3]."""
+    colors, weights = colors.double(), weights.double()
     total = weights.sum()
-    mean = colours.T @ weights / total
-    centred = colours - mean
-    return mean, (weights[:, None] * centred).T @ centred / total
+    mean = colors.T @ weights / total
+    centered = colors - mean
+    return mean, (weights[:, None] * centered).T @ centered / total
 
 
 def _pooled(coverage: Tensor, features: Tensor) -> Tensor:

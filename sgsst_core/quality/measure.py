@@ -35,10 +35,10 @@ class Measurements:
 
     Everything is built at first use. Results go to `Stylizer.measured`, one entry a moment, ready for JSON: "step",
     "held_out" and "approximation" (None where there is nothing to measure), the "seconds" it took. The moment of step 0
-    is measured together with the one after it, from the unstylized colours, so that the first step need not wait. How
+    is measured together with the one after it, from the unstylized colors, so that the first step need not wait. How
     much is measured is the plan's, or less where the first view takes longer than it thought: decided once, by the
     first rank, and kept in the first entry with what a moment takes after it ("level", "again"). The last entry holds
-    what the result is "judged" to be (`Judgement`, "before" and "after"), where AlexNet is installed.
+    what the result is "judged" to be (`Judgment`, "before" and "after"), where AlexNet is installed.
 
     Args:
         stylizer: the job, at any step.
@@ -92,15 +92,15 @@ class Measurements:
         return left * max(price, 0.0) + losses
 
     def evaluate(self, *, unstylized: bool = False) -> Evaluation:
-        """Exact loss on the evaluation views, of the present colours or of the unstylized scene."""
+        """Exact loss on the evaluation views, of the present colors or of the unstylized scene."""
         stylizer = self._stylizer
         if unstylized and not self.approximated:
             return stylizer.start()
         with stylizer.measuring():
             if not self.approximated:
                 return stylizer.evaluate(stylizer.evaluation_views, stylizer.shown())
-            colours = stylizer.scene.sh_dc if unstylized else stylizer.stylized()
-            return self.exact.evaluate(stylizer.evaluation_views, colours)
+            colors = stylizer.scene.sh_dc if unstylized else stylizer.stylized()
+            return self.exact.evaluate(stylizer.evaluation_views, colors)
 
     def at_the_end(self) -> None:
         """Measure the last moment, wherever the job has ended, unless that has been done."""
@@ -129,8 +129,8 @@ class Measurements:
         views = [held_out.cameras[index] for index in held_out.views]
         background = stylizer.settings.background
         judge = Judge(held_out.lpips, stylizer.styles, held_out.scene, held_out.rasterizer, views, background)
-        colours = {"before": stylizer.scene.sh_dc, "after": stylizer.stylized()}
-        found = {name: judge.judge(sh_dc) for name, sh_dc in colours.items()}
+        colors = {"before": stylizer.scene.sh_dc, "after": stylizer.stylized()}
+        found = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
         stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in found.items() if one} or None
 
     def _measure_start(self) -> None:
@@ -152,8 +152,8 @@ class Measurements:
         entry["seconds"] = time.perf_counter() - started
         stylizer.measured.append(entry)
 
-    def _moment(self, colours: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
-        """Held-out views with colours [N, 3]; None without any. `own`: what the first entry holds."""
+    def _moment(self, colors: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
+        """Held-out views with colors [N, 3]; None without any. `own`: what the first entry holds."""
         stylizer, held_out = self._stylizer, self._of_held_out_views()
         if own:
             own["held_out_views"] = [held_out.cameras[index].name for index in held_out.views]
@@ -161,17 +161,17 @@ class Measurements:
             own["approximated"] = self.approximated
         if not held_out.views:
             return None
-        measured = held_out.measure(colours.to(held_out.rasterizer.device))
+        measured = held_out.measure(colors.to(held_out.rasterizer.device))
         if not start and (not stylizer.measured or stylizer.measured[0]["step"]):  # no start to compare it with
             measured = replace(measured, gram_relative=None)
         return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
 
-    def _first(self, colours: Tensor, seconds: float) -> dict[str, Any]:
+    def _first(self, colors: Tensor, seconds: float) -> dict[str, Any]:
         """How much is measured, from what one view of it takes; seconds: of a moment beside its views."""
         stylizer, place = self._stylizer, self._stylizer.plan.measuring
         again = 0.0
         if LEVELS[place].views and LEVELS[place].start:
-            held_out, prices = self._trial(colours, seconds)
+            held_out, prices = self._trial(colors, seconds)
             if held_out.views:
                 place = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
                 again = prices.again(LEVELS[place])
@@ -181,14 +181,14 @@ class Measurements:
             self._held_out = self._make(LEVELS[place].views)
         return {"level": place, "again": again}
 
-    def _trial(self, colours: Tensor, seconds: float) -> tuple[HeldOut, Prices]:
-        """One view of colours [N, 3], measured, and its price; seconds: of a moment beside its views."""
+    def _trial(self, colors: Tensor, seconds: float) -> tuple[HeldOut, Prices]:
+        """One view of colors [N, 3], measured, and its price; seconds: of a moment beside its views."""
         lpips = load_lpips_or_none(self._stylizer.network.device)  # is not what a view takes
         clock = [time.perf_counter()]
         held_out = self._make(1, lpips)
         for _ in range(2 if held_out.views else 0):  # the first time its lists, depth and warps are made
             clock.append(time.perf_counter())
-            held_out.measure(colours.to(held_out.rasterizer.device))
+            held_out.measure(colors.to(held_out.rasterizer.device))
         clock.append(time.perf_counter())
         again = clock[-1] - clock[-2]
         return held_out, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
@@ -206,7 +206,7 @@ class Measurements:
         return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
 
     def _source_of_statistics(self) -> Stylizer | ExactLoss:
-        """What has network and style targets to measure Gram distances with: exact ones, whatever the job optimises."""
+        """What has network and style targets to measure Gram distances with: exact ones, whatever the job optimizes."""
         if not has_statistics(self._stylizer.settings.style_loss):
             return ExactLoss(self._stylizer, "sos")
         return self.exact if self._stylizer.network.precision != "float32" else self._stylizer

@@ -12,7 +12,7 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 #: Views that are looked at, and their longer side in pixels.
 _VIEWS, _SIDE = 3, 256
@@ -27,7 +27,7 @@ class PackedLoss:
         form: of the file.
         size: bytes.
         views: names of the views that were compared.
-        psnr: peak signal-to-noise ratio of their pictures, colours clamped to 0..1, in dB; None where all are equal.
+        psnr: peak signal-to-noise ratio of their pictures, colors clamped to 0..1, in dB; None where all are equal.
     """
 
     name: str
@@ -72,7 +72,7 @@ def measure_packed(
     squares = values = 0.0
     for camera in chosen:
         first, second = (
-            rasterizer.render(view_colours(each.sh_dc, rest_colours(each.sh_rest, each.means, camera)), camera).clamp(
+            rasterizer.render(view_colors(each.sh_dc, rest_colors(each.sh_rest, each.means, camera)), camera).clamp(
                 0, 1
             )
             for rasterizer, each in zip(pairs, (scene, back.scene), strict=True)

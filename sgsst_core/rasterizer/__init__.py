@@ -1,7 +1,7 @@
 """Rasterizers: one small protocol, six implementations.
 
-Geometry is frozen, so a view's image is linear in its colours: image = W c + T_final * background,
-and the gradient with respect to the colours is W^T dL/dimage.
+Geometry is frozen, so a view's image is linear in its colors: image = W c + T_final * background,
+and the gradient with respect to the colors is W^T dL/dimage.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ RasterizerName = Literal["reference", "cpu", "cached", "triton", "cuda"]
 
 
 class Rasterizer(Protocol):
-    """Renders one scene's frozen geometry with any colours.
+    """Renders one scene's frozen geometry with any colors.
 
-    `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colours` are the
-    colours of one view, after spherical harmonics and clamp. Arguments may come in any floating dtype and from any
+    `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colors` are the
+    colors of one view, after spherical harmonics and clamp. Arguments may come in any floating dtype and from any
     device; results are on `device`, in `dtype`. A wrong shape is a ValueError.
 
     Images are of full size (`scale` 0) but for `coarse`, whose images are 2^scale x 2^scale box averages of the
@@ -38,15 +38,15 @@ class Rasterizer(Protocol):
     device: torch.device
     dtype: torch.dtype
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] of colours [N, 3] in the camera's rows, over the background."""
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] of colors [N, 3] in the camera's rows, over the background."""
         ...
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
         """1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
         ...
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
         ...
 

@@ -31,15 +31,15 @@ def check_rows(camera: Camera, rows: Rows | None) -> Rows:
     return start, stop
 
 
-def check_colours(colours: Tensor, gaussians: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`colours` [N, 3], contiguous, in the dtype and on the device of the rasterizer.
+def check_colors(colors: Tensor, gaussians: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`colors` [N, 3], contiguous, in the dtype and on the device of the rasterizer.
 
     Raises:
-        ValueError: not one colour for each Gaussian of the scene.
+        ValueError: not one color for each Gaussian of the scene.
     """
-    if tuple(colours.shape) != (gaussians, 3):
-        raise ValueError(f"colours of shape {tuple(colours.shape)}: the scene needs {(gaussians, 3)}")
-    return colours.detach().to(device=device, dtype=dtype).contiguous()
+    if tuple(colors.shape) != (gaussians, 3):
+        raise ValueError(f"colors of shape {tuple(colors.shape)}: the scene needs {(gaussians, 3)}")
+    return colors.detach().to(device=device, dtype=dtype).contiguous()
 
 
 def check_image_gradient(

@@ -21,7 +21,7 @@ from sgsst_core.rasterizer.arguments import (
     CameraKey,
     Rows,
     camera_key,
-    check_colours,
+    check_colors,
     check_image_gradient,
     check_rows,
 )
@@ -49,7 +49,7 @@ class CachedRasterizer:
     exceed `max_bytes`; nothing is ever evicted (views come round in turn, so that what is evicted would be needed again
     before what is kept). Views and bands without kept weights are computed each time, on the same device, by `cpu` or
     `triton`: on the CPU with the same image as float32 weights give and gradients within rounding, on a GPU both within
-    rounding. A band is served from the whole view's weights where those are kept, else from its own. Colour gradients
+    rounding. A band is served from the whole view's weights where those are kept, else from its own. Color gradients
     repeat to the bit.
 
     Args:
@@ -144,10 +144,10 @@ class CachedRasterizer:
         """Whether the band is served from kept weights by now."""
         return self._serving(camera_key(camera), check_rows(camera, rows), camera) is not None
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
         band = check_rows(camera, rows)
-        values = check_colours(colours, len(self.scene), torch.float32, self.device)
+        values = check_colors(colors, len(self.scene), torch.float32, self.device)
         kept = self._kept_for(camera, band)
         if kept is None:
             return self.anew.render(values, camera, band)
@@ -161,18 +161,18 @@ class CachedRasterizer:
             return self.anew.coverage(camera, band)
         return 1 - kept.weights.transmittance[band[0] - kept.band[0] : band[1] - kept.band[0]]
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
         kept = self._kept_for(camera, band)
         if kept is None:
-            return self.anew.colour_gradient(pixels, camera, band)
+            return self.anew.color_gradient(pixels, camera, band)
         if kept.band != band:  # the weights of the whole view: no gradient from the other rows
             whole = pixels.new_zeros((camera.height, camera.width, 3))
             whole[band[0] : band[1]] = pixels
             pixels = whole
-        return kept.weights.colour_gradient(pixels)
+        return kept.weights.color_gradient(pixels)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]; keeps nothing."""

@@ -1,6 +1,6 @@
 """`coarse`: the box average of a view and its blend weights kept as one operator, for phase 1.
 
-At scale s the optimiser sees image_s = D (W c + T_final background), D the 2^s x 2^s box average
+At scale s the optimizer sees image_s = D (W c + T_final background), D the 2^s x 2^s box average
 (`pyramid.downscale`). Geometry is frozen, so D W never changes either; and because the pixels of a square
 share one weight, it is far smaller than W, and faster to apply by as much.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import coarse_kernels, kernels
-from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colours
+from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colors
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
@@ -114,16 +114,16 @@ class CoarseOperator:
         """Bytes kept in memory."""
         return sum(a.nbytes for a in (*self.pieces, self.transmittance, self.gaussians, self.first_slots))
 
-    def render(self, colours: NDArray[np.float32], background: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Image [h, w, 3] of colours [N, 3]."""
+    def render(self, colors: NDArray[np.float32], background: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Image [h, w, 3] of colors [N, 3]."""
         image = np.empty((*self.transmittance.shape, 3), dtype=np.float32)
         with kernel_threads():
             coarse_kernels.apply_pieces(
-                self.pieces, colours, background, self.transmittance, self.across, self.scale, image
+                self.pieces, colors, background, self.transmittance, self.across, self.scale, image
             )
         return image
 
-    def colour_gradient(self, image_gradient: NDArray[np.float32], gaussians: int) -> NDArray[np.float32]:
+    def color_gradient(self, image_gradient: NDArray[np.float32], gaussians: int) -> NDArray[np.float32]:
         """W^T D^T dL/dimage_s, [gaussians, 3], of image_gradient [h, w, 3]."""
         gradient = np.zeros((gaussians, 3), dtype=np.float32)
         slot_gradients = np.empty((len(self.pieces.slots), 3), dtype=np.float32)
@@ -228,11 +228,11 @@ class CoarseRasterizer:
         """Whether a view is served from a kept operator by now."""
         return self._operators.kept.get((camera_key(camera), self.scale)) is not None
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, W >> scale, 3] float32 of colours [N, 3] in some rows at the scale, over the background."""
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, W >> scale, 3] float32 of colors [N, 3] in some rows at the scale, over the background."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
-        values = check_colours(colours, len(self.scene), torch.float32, _CPU)
+        values = check_colors(colors, len(self.scene), torch.float32, _CPU)
         operator = self._operators.get(camera, self.scale, grid)
         if operator is None:
             return downscale(self._cpu.render(values, camera, self._full_size(band)), self.scale)
@@ -248,7 +248,7 @@ class CoarseRasterizer:
             return downscale(self._cpu.coverage(camera, self._full_size(band)), self.scale)
         return 1 - downscale(torch.from_numpy(operator.transmittance), self.scale - operator.scale)[slice(*band)]
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T D^T dL/dimage_s, [N, 3] float32, of image_gradient [h, W >> scale, 3] in some rows at the scale."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
@@ -257,12 +257,12 @@ class CoarseRasterizer:
         if operator is None:
             whole = torch.zeros((camera.height, camera.width, 3))
             add_upscaled_(whole, pixels, self.scale)
-            return self._cpu.colour_gradient(whole, camera)
+            return self._cpu.color_gradient(whole, camera)
         if self.scale > operator.scale:
             of_squares = pixels
             pixels = torch.zeros((*grid.shape(operator.scale), 3))
             add_upscaled_(pixels, of_squares, self.scale - operator.scale)
-        return torch.from_numpy(operator.colour_gradient(pixels.numpy(), len(self.scene)))
+        return torch.from_numpy(operator.color_gradient(pixels.numpy(), len(self.scene)))
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Coverage [h, W >> scale], and each Gaussian's blend weights summed over its pixels [N]."""

@@ -129,7 +129,7 @@ def keep_pieces(
 
 @compiled()
 def _add_piece(weights, begin, count, pixels, red, green, blue):
-    """pixels[v, c, i] += weights[begin + 8 v + i] * colour c for a piece of `count` weights."""
+    """pixels[v, c, i] += weights[begin + 8 v + i] * color c for a piece of `count` weights."""
     if count >= LANES:
         add_scaled(weights, begin, count // LANES, pixels, 0, red, green, blue)
         return
@@ -153,8 +153,8 @@ def _dot_piece(weights, begin, count, pixels):
 
 
 @compiled(parallel=True)
-def apply_pieces(pieces, colours, background, transmittance, across, scale, image):
-    """Image [h, w, 3] of colours [N, 3] over the background: the box average of what `kernels.render` computes."""
+def apply_pieces(pieces, colors, background, transmittance, across, scale, image):
+    """Image [h, w, 3] of colors [N, 3] over the background: the box average of what `kernels.render` computes."""
     starts, gaussians, _, weights = pieces
     height, width = transmittance.shape
     side = _TILE >> scale
@@ -167,7 +167,7 @@ def apply_pieces(pieces, colours, background, transmittance, across, scale, imag
             pixels[:] = _ZERO
             for piece in range(run, min(run + _RUN, starts[tile + 1])):
                 gaussian = gaussians[piece]
-                red, green, blue = colours[gaussian, 0], colours[gaussian, 1], colours[gaussian, 2]
+                red, green, blue = colors[gaussian, 0], colors[gaussian, 1], colors[gaussian, 2]
                 _add_piece(weights, piece * count, count, pixels, red, green, blue)
             totals += pixels
         for row in range(min(height - y, side)):
@@ -180,7 +180,7 @@ def apply_pieces(pieces, colours, background, transmittance, across, scale, imag
 
 @compiled(parallel=True)
 def apply_transposed_pieces(pieces, image_gradient, across, scale, slot_gradients):
-    """dL/dcolour of every piece in its slot [P, 3], of the gradient [h, w, 3] of the averaged image."""
+    """dL/dcolor of every piece in its slot [P, 3], of the gradient [h, w, 3] of the averaged image."""
     starts, _, slots, weights = pieces
     height, width = image_gradient.shape[0], image_gradient.shape[1]
     side = _TILE >> scale

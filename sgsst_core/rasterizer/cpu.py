@@ -12,7 +12,7 @@ from sgsst_core.constants import ALPHA_MAX, NEAR
 from sgsst_core.rasterizer import kernels
 from sgsst_core.rasterizer.arguments import (
     Rows,
-    check_colours,
+    check_colors,
     check_image_gradient,
     check_rows,
 )
@@ -104,9 +104,9 @@ class CpuRasterizer:
         self._lists.take(camera)
         self._lists.limit(left)
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
-        values = check_colours(colours, len(self.scene), torch.float32, _CPU).numpy()
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
+        values = check_colors(colors, len(self.scene), torch.float32, _CPU).numpy()
         return self._render(values, camera, check_rows(camera, rows))[0]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
@@ -114,7 +114,7 @@ class CpuRasterizer:
         nothing = np.zeros((len(self.scene), 3), dtype=np.float32)
         return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, _CPU).numpy()
@@ -123,7 +123,7 @@ class CpuRasterizer:
         slot_gradients = np.empty((len(lists.ranks), 3), dtype=np.float32)
         gradient = np.zeros((len(self.scene), 3), dtype=np.float32)
         with kernel_threads():
-            kernels.colour_gradient(
+            kernels.color_gradient(
                 lists.ranks,
                 lists.slots,
                 lists.starts,
@@ -139,7 +139,7 @@ class CpuRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Coverage [height, width] and each Gaussian's blend weights summed over all pixels [N], float32, in one pass.
 
-        The same bits as `coverage`, and as a column of `colour_gradient` of ones.
+        The same bits as `coverage`, and as a column of `color_gradient` of ones.
         """
         lists = self.lists(camera)
         slot_weights = np.empty(len(lists.ranks), dtype=np.float32)
@@ -151,7 +151,7 @@ class CpuRasterizer:
             kernels.add_slot_weights(slot_weights, lists.first_slots, lists.projection.gaussians, weights)
         return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
 
-    def _render(self, colours: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+    def _render(self, colors: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Image and final transmittance of a band."""
         lists = self.lists(camera)
         height = band[1] - band[0]
@@ -163,7 +163,7 @@ class CpuRasterizer:
                 lists.starts,
                 lists.projection.values,
                 lists.projection.gaussians,
-                colours,
+                colors,
                 self.background,
                 band[0],
                 self.alpha_max,

@@ -2,7 +2,7 @@
 
 gsplat's `rasterization` is taken apart into its public stages. Geometry is frozen, so projection and tile lists are
 computed once a view; and a band is exact, because the projection (whose slopes are clamped to the whole view's frustum)
-does not see the band: the projected centres are moved up by its first row, and tiles that no longer lie in the image
+does not see the band: the projected centers are moved up by its first row, and tiles that no longer lie in the image
 drop out.
 """
 
@@ -21,7 +21,7 @@ from sgsst_core.rasterizer.arguments import (
     CameraKey,
     Rows,
     camera_key,
-    check_colours,
+    check_colors,
     check_image_gradient,
     check_rows,
 )
@@ -107,10 +107,10 @@ class CudaRasterizer:
         self._opacities = scene.opacities.to(self.device).sigmoid()
         self._latest: tuple[CameraKey, Rows, _Splats] | None = None
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
         band = check_rows(camera, rows)
-        values = check_colours(colours, len(self.scene), torch.float32, self.device)
+        values = check_colors(colors, len(self.scene), torch.float32, self.device)
         with torch.no_grad():
             image, alpha = self._rasterize(values, camera, band)
         return image + (1 - alpha) * self._background
@@ -121,30 +121,30 @@ class CudaRasterizer:
         with torch.no_grad():
             return self._rasterize(nothing, camera, check_rows(camera, rows))[1][..., 0]
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows.
 
-        The image is linear in the colours, so the gradient is that of <image, image_gradient> at any colours.
+        The image is linear in the colors, so the gradient is that of <image, image_gradient> at any colors.
         """
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
         with torch.enable_grad():
-            colours = torch.zeros(len(self.scene), 3, device=self.device, requires_grad=True)
-            image, _ = self._rasterize(colours, camera, band)
-            (gradient,) = torch.autograd.grad(image, colours, pixels)
+            colors = torch.zeros(len(self.scene), 3, device=self.device, requires_grad=True)
+            image, _ = self._rasterize(colors, camera, band)
+            (gradient,) = torch.autograd.grad(image, colors, pixels)
         return gradient
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]."""
         return plain_survey(self, camera)
 
-    def _rasterize(self, colours: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+    def _rasterize(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Image [h, width, 3] over black and 1 - T_final [h, width, 1]."""
         splats = self._splats(camera, band)
         image, alpha = self._gsplat.rasterize_to_pixels(
             splats.means,
             splats.conics,
-            colours[None],
+            colors[None],
             splats.opacities,
             camera.width,
             band[1] - band[0],

@@ -24,11 +24,11 @@ class KeptWeights(Protocol):
         """Bytes that they take on the device."""
         ...
 
-    def render(self, colours: Tensor) -> Tensor:
-        """Image [h, width, 3] float32 of colours [N, 3], over the background."""
+    def render(self, colors: Tensor) -> Tensor:
+        """Image [h, width, 3] float32 of colors [N, 3], over the background."""
         ...
 
-    def colour_gradient(self, image_gradient: Tensor) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3]."""
         ...
 

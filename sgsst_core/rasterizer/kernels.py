@@ -2,10 +2,10 @@
 
 Everything goes front to back through the Gaussians of one raster tile, with the blend weights of one Gaussian in a
 block of 16 x 16 that stays in the first-level cache (`_blend`). What is done with the block differs: add it to the
-image times a colour, multiply it with dL/dimage, or keep it. All therefore see the same weights to the last bit.
+image times a color, multiply it with dL/dimage, or keep it. All therefore see the same weights to the last bit.
 
 Accuracy. Offsets between a pixel and a Gaussian are taken in float64 once a row and rounded after the large terms have
-cancelled; along the row at most 15 pixels are added in float32. So neither far-off centres nor needles lose digits.
+canceled; along the row at most 15 pixels are added in float32. So neither far-off centers nor needles lose digits.
 
 Determinism. A tile belongs to one thread. A gradient is first kept by itself for each (Gaussian, tile) in a slot of its
 own, the slots of a Gaussian lying side by side; then each Gaussian's slots are added in order.
@@ -144,13 +144,13 @@ def _scattered(step, tiles):
     """The tile at a step of a parallel loop over `_blocks(tiles) * _BLOCK_TILES`; beyond `tiles` there is none.
 
     Each thread gets a run of steps. Blocks that follow each other there lie all over the image, so that no thread has
-    the sky for itself and another the crowd; within a block tiles are neighbours, which share Gaussians.
+    the sky for itself and another the crowd; within a block tiles are neighbors, which share Gaussians.
     """
     return step // _BLOCK_TILES * _STRIDE % _blocks(tiles) * _BLOCK_TILES + step % _BLOCK_TILES
 
 
 @compiled(parallel=True)
-def render(entries, starts, values, gaussians, colours, background, first_row, alpha_max, image, transmittance):
+def render(entries, starts, values, gaussians, colors, background, first_row, alpha_max, image, transmittance):
     """Image [h, width, 3] and final transmittance [h, width] of the rows that begin at `first_row`."""
     width, last_row = image.shape[1], first_row + image.shape[0]
     across = (width + _LAST) // _TILE
@@ -176,9 +176,9 @@ def render(entries, starts, values, gaussians, colours, background, first_row, a
             prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
             rank = entries[position]
             first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
-            colour = colours[gaussians[rank]]
+            color = colors[gaussians[rank]]
             begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
-            add_scaled(weights, _PIXELS + begin * LANES, vectors, pixels, begin, colour[0], colour[1], colour[2])
+            add_scaled(weights, _PIXELS + begin * LANES, vectors, pixels, begin, color[0], color[1], color[2])
         for row in range(low, high):
             for i in range(columns):
                 transmittance[y + row - first_row, x + i] = abs(block[0, row, i])
@@ -186,8 +186,8 @@ def render(entries, starts, values, gaussians, colours, background, first_row, a
 
 
 @compiled(parallel=True)
-def colour_gradient(entries, slots, starts, values, image_gradient, first_row, alpha_max, slot_gradients):
-    """dL/dcolour of every (Gaussian, tile) in its own slot [E, 3]; zero where the tile is outside the band."""
+def color_gradient(entries, slots, starts, values, image_gradient, first_row, alpha_max, slot_gradients):
+    """dL/dcolor of every (Gaussian, tile) in its own slot [E, 3]; zero where the tile is outside the band."""
     width, last_row = image_gradient.shape[1], first_row + image_gradient.shape[0]
     across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
@@ -234,7 +234,7 @@ def add_slots(slot_gradients, first_slots, gaussians, gradient):
 def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittance):
     """Final transmittance [h, w] of a whole view, and the sum of each (Gaussian, tile)'s weights in its slot [E].
 
-    The same bits as `render` and as `colour_gradient` of ones, in one pass.
+    The same bits as `render` and as `color_gradient` of ones, in one pass.
     """
     height, width = transmittance.shape
     across = (width + _LAST) // _TILE
@@ -387,7 +387,7 @@ def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slo
 
 
 @compiled(parallel=True)
-def apply_weights(strips, colours, background, transmittance, first_row, image):
+def apply_weights(strips, colors, background, transmittance, first_row, image):
     """Image of kept weights: what `render` computes, without computing a weight."""
     item_starts, piece_starts, item_gaussians, _, piece_items, weights = strips
     height, width = transmittance.shape
@@ -396,15 +396,15 @@ def apply_weights(strips, colours, background, transmittance, first_row, image):
         x, y = strip % across * STRIP, strip // across * _TILE
         begin, end = item_starts[strip], item_starts[strip + 1]
         pixels = np.zeros((_TILE, 3, LANES), dtype=np.float32)
-        strip_colours = np.empty((end - begin, 3), dtype=np.float32)
+        strip_colors = np.empty((end - begin, 3), dtype=np.float32)
         for item in range(begin, end):
             gaussian = item_gaussians[item]
             for channel in range(3):
-                strip_colours[item - begin, channel] = colours[gaussian, channel]
+                strip_colors[item - begin, channel] = colors[gaussian, channel]
         for part in range(BLOCKS):
             piece = piece_starts[strip * BLOCKS + part]
             count = piece_starts[strip * BLOCKS + part + 1] - piece
-            add_pieces(weights, piece_items, piece, count, strip_colours, pixels, part * BLOCK_ROWS)
+            add_pieces(weights, piece_items, piece, count, strip_colors, pixels, part * BLOCK_ROWS)
         low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
         columns = min(width - x, STRIP)
         _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
@@ -412,7 +412,7 @@ def apply_weights(strips, colours, background, transmittance, first_row, image):
 
 @compiled(parallel=True)
 def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
-    """dL/dcolour of every item in its slot: what `colour_gradient` computes, without computing a weight."""
+    """dL/dcolor of every item in its slot: what `color_gradient` computes, without computing a weight."""
     item_starts, piece_starts, _, item_slots, piece_items, weights = strips
     height, width = image_gradient.shape[0], image_gradient.shape[1]
     across = (width + _LAST) // _TILE * _STRIPS

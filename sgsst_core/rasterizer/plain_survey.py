@@ -13,4 +13,4 @@ def plain_survey(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor
     """Coverage [h, width], and each Gaussian's blend weights summed over all pixels [N]: the gradient of ones."""
     coverage = rasterizer.coverage(camera)
     ones = torch.ones((*coverage.shape, 3), dtype=rasterizer.dtype, device=coverage.device)
-    return coverage, rasterizer.colour_gradient(ones, camera)[:, 0]
+    return coverage, rasterizer.color_gradient(ones, camera)[:, 0]

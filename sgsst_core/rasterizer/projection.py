@@ -1,7 +1,7 @@
 """EWA projection of a scene onto one camera's image plane, in float64.
 
 Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 2002: a Gaussian with covariance V becomes a 2D Gaussian
-with covariance J V J^T, J the derivative of the perspective at its centre. What is done about the numbers:
+with covariance J V J^T, J the derivative of the perspective at its center. What is done about the numbers:
 
 * The 2x3 factor M = J R_camera R_quaternion diag(scales) is formed, never the 3x3 covariance. With the blur e,
   det(M M^T + e I) = (sum of the squared 2x2 minors of M) + e trace(M M^T) + e^2 (Cauchy-Binet): a sum of positive
@@ -41,7 +41,7 @@ _PARTS = 16
 
 
 class Column(IntEnum):
-    """Columns of `Projection.values`; dx, dy are a pixel centre's offsets from (X, Y) in pixels.
+    """Columns of `Projection.values`; dx, dy are a pixel center's offsets from (X, Y) in pixels.
 
     alpha = 2^(LOG2_OPACITY - u^2 - w^2) with w = dy * W_SCALE, u = (dx - SKEW * dy) * U_SCALE.
     """
@@ -62,11 +62,11 @@ class Outcome(IntEnum):
     VISIBLE = 0
     #: Depth below the near plane; a Gaussian exactly on it is kept.
     NEAR = 1
-    #: Zero quaternion, or a value that overflows float64, and the centre not far beside the image.
+    #: Zero quaternion, or a value that overflows float64, and the center not far beside the image.
     INVALID = 2
     #: Opacity below ALPHA_MIN: contributes to no pixel.
     FAINT = 3
-    #: No pixel centre of the image inside its extents.
+    #: No pixel center of the image inside its extents.
     OUTSIDE = 4
 
 
@@ -191,12 +191,12 @@ def _factor_row(row, rotation, deviation):
 
 
 @compiled()
-def _surely_outside(centre, size, row, deviation, support):
+def _surely_outside(center, size, row, deviation, support):
     """Whether a Gaussian lies beside the image, whatever its orientation: no row of M is longer than that of a ball.
 
     Beside by more than any rounding of the extents that it will be cut with, else False.
     """
-    beside = max(0.5 - centre, centre - (size - 0.5)) - _ROUNDING
+    beside = max(0.5 - center, center - (size - 0.5)) - _ROUNDING
     if not beside > 0:
         return False
     largest = max(deviation[0], deviation[1], deviation[2])

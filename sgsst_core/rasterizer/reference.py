@@ -1,6 +1,6 @@
 """`reference`: plain PyTorch, float64 by default, written from the formulas and sharing no code with the compiled path.
 
-The fast rasterizers are tested against this one. In float32 it is also what a vectorised PyTorch rasterizer can do,
+The fast rasterizers are tested against this one. In float32 it is also what a vectorized PyTorch rasterizer can do,
 which is what the benchmark compares with: raster tiles are batched by how many Gaussians they hold, and each batch is a
 handful of tensor operations.
 """
@@ -18,7 +18,7 @@ from sgsst_core.rasterizer.arguments import (
     CameraKey,
     Rows,
     camera_key,
-    check_colours,
+    check_colors,
     check_image_gradient,
     check_rows,
 )
@@ -60,9 +60,9 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def perspective_derivative(centres: Tensor, camera: Camera) -> Tensor:
-    """Derivative [N, 2, 3] of the projection at centres [N, 3] in the camera's frame, slopes clamped to the frustum."""
-    x, y, z = centres.unbind(-1)
+def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
+    """Derivative [N, 2, 3] of the projection at centers [N, 3] in the camera's frame, slopes clamped to the frustum."""
+    x, y, z = centers.unbind(-1)
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
     slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
@@ -76,10 +76,10 @@ def perspective_derivative(centres: Tensor, camera: Camera) -> Tensor:
 def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     """EWA projection (Zwicker et al. 2002) in float64; Gaussians that can reach no pixel are left out."""
     pose = camera.world_to_camera.double()
-    centres = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
-    index = torch.nonzero(centres[:, 2] >= near)[:, 0]
-    centres = centres[index]
-    factor = perspective_derivative(centres, camera) @ pose[:3, :3] @ rotation_matrices(scene.quats[index].double())
+    centers = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
+    index = torch.nonzero(centers[:, 2] >= near)[:, 0]
+    centers = centers[index]
+    factor = perspective_derivative(centers, camera) @ pose[:3, :3] @ rotation_matrices(scene.quats[index].double())
     factor = factor * scene.scales[index].double().exp()[:, None, :]  # covariance without blur: factor factor^T
     m0, m1 = factor[:, 0], factor[:, 1]
     p, q, r = (m0 * m0).sum(-1) + EPS2D, (m0 * m1).sum(-1), (m1 * m1).sum(-1) + EPS2D
@@ -89,8 +89,8 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     reach = (2 * (opacity / ALPHA_MIN).log()).clamp_min(0).sqrt()
     columns = torch.stack(
         [
-            camera.fx * centres[:, 0] / centres[:, 2] + camera.cx,
-            camera.fy * centres[:, 1] / centres[:, 2] + camera.cy,
+            camera.fx * centers[:, 0] / centers[:, 2] + camera.cx,
+            camera.fy * centers[:, 1] / centers[:, 2] + camera.cy,
             p.rsqrt(),
             q / p,
             (p / det).sqrt(),
@@ -102,7 +102,7 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     # a determinant that overflows would leave u_scale 0: finite, and a Gaussian where the fast projection has none
     usable = columns.isfinite().all(0) & det.isfinite()
     keep = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
-    keep = keep[torch.sort(centres[keep, 2], stable=True).indices]
+    keep = keep[torch.sort(centers[keep, 2], stable=True).indices]
     return Splats(index[keep], *columns[:, keep])
 
 
@@ -110,7 +110,7 @@ class ReferenceRasterizer:
     """The protocol of `sgsst_core.rasterizer.Rasterizer` in plain PyTorch on the CPU.
 
     Memory is bounded by batches of about a million (pixel, Gaussian) pairs, whatever the size of view and scene. Of
-    what does not depend on colours, the projection and the lists of the last camera are kept.
+    what does not depend on colors, the projection and the lists of the last camera are kept.
 
     Args:
         scene: its geometry must not change while this object lives.
@@ -140,13 +140,13 @@ class ReferenceRasterizer:
         self.background = torch.tensor(background, dtype=dtype)
         self._prepared: tuple[CameraKey, Splats, Tensor, Tensor] | None = None
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] of colours [N, 3] in the camera's rows, over the background."""
-        colours = check_colours(colours, len(self.scene), self.dtype, self.device)
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] of colors [N, 3] in the camera's rows, over the background."""
+        colors = check_colors(colors, len(self.scene), self.dtype, self.device)
         start, stop = check_rows(camera, rows)
         image = self.background.expand((stop - start) * camera.width + 1, 3).clone()
         for pixels, gaussians, weights, left in self._blended(camera, (start, stop)):
-            image[pixels] = torch.bmm(weights, colours[gaussians]) + left[..., None] * self.background
+            image[pixels] = torch.bmm(weights, colors[gaussians]) + left[..., None] * self.background
         return image[:-1].view(stop - start, camera.width, 3)
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
@@ -157,7 +157,7 @@ class ReferenceRasterizer:
             coverage[pixels] = 1 - left
         return coverage[:-1].view(stop - start, camera.width)
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
         band = check_rows(camera, rows)
         flat = check_image_gradient(image_gradient, camera, band, self.dtype, self.device).view(-1, 3)
@@ -245,9 +245,9 @@ def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
     """Ranks of the splats whose extents, a pixel wider, meet each raster tile; and the lists' lengths [tiles]."""
     across, down = -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
 
-    def tiles(centre: Tensor, extent: Tensor, limit: int) -> tuple[Tensor, Tensor]:
-        first = ((centre - extent - 1) / RASTER_TILE).floor().clamp(0, limit).long()
-        end = ((centre + extent + 1) / RASTER_TILE).ceil().clamp(0, limit).long()
+    def tiles(center: Tensor, extent: Tensor, limit: int) -> tuple[Tensor, Tensor]:
+        first = ((center - extent - 1) / RASTER_TILE).floor().clamp(0, limit).long()
+        end = ((center + extent + 1) / RASTER_TILE).ceil().clamp(0, limit).long()
         return first, (end - first).clamp_min(0)
 
     left, width = tiles(splats.x, splats.extent_x, across)

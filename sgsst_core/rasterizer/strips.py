@@ -96,15 +96,15 @@ class WeightStrips:
         with kernel_threads():
             kernels.keep_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
 
-    def render(self, colours: Tensor) -> Tensor:
-        """Image [h, width, 3] of colours [N, 3], over the background."""
+    def render(self, colors: Tensor) -> Tensor:
+        """Image [h, width, 3] of colors [N, 3], over the background."""
         transmittance = self.transmittance.numpy()
         image = np.empty((*transmittance.shape, 3), dtype=np.float32)
         with kernel_threads():
-            kernels.apply_weights(self.strips, colours.numpy(), self.background, transmittance, self.first_row, image)
+            kernels.apply_weights(self.strips, colors.numpy(), self.background, transmittance, self.first_row, image)
         return torch.from_numpy(image)
 
-    def colour_gradient(self, image_gradient: Tensor) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3]."""
         gradient = np.zeros((self._total, 3), dtype=np.float32)
         pixels = image_gradient.numpy()

@@ -46,7 +46,7 @@ def _draws(name: RasterizerName, device: torch.device | str) -> bool:
     camera = Camera("trial", RASTER_TILE, RASTER_TILE, 16.0, 16.0, 8.0, 8.0, torch.eye(4, dtype=torch.float64))
     rasterizer = make_rasterizer(name, gaussian, device=device)
     image = rasterizer.render(torch.ones(1, 3), camera)
-    gradient = rasterizer.colour_gradient(torch.ones_like(image), camera)
+    gradient = rasterizer.color_gradient(torch.ones_like(image), camera)
     return float(image.sum()) > 0 and float(gradient.sum()) > 0
 
 

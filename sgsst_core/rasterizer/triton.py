@@ -18,7 +18,7 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.arguments import (
     Rows,
-    check_colours,
+    check_colors,
     check_image_gradient,
     check_rows,
 )
@@ -66,7 +66,7 @@ class DeviceLists:
 class TritonRasterizer:
     """The protocol of `sgsst_core.rasterizer.Rasterizer` in Triton kernels.
 
-    Colour gradients repeat to the bit on one machine: every pair of Gaussian and tile has a slot of its own, and slots
+    Color gradients repeat to the bit on one machine: every pair of Gaussian and tile has a slot of its own, and slots
     are added in a fixed order. Bands of rows put together are the same bits as the whole view. Lists of views are kept
     until `max_list_bytes` are reached (`KeptLists`).
 
@@ -121,9 +121,9 @@ class TritonRasterizer:
         """
         return self._lists.of(camera)
 
-    def render(self, colours: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colours [N, 3] in the camera's rows, over the background."""
-        values = check_colours(colours, len(self.scene), torch.float32, self.device)
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
+        values = check_colors(colors, len(self.scene), torch.float32, self.device)
         return self._render(values, camera, check_rows(camera, rows))[0]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
@@ -131,7 +131,7 @@ class TritonRasterizer:
         nothing = torch.zeros((len(self.scene), 3), device=self.device)
         return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
 
-    def colour_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -154,7 +154,7 @@ class TritonRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Coverage [height, width] and each Gaussian's blend weights summed over all pixels [N], float32, in one pass.
 
-        The same bits as `coverage`, and as a column of `colour_gradient` of ones.
+        The same bits as `coverage`, and as a column of `color_gradient` of ones.
         """
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -175,7 +175,7 @@ class TritonRasterizer:
             )
         return 1 - transmittance, weights
 
-    def _render(self, colours: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Image and final transmittance of a band."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -185,7 +185,7 @@ class TritonRasterizer:
         transmittance = torch.empty((height, camera.width), device=self.device)
         across, tiles = tiles_of(camera, band)
         kernels.render[(tiles,)](
-            lists.ranks, lists.starts, lists.gaussians, lists.values, colours, self.background, image, transmittance,
+            lists.ranks, lists.starts, lists.gaussians, lists.values, colors, self.background, image, transmittance,
             camera.width, *band, across,
             **self.cuts(),
         )  # fmt: skip

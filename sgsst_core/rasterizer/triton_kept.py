@@ -114,19 +114,19 @@ class WeightPieces:
         )
         return sum(tensor.nbytes for tensor in kept)
 
-    def render(self, colours: Tensor) -> Tensor:
-        """Image [h, width, 3] of colours [N, 3], over the background."""
+    def render(self, colors: Tensor) -> Tensor:
+        """Image [h, width, 3] of colors [N, 3], over the background."""
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
-        image = torch.empty((*self.transmittance.shape, 3), device=colours.device)
+        image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
         kernels.apply_pieces[self._grid()](
-            self.block_starts, self.piece_gaussians, self.weights, colours, self._rasterizer.background,
+            self.block_starts, self.piece_gaussians, self.weights, colors, self._rasterizer.background,
             self.transmittance, image, *self._place(),
             SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
         )  # fmt: skip
         return image
 
-    def colour_gradient(self, image_gradient: Tensor) -> Tensor:
+    def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3]."""
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 

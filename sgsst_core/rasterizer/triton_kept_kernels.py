@@ -146,7 +146,7 @@ def _load_pieces(weights, k, end, P: tl.constexpr):
 
 @triton.jit
 def apply_pieces(
-    block_starts, gaussians, weights, colours, background, transmittances, image, width, first_row, last_row, across,
+    block_starts, gaussians, weights, colors, background, transmittances, image, width, first_row, last_row, across,
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Image [h, width, 3] of kept weights; one program a block."""
@@ -159,10 +159,10 @@ def apply_pieces(
     )
     while k < end:
         kept, j, there = _load_pieces(weights, k, end, P)
-        colour = colours + 3 * tl.load(gaussians + j, mask=there, other=0).to(tl.int64)
-        red += kept * tl.load(colour, mask=there, other=0.0)[:, None]
-        green += kept * tl.load(colour + 1, mask=there, other=0.0)[:, None]
-        blue += kept * tl.load(colour + 2, mask=there, other=0.0)[:, None]
+        color = colors + 3 * tl.load(gaussians + j, mask=there, other=0).to(tl.int64)
+        red += kept * tl.load(color, mask=there, other=0.0)[:, None]
+        green += kept * tl.load(color + 1, mask=there, other=0.0)[:, None]
+        blue += kept * tl.load(color + 2, mask=there, other=0.0)[:, None]
         k += P
     left = tl.load(transmittances + place, mask=inside, other=0.0)
     tl.store(image + 3 * place, tl.sum(red, 0) * (1.0 / SCALE) + left * tl.load(background), mask=inside)
@@ -175,7 +175,7 @@ def piece_gradients(
     block_starts, slots, weights, image_gradient, out, width, first_row, last_row, across,
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """dL/dcolour of every piece in its own slot [P, 3]; one program a block."""
+    """dL/dcolor of every piece in its own slot [P, 3]; one program a block."""
     inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
     red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
     green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)

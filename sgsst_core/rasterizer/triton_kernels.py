@@ -259,7 +259,7 @@ def tile_pixels(tile, across, width, first_row, last_row):
 
 @triton.jit
 def render(
-    ranks, starts, gaussians, values, colours, background, image, transmittances, width, first_row, last_row, across,
+    ranks, starts, gaussians, values, colors, background, image, transmittances, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
     """Image [h, width, 3] and final transmittance [h, width] of rows first_row..last_row; one program a raster tile."""
@@ -275,9 +275,9 @@ def render(
         there = j < end
         gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
         # Three channels are too few for matrix units, which would take the products in less than float32 besides.
-        red += tl.sum(weights * tl.load(colours + 3 * gaussian, mask=there, other=0.0)[:, None], 0)
-        green += tl.sum(weights * tl.load(colours + 3 * gaussian + 1, mask=there, other=0.0)[:, None], 0)
-        blue += tl.sum(weights * tl.load(colours + 3 * gaussian + 2, mask=there, other=0.0)[:, None], 0)
+        red += tl.sum(weights * tl.load(colors + 3 * gaussian, mask=there, other=0.0)[:, None], 0)
+        green += tl.sum(weights * tl.load(colors + 3 * gaussian + 1, mask=there, other=0.0)[:, None], 0)
+        blue += tl.sum(weights * tl.load(colors + 3 * gaussian + 2, mask=there, other=0.0)[:, None], 0)
         going = tl.max(left, 0)
         k += K
     left = tl.abs(left)
@@ -293,7 +293,7 @@ def slot_gradients(
     ranks, slots, starts, values, image_gradient, out, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
-    """dL/dcolour of every pair of Gaussian and tile in its own slot [E, 3], which holds zeros before."""
+    """dL/dcolor of every pair of Gaussian and tile in its own slot [E, 3], which holds zeros before."""
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
     place = (y - first_row).to(tl.int64) * width + x

@@ -189,7 +189,7 @@ def keep_vector(typingctx, source, begin, weights, target):
 
 @intrinsic
 def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, blue):
-    """pixels[offset + v, c, i] += weights[begin + 8 v + i] * colour[c] for v < vectors, three channels, 8 lanes.
+    """pixels[offset + v, c, i] += weights[begin + 8 v + i] * color[c] for v < vectors, three channels, 8 lanes.
 
     `weights` is flat, float32 or half-precision bits (uint16); `pixels` [P, 3, 8] float32. Nothing is checked.
     """
@@ -199,15 +199,15 @@ def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, b
     signature = types.void(weights, types.int64, types.int64, pixels, types.int64, *scalars)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        weights_, begin_, vectors_, pixels_, offset_, *colour = args
+        weights_, begin_, vectors_, pixels_, offset_, *color = args
         source = _data(context, builder, sig.args[0], weights_, begin_)
         target = _data(context, builder, sig.args[3], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
-        colours = [_splat(builder, c) for c in colour]
+        colors = [_splat(builder, c) for c in color]
         with cgutils.for_range(builder, vectors_) as loop:
             place = builder.mul(loop.index, _number(LANES))
             w = _load_weights(builder, sig.args[0], builder.gep(source, [place]))
             place = builder.mul(place, _number(_CHANNELS))
-            for channel, c in enumerate(colours):
+            for channel, c in enumerate(colors):
                 pointer = builder.gep(target, [builder.add(place, _number(channel * LANES))])
                 total = builder.fadd(_load(builder, pointer), builder.fmul(w, c, flags=_FUSED), flags=_FUSED)
                 builder.store(total, builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
@@ -292,18 +292,18 @@ def prefetch(typingctx, values, place):
 
 
 @intrinsic
-def add_pieces(typingctx, weights, items, first, count, colours, pixels, offset):
-    """pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colours[items[piece], c] over the pieces.
+def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
+    """pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colors[items[piece], c] over the pieces.
 
     Pieces first..first + count in order; 4 rows, three channels, 8 lanes. `weights` is flat, float32 or half-precision
-    bits (uint16); `items` int32; `colours` [I, 3] and `pixels` [P, 3, 8] float32. Nothing is checked.
+    bits (uint16); `items` int32; `colors` [I, 3] and `pixels` [P, 3, 8] float32. Nothing is checked.
     """
     if not _is_weights(weights):
         return None
-    signature = types.void(weights, items, types.int64, types.int64, colours, pixels, types.int64)
+    signature = types.void(weights, items, types.int64, types.int64, colors, pixels, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        weights_, items_, first_, count_, colours_, pixels_, offset_ = args
+        weights_, items_, first_, count_, colors_, pixels_, offset_ = args
         target = _data(context, builder, sig.args[5], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
         places = [(row, c) for row in range(BLOCK_ROWS) for c in range(_CHANNELS)]
         pointers = {
@@ -315,8 +315,8 @@ def add_pieces(typingctx, weights, items, first, count, colours, pixels, offset)
         with cgutils.for_range(builder, count_) as loop:
             piece = builder.add(first_, loop.index)
             item = builder.zext(builder.load(_data(context, builder, sig.args[1], items_, piece)), ir.IntType(64))
-            colour = _data(context, builder, sig.args[4], colours_, builder.mul(item, _number(_CHANNELS)))
-            channels = [_splat(builder, builder.load(builder.gep(colour, [_number(c)]))) for c in range(_CHANNELS)]
+            color = _data(context, builder, sig.args[4], colors_, builder.mul(item, _number(_CHANNELS)))
+            channels = [_splat(builder, builder.load(builder.gep(color, [_number(c)]))) for c in range(_CHANNELS)]
             source = _data(context, builder, sig.args[0], weights_, builder.mul(piece, _number(BLOCK_ROWS * LANES)))
             for row in range(BLOCK_ROWS):
                 w = _load_weights(builder, sig.args[0], builder.gep(source, [_number(row * LANES)]))

@@ -29,7 +29,7 @@ from sgsst_core.report.history import (
     moment_places,
     thinned,
 )
-from sgsst_core.report.palette import GRID, INK, colour_of
+from sgsst_core.report.palette import GRID, INK, color_of
 
 #: Of every chart, for `matplotlib.rc_context`.
 STYLE: dict[Any, Any] = {
@@ -66,11 +66,11 @@ def draw_loss(figure: Figure, against: Against, history: History, moments: Seque
     """
     axes = figure.subplots()
     mark_phases(axes, history, against)
-    lines = [(scale_name(scale), values, colour_of(scale)) for scale, values in history.relative.items()]
+    lines = [(scale_name(scale), values, color_of(scale)) for scale, values in history.relative.items()]
     if len(lines) > 1:
         lines.append(("mean", history.mean_relative, INK))
-    for label, values, colour in lines:
-        draw_line(axes, history, against, values, colour, label)
+    for label, values, color in lines:
+        draw_line(axes, history, against, values, color, label)
     x, gram = moment_places(moments, against), column([moment.get("gram_relative") for moment in moments])
     shown = drawable(x) & drawable(gram)
     label = "Gram distance, held-out views"
@@ -102,14 +102,14 @@ def scale_name(scale: int) -> str:
     return f"scale {scale} (1/{1 << scale})" if scale else "scale 0 (full size)"
 
 
-def draw_line(axes: Axes, history: History, against: Against, values: Floats, colour: str, label: str) -> None:
+def draw_line(axes: Axes, history: History, against: Against, values: Floats, color: str, label: str) -> None:
     """A running mean over one round of views, phase by phase, and behind it the range of the values [steps]."""
     for _, part in history.phases:
         line = thinned(history.x[against][part], values[part], history.round_length, history.place_width(against))
         if not len(line.x):
             continue
-        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.18, linewidth=0.7)
-        axes.plot(line.x, line.mean, color=colour, label=label, marker="o" if len(line.x) == 1 else None)
+        axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.18, linewidth=0.7)
+        axes.plot(line.x, line.mean, color=color, label=label, marker="o" if len(line.x) == 1 else None)
         label = "_"  # one legend entry for all phases; matplotlib leaves out names that begin so
 
 

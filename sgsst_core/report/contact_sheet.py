@@ -16,7 +16,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.palette import INK, PAPER
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene, sampled
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Pixels of the sheet: height of a picture, the style's width at most, gaps, and the labels' text.
@@ -42,7 +42,7 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
             dcs = (views.scene.sh_dc.to(device), stylizer.shown())
             # The rasterizer's own render: one rank writes the sheet, and the others take no part in it.
             camera = views.cameras[index]
-            renders = [_picture(views.rasterizer.render(views.colours(index, dc), camera)) for dc in dcs]
+            renders = [_picture(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
     sheet = _sheet(_stacked([_picture(picture) for style in stylizer.styles.all for picture in style.pictures]), pairs)
     with atomic_path(path) as temporary:
@@ -69,8 +69,8 @@ def write_views(
     pictures = []
     for camera in spread(cameras, _MOST_VIEWS):
         small = resized(camera, min(camera.side, _VIEW_SIDE))
-        colours = view_colours(part.sh_dc, rest_colours(part.sh_rest, part.means, small))
-        pictures.append((camera.name, _picture(rasterizer.render(colours, small))))
+        colors = view_colors(part.sh_dc, rest_colors(part.sh_rest, part.means, small))
+        pictures.append((camera.name, _picture(rasterizer.render(colors, small))))
     width = max(picture.width for _, picture in pictures) + _GAP
     height = max(picture.height for _, picture in pictures) + _GAP + _LABEL
     columns = min(len(pictures), max(1, round(math.sqrt(_SHEET_SHAPE * len(pictures) * height / width))))

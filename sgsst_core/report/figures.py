@@ -37,12 +37,12 @@ from sgsst_core.report.history import (
     moment_places,
     thinned,
 )
-from sgsst_core.report.palette import INK, colour_of
+from sgsst_core.report.palette import INK, color_of
 from sgsst_core.report.svg import inline
 
 #: Inches; at this width the text is legible on a phone, and two figures stand side by side on a desk.
 _WIDTH, _HEIGHT = 5.6, 3.5
-_REACHES = {"short": colour_of(0), "long": colour_of(1)}
+_REACHES = {"short": color_of(0), "long": color_of(1)}
 _METRICS = {"rmse": "RMSE", "lpips": "LPIPS"}
 
 
@@ -147,7 +147,7 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
         there = history.x[against][np.any([~np.isnan(values) for values in terms.values()], axis=0)]
         own = replace(history, limits={**history.limits, against: log_limits(there, X_MARGIN)})
         for term, values in terms.items():
-            draw_line(axes, own, against, values, colour_of(list(TERMS).index(term)), TERMS[term])
+            draw_line(axes, own, against, values, color_of(list(TERMS).index(term)), TERMS[term])
         axes.set_title(scale_name(scale))
         set_log_x(axes, own.limits[against], against)
         set_log_y(axes, everything)
@@ -163,13 +163,13 @@ def _draw_consistency(figure: Figure, against: Against, history: History, moment
     x = moment_places(moments, against)
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     for axes, metric in zip(panels, metrics, strict=True):
-        for reach, colour in _REACHES.items():
+        for reach, color in _REACHES.items():
             values = column(_consistency(moments, reach, metric))
             shown = drawable(x) & np.isfinite(values)
-            look = {"marker": "o", "markersize": 4, "color": colour, "label": _reach_name(moments, reach)}
+            look = {"marker": "o", "markersize": 4, "color": color, "label": _reach_name(moments, reach)}
             draw_points(axes, x[shown], values[shown], **look)
             if moments[0].get("step") == 0 and np.isfinite(values[0]):
-                axes.axhline(values[0], color=colour, linestyle="--", linewidth=1)
+                axes.axhline(values[0], color=color, linestyle="--", linewidth=1)
         axes.set_title(_METRICS[metric])
         axes.set_ylim(bottom=0)
         set_log_x(axes, history.limits[against], against)
@@ -183,7 +183,7 @@ def _draw_approximations(figure: Figure, against: Against, history: History, pro
     x = steps if against == "steps" else np.interp(steps, history.x["steps"], history.x["seconds"])
     errors = column([probe.get("relative_error") for probe in probes])
     shown = drawable(x) & drawable(errors)
-    draw_points(axes, x[shown], errors[shown], marker="o", markersize=4, color=colour_of(0))
+    draw_points(axes, x[shown], errors[shown], marker="o", markersize=4, color=color_of(0))
     set_log_x(axes, history.limits[against], against)
     set_log_y(axes, [errors])
     axes.set_ylabel("relative error")
@@ -192,14 +192,14 @@ def _draw_approximations(figure: Figure, against: Against, history: History, pro
 def _draw_memory(figure: Figure, against: Against, history: History, predicted: dict[str, Any]) -> None:
     axes = figure.subplots()
     on_device = bool(np.isfinite(history.device_memory).any())
-    shown = [(history.memory, predicted.get("peak_bytes"), "", colour_of(0), INK)]
+    shown = [(history.memory, predicted.get("peak_bytes"), "", color_of(0), INK)]
     if on_device:
-        shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", colour_of(1), colour_of(1)))
-    for memory, peak, where, colour, dashed in shown:
+        shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", color_of(1), color_of(1)))
+    for memory, peak, where, color, dashed in shown:
         # Every step stands alone: of memory, the most in a place is what matters, not a mean over a round.
         line = thinned(history.x[against], memory / 1e9, 1, history.place_width(against))
         marker = "o" if len(line.x) == 1 else None
-        axes.plot(line.x, line.high, color=colour, marker=marker, label=f"measured{where}")
+        axes.plot(line.x, line.high, color=color, marker=marker, label=f"measured{where}")
         if peak is not None and math.isfinite(peak):
             label = f"peak{where} that the plan predicted"
             axes.axhline(peak / 1e9, color=dashed, linestyle="--", linewidth=1, label=label)

@@ -182,7 +182,7 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
 
 
 def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
-    """Geometric mean of the `window` values around each place, of fewer towards the ends."""
+    """Geometric mean of the `window` values around each place, of fewer toward the ends."""
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
     places = np.arange(len(logs))

@@ -1,6 +1,6 @@
 """Figures as SVG that shares a page with others.
 
-Colours are written as CSS variables with the printed colour as fallback (`var(--c-222222, #222222)`), so that a page
+Colors are written as CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so that a page
 can give others to a dark screen; text takes the page's font.
 """
 
@@ -13,7 +13,7 @@ import xml.etree.ElementTree as ElementTree
 from matplotlib.figure import Figure
 
 _NAMESPACE = re.compile(r"\{[^}]*\}")
-_COLOUR = re.compile(r"(fill|stroke): #([0-9a-f]{6})")
+_COLOR = re.compile(r"(fill|stroke): #([0-9a-f]{6})")
 _REFERENCE = re.compile(r"url\(#([^)]+)\)")
 _FAMILY = re.compile(r"font-family: [^;]*;?")
 _LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
@@ -60,7 +60,7 @@ def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:
         return key, f"#{name}-{value.removeprefix('#')}"
     value = _REFERENCE.sub(rf"url(#{name}-\1)", value)
     if key == "style":
-        return key, _FAMILY.sub("", _COLOUR.sub(r"\1: var(--c-\2, #\2)", value))
+        return key, _FAMILY.sub("", _COLOR.sub(r"\1: var(--c-\2, #\2)", value))
     if key in ("d", "points"):
         value = " ".join(value.split())
     return key, _LONG_DECIMAL.sub(r"\1", value) if key in ("d", "points", "x", "y", "transform") else value

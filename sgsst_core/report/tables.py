@@ -63,16 +63,16 @@ def held_out_table(report: dict[str, Any]) -> Table | None:
 #: What a result is judged by, and how it is written.
 _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "style": ("distance to the style", number),
-    "palette": ("distance to its colours, in levels of 8 bits", number),
+    "palette": ("distance to its colors, in levels of 8 bits", number),
     "content": ("content lost (LPIPS)", number),
     "features": ("features turned (1 - cosine)", number),
     "swing": ("style on black against white", number),
-    "saturated": ("colours that no screen shows", percent),
+    "saturated": ("colors that no screen shows", percent),
 }
 
 
 def judged_table(report: dict[str, Any]) -> Table | None:
-    """What the result is judged to be by a network that was not optimised, beside the unstylized scene."""
+    """What the result is judged to be by a network that was not optimized, beside the unstylized scene."""
     judged = (report.get("held_out") or {}).get("judged")
     if not judged:
         return None

@@ -1,1 +1,1 @@
-"""What is rendered, and from where: Gaussians, cameras, view-dependent colours, the pyramid of a view."""
+"""What is rendered, and from where: Gaussians, cameras, view-dependent colors, the pyramid of a view."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; pixel centres lie at +0.5, x points right, y down, z forward.
+    """A pinhole camera; pixel centers lie at +0.5, x points right, y down, z forward.
 
     Attributes:
         name: what the camera is called in its file (image name where there is one).
@@ -46,7 +46,7 @@ class Camera:
         return self.resolution or max(self.width, self.height)
 
     @property
-    def centre(self) -> Tensor:
+    def center(self) -> Tensor:
         """[3] float64: the camera's position in the world."""
         rotation = self.world_to_camera[:3, :3]
         return -rotation.T @ self.world_to_camera[:3, 3]
@@ -92,7 +92,7 @@ def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
 def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """`count` of the cameras, evenly spread over the list, in its order; all where there are no more than that.
 
-    Each is the middle of one of `count` equal parts, so that neither a path's ends nor the seam of a ring are favoured.
+    Each is the middle of one of `count` equal parts, so that neither a path's ends nor the seam of a ring are favored.
 
     Raises:
         SettingsError: count below 1.
@@ -106,7 +106,7 @@ def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
 
 
 def between(first: Camera, second: Camera) -> Camera:
-    """The camera halfway between two: its centre is their midpoint, its rotation the spherical mean of theirs.
+    """The camera halfway between two: its center is their midpoint, its rotation the spherical mean of theirs.
 
     Size and intrinsics are the first's. The mean turns by half of the shortest rotation from one to the other (slerp,
     Shoemake 1985); of the two shortest ones at 180 degrees, either.
@@ -115,7 +115,7 @@ def between(first: Camera, second: Camera) -> Camera:
     rotation = torch.from_numpy(Slerp([0, 1], Rotation.from_matrix(ends))(0.5).as_matrix())
     world_to_camera = torch.eye(4, dtype=torch.float64)
     world_to_camera[:3, :3] = rotation
-    world_to_camera[:3, 3] = -rotation @ ((first.centre + second.centre) / 2)
+    world_to_camera[:3, 3] = -rotation @ ((first.center + second.center) / 2)
     return replace(first, name=f"{first.name}–{second.name}", world_to_camera=world_to_camera)
 
 
@@ -130,7 +130,7 @@ def look_at(
     focal: float,
     resolution: int | None = None,
 ) -> Camera:
-    """A camera at `position` [3] that looks at `target` [3], `up` [3] towards its upper edge.
+    """A camera at `position` [3] that looks at `target` [3], `up` [3] toward its upper edge.
 
     Args:
         name: the camera's name.

@@ -22,10 +22,10 @@ class Scene:
 
     Attributes:
         means: [N, 3], world units.
-        quats: [N, 4], wxyz, not necessarily normalised.
+        quats: [N, 4], wxyz, not necessarily normalized.
         scales: [N, 3], natural logarithm of the standard deviations in world units (as in files).
         opacities: [N], logits (as in files).
-        sh_dc: [N, 3], the degree-0 coefficients: what stylization optimises.
+        sh_dc: [N, 3], the degree-0 coefficients: what stylization optimizes.
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
     """
 

@@ -66,7 +66,7 @@ def orbit(
 
     Args:
         scene: what to look at.
-        count: number of cameras, shared out among the rings so that neighbours are about equally far apart.
+        count: number of cameras, shared out among the rings so that neighbors are about equally far apart.
         up: world direction of up; captures processed by COLMAP have y pointing down, so that -y is up.
         elevations: of the rings above the scene's horizon, degrees, between -90 and 90.
         radius: distance of the cameras from the middle, world units; None for the smallest from which the longer side

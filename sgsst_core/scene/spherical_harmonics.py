@@ -1,9 +1,9 @@
-"""Colours of one view from spherical harmonics, and their gradient.
+"""Colors of one view from spherical harmonics, and their gradient.
 
     c_j = max(0, 0.5 + SH_C0 * sh_dc_j + sum over l >= 1 of sh_rest_j * Y_l(direction_j))
 
-Only `sh_dc` is ever optimised, so the sum over l >= 1 is frozen: it is computed once per view (`rest_colours`), after
-which a view's colours cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments, but
+Only `sh_dc` is ever optimized, so the sum over l >= 1 is frozen: it is computed once per view (`rest_colors`), after
+which a view's colors cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments, but
 for the compiled twins of that sum: Numba's on the CPU, Triton's on a GPU.
 """
 
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.constants import COLOUR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
+from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
@@ -26,15 +26,15 @@ _CHUNK = 1 << 17
 
 def view_directions(
     means: Tensor,  # [N, 3]
-    centre: Tensor,  # [3] float64
+    center: Tensor,  # [3] float64
 ) -> Tensor:
-    """Unit vectors [N, 3] float64 from the camera's centre to the Gaussians.
+    """Unit vectors [N, 3] float64 from the camera's center to the Gaussians.
 
     The difference is taken in float64: with the world moved far from its origin, both points are large and nearly
-    equal. A Gaussian exactly at the centre has no direction; it gets the zero vector, so that its colour stays finite.
+    equal. A Gaussian exactly at the center has no direction; it gets the zero vector, so that its color stays finite.
     (It lies in front of the near plane and is never drawn.)
     """
-    offsets = means.double() - centre.to(device=means.device, dtype=torch.float64)
+    offsets = means.double() - center.to(device=means.device, dtype=torch.float64)
     # hypot-like: scaled by the largest component first, so that no square overflows or vanishes.
     largest = offsets.abs().amax(dim=-1, keepdim=True)
     scaled = offsets / torch.where(largest > 0, largest, torch.ones_like(largest))
@@ -73,17 +73,17 @@ def basis(
     return torch.stack(terms, dim=-1)
 
 
-def rest_colours(
+def rest_colors(
     sh_rest: Tensor | StoredHarmonics,  # [N, K, 3], K = 0, 3, 8 or 15
     means: Tensor,  # [N, 3]
     camera: Camera,
     *,
     degree: int | None = None,
 ) -> Tensor:
-    """The frozen part of a view's colours: the sum over l >= 1, [N, 3] in the dtype and on the device of `sh_rest`.
+    """The frozen part of a view's colors: the sum over l >= 1, [N, 3] in the dtype and on the device of `sh_rest`.
 
     `degree` leaves out higher bands (that a plan found to be zero, say). Summed in float64 and rounded once; float32 on
-    a GPU is summed in float32 (`kernel_rest_colours`). Degree 0 is zeros, without any work.
+    a GPU is summed in float32 (`kernel_rest_colors`). Degree 0 is zeros, without any work.
 
     Raises:
         ValueError: K is no number of coefficients of degree 0 to 3, or `degree` is higher than the file's.
@@ -98,79 +98,79 @@ def rest_colours(
     if degree == 0:
         return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     if isinstance(sh_rest, StoredHarmonics):
-        return _stored_rest_colours(sh_rest, means, camera, degree)
+        return _stored_rest_colors(sh_rest, means, camera, degree)
     if sh_rest.dtype == torch.float32 and sh_rest.device.type == "cpu":
-        return _compiled_rest_colours(sh_rest, means, camera, degree)
+        return _compiled_rest_colors(sh_rest, means, camera, degree)
     if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and triton_runs_on(sh_rest.device):
-        return kernel_rest_colours(sh_rest, means, camera, degree)
-    return reference_rest_colours(sh_rest, means, camera, degree)
+        return kernel_rest_colors(sh_rest, means, camera, degree)
+    return reference_rest_colors(sh_rest, means, camera, degree)
 
 
-def reference_rest_colours(
+def reference_rest_colors(
     sh_rest: Tensor,  # [N, K, 3]
     means: Tensor,  # [N, 3]
     camera: Camera,
     degree: int,
 ) -> Tensor:
-    """`rest_colours` of degree 1 to 3 in tensor functions, in float64, rounded to the dtype of `sh_rest`: [N, 3]."""
-    colours = torch.empty(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
+    """`rest_colors` of degree 1 to 3 in tensor functions, in float64, rounded to the dtype of `sh_rest`: [N, 3]."""
+    colors = torch.empty(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     count = (degree + 1) ** 2 - 1
     for start in range(0, sh_rest.shape[0], _CHUNK):
         part = slice(start, start + _CHUNK)
-        values = basis(view_directions(means[part], camera.centre), degree)
-        colours[part] = torch.einsum("nk,nkc->nc", values, sh_rest[part, :count].double()).to(sh_rest.dtype)
-    return colours
+        values = basis(view_directions(means[part], camera.center), degree)
+        colors[part] = torch.einsum("nk,nkc->nc", values, sh_rest[part, :count].double()).to(sh_rest.dtype)
+    return colors
 
 
-def _compiled_rest_colours(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
+def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
     """The same on the CPU for float32, on all cores; sums are in another order, so that the last bit may differ."""
     from sgsst_core.compiled import kernel_threads
     from sgsst_core.scene import spherical_harmonics_kernels as kernels
 
-    colours = torch.empty((len(sh_rest), 3))
+    colors = torch.empty((len(sh_rest), 3))
     values, points = (tensor.detach().cpu().contiguous().numpy() for tensor in (sh_rest, means))
     with kernel_threads():
-        kernels.rest_colours(values, points, camera.centre.numpy(), degree, colours.numpy())
-    return colours
+        kernels.rest_colors(values, points, camera.center.numpy(), degree, colors.numpy())
+    return colors
 
 
-def _stored_rest_colours(sh_rest: StoredHarmonics, means: Tensor, camera: Camera, degree: int) -> Tensor:
+def _stored_rest_colors(sh_rest: StoredHarmonics, means: Tensor, camera: Camera, degree: int) -> Tensor:
     """The same, to the bit, of coefficients in a file: each block is used while it is in a core's cache."""
     from sgsst_core.scene import spherical_harmonics_kernels as kernels
 
-    colours = torch.empty((len(sh_rest), 3))
-    points, centre, out = means.detach().cpu().contiguous().numpy(), camera.centre.numpy(), colours.numpy()
+    colors = torch.empty((len(sh_rest), 3))
+    points, center, out = means.detach().cpu().contiguous().numpy(), camera.center.numpy(), colors.numpy()
 
     def add_up(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
         part = slice(start, start + len(rows))
-        kernels.block_rest_colours(block, rows, points[part], centre, degree, out[part])
+        kernels.block_rest_colors(block, rows, points[part], center, degree, out[part])
 
     sh_rest.for_blocks(add_up)
-    return colours
+    return colors
 
 
-def kernel_rest_colours(
+def kernel_rest_colors(
     sh_rest: Tensor,  # [N, K, 3] float32
     means: Tensor,  # [N, 3]
     camera: Camera,
     degree: int,
 ) -> Tensor:
-    """`rest_colours` of degree 1 to 3 in one launch of a Triton kernel: [N, 3] float32.
+    """`rest_colors` of degree 1 to 3 in one launch of a Triton kernel: [N, 3] float32.
 
     Directions are differences of float64; basis and sum are float32: up to 1e-6 of the sum of the coefficients' sizes
-    away from `rest_colours`. On a GPU, or on the CPU where Triton's interpreter is on.
+    away from `rest_colors`. On a GPU, or on the CPU where Triton's interpreter is on.
     """
     from sgsst_core.scene import spherical_harmonics_triton_kernels as kernels
 
     count, block = len(sh_rest), kernels.BLOCK.value
-    colours = torch.empty((count, 3), device=sh_rest.device)
+    colors = torch.empty((count, 3), device=sh_rest.device)
     if count:
-        centre = camera.centre.to(device=sh_rest.device, dtype=torch.float64, non_blocking=True)
-        kernels.rest_colours[(-(-count // block),)](
-            sh_rest.contiguous(), means.to(sh_rest.device).contiguous(), centre, colours, count,
+        center = camera.center.to(device=sh_rest.device, dtype=torch.float64, non_blocking=True)
+        kernels.rest_colors[(-(-count // block),)](
+            sh_rest.contiguous(), means.to(sh_rest.device).contiguous(), center, colors, count,
             DEGREE=degree, COEFFICIENTS=sh_rest.shape[1], BLOCK=block,
         )  # fmt: skip
-    return colours
+    return colors
 
 
 @functools.cache
@@ -179,33 +179,33 @@ def triton_runs_on(device: torch.device) -> bool:
 
     Triton may be missing, or find no C compiler for what it builds around its kernels.
     """
-    one, centre = torch.ones((1, 3, 3), device=device), torch.eye(4, dtype=torch.float64)
-    camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, centre)
+    one, center = torch.ones((1, 3, 3), device=device), torch.eye(4, dtype=torch.float64)
+    camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, center)
     try:
-        found = kernel_rest_colours(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
+        found = kernel_rest_colors(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
     except Exception:  # whatever it is, the tensor functions do the same
         return False
     return abs(float(found[0, 0]) - SH_C1) < 1e-6
 
 
-def view_colours(
+def view_colors(
     sh_dc: Tensor,  # [N, 3]
     rest: Tensor,  # [N, 3]
 ) -> Tensor:
-    """Colours [N, 3] of one view, clamped at zero: `max(0, 0.5 + SH_C0 * sh_dc + rest)`."""
-    return torch.add(rest + COLOUR_OFFSET, sh_dc, alpha=SH_C0).clamp_min(0)
+    """Colors [N, 3] of one view, clamped at zero: `max(0, 0.5 + SH_C0 * sh_dc + rest)`."""
+    return torch.add(rest + COLOR_OFFSET, sh_dc, alpha=SH_C0).clamp_min(0)
 
 
-def view_colours_gradient(
-    colour_gradient: Tensor,  # [N, 3]
-    colours: Tensor,  # [N, 3], of `view_colours`
+def view_colors_gradient(
+    color_gradient: Tensor,  # [N, 3]
+    colors: Tensor,  # [N, 3], of `view_colors`
     *,
     revive: bool = False,
 ) -> Tensor:
-    """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolours` where the clamp let the colour through, 0 where it did not.
+    """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolors` where the clamp let the color through, 0 where it did not.
 
-    With `revive`, colours that the clamp holds at 0 also take a gradient that would raise them. It is not the
-    derivative: it lets colours that a large step has thrown below 0 come back, which otherwise never move again.
+    With `revive`, colors that the clamp holds at 0 also take a gradient that would raise them. It is not the
+    derivative: it lets colors that a large step has thrown below 0 come back, which otherwise never move again.
     """
-    passes = (colours > 0) | (colour_gradient < 0) if revive else colours > 0
-    return torch.where(passes, SH_C0 * colour_gradient, torch.zeros_like(colour_gradient))
+    passes = (colors > 0) | (color_gradient < 0) if revive else colors > 0
+    return torch.where(passes, SH_C0 * color_gradient, torch.zeros_like(color_gradient))

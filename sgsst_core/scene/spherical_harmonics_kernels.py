@@ -1,4 +1,4 @@
-"""Compiled kernel of `spherical_harmonics.rest_colours` on CPUs: one pass over the coefficients, on all cores.
+"""Compiled kernel of `spherical_harmonics.rest_colors` on CPUs: one pass over the coefficients, on all cores.
 
 In float64 like the tensor functions, whose sums it makes in another order. Float32 would be hardly faster, and right to
 six digits only.
@@ -20,9 +20,9 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = SH_C3
 
 
 @compiled()
-def _direction(means, i, centre):
-    """Unit vector from the camera's centre; 0 at the centre. Scaled first where squares would overflow or vanish."""
-    x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
+def _direction(means, i, center):
+    """Unit vector from the camera's center; 0 at the center. Scaled first where squares would overflow or vanish."""
+    x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     largest = max(abs(x), abs(y), abs(z))
     if not largest > 0:
         return 0.0, 0.0, 0.0
@@ -60,19 +60,19 @@ def _sum_of_bands(sh_rest, row, x, y, z, degree, out, i):
 
 
 @compiled(parallel=True)
-def rest_colours(sh_rest, means, centre, degree, out):
+def rest_colors(sh_rest, means, center, degree, out):
     """Sum over bands 1 to `degree`, [N, 3] float32, of sh_rest [N, K, 3] float32 and means [N, 3]."""
     for i in numba.prange(out.shape[0]):
-        x, y, z = _direction(means, i, centre)
+        x, y, z = _direction(means, i, center)
         _sum_of_bands(sh_rest, i, x, y, z, degree, out, i)
 
 
 @compiled()
-def block_rest_colours(sh_rest, rows, means, centre, degree, out):
+def block_rest_colors(sh_rest, rows, means, center, degree, out):
     """The same of the Gaussians in some rows [n] int32 of a block sh_rest [R, K, 3]; one core's work.
 
-    Their means [n, 3] and colours out [n, 3] come in the order of the rows.
+    Their means [n, 3] and colors out [n, 3] come in the order of the rows.
     """
     for i in range(rows.size):
-        x, y, z = _direction(means, i, centre)
+        x, y, z = _direction(means, i, center)
         _sum_of_bands(sh_rest, rows[i], x, y, z, degree, out, i)

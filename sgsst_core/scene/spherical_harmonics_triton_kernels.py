@@ -1,8 +1,8 @@
-"""GPU kernel of `spherical_harmonics.rest_colours`: one launch a view, in which every coefficient is read once.
+"""GPU kernel of `spherical_harmonics.rest_colors`: one launch a view, in which every coefficient is read once.
 
 The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (TRITON_INTERPRET=1 before the first
 import). Directions are differences of float64, scaled by their largest component before anything is squared; basis and
-sum are float32, as the colours that they become part of.
+sum are float32, as the colors that they become part of.
 """
 
 # The types of compiled functions are those of their arguments.
@@ -29,48 +29,48 @@ def _term(k: tl.constexpr, factor: tl.constexpr, polynomial, row, own):
 
 
 @triton.jit
-def rest_colours(
-    sh_rest, means, centre, out, total, DEGREE: tl.constexpr, COEFFICIENTS: tl.constexpr, BLOCK: tl.constexpr
+def rest_colors(
+    sh_rest, means, center, out, total, DEGREE: tl.constexpr, COEFFICIENTS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """Sum over bands 1 to DEGREE of BLOCK Gaussians a program.
 
     Args:
         sh_rest: [N, COEFFICIENTS, 3] float32.
         means: [N, 3] float32 or float64.
-        centre: [3] float64, of the camera.
+        center: [3] float64, of the camera.
         out: [N, 3] float32.
         total: N.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = i < total
     p = i.to(tl.int64)
-    dx = tl.load(means + 3 * p, mask=there, other=0.0).to(tl.float64) - tl.load(centre)
-    dy = tl.load(means + 3 * p + 1, mask=there, other=0.0).to(tl.float64) - tl.load(centre + 1)
-    dz = tl.load(means + 3 * p + 2, mask=there, other=0.0).to(tl.float64) - tl.load(centre + 2)
+    dx = tl.load(means + 3 * p, mask=there, other=0.0).to(tl.float64) - tl.load(center)
+    dy = tl.load(means + 3 * p + 1, mask=there, other=0.0).to(tl.float64) - tl.load(center + 1)
+    dz = tl.load(means + 3 * p + 2, mask=there, other=0.0).to(tl.float64) - tl.load(center + 2)
     largest = tl.maximum(tl.maximum(tl.abs(dx), tl.abs(dy)), tl.abs(dz))
     largest = tl.where(largest > 0, largest, 1.0)
     x, y, z = (dx / largest).to(tl.float32), (dy / largest).to(tl.float32), (dz / largest).to(tl.float32)
-    length = tl.sqrt(x * x + y * y + z * z)  # 1 to sqrt(3), or 0 at the camera's centre
+    length = tl.sqrt(x * x + y * y + z * z)  # 1 to sqrt(3), or 0 at the camera's center
     length = tl.where(length > 0, length, 1.0)
     x, y, z = x / length, y / length, z / length
     # Four channels, the last of them without memory: the three values of a coefficient lie side by side.
     channel = tl.arange(0, 4)[None, :]
     own = there[:, None] & (channel < 3)
     row = sh_rest + (3 * COEFFICIENTS) * p[:, None] + channel
-    colours = _term(0, -_C1, y, row, own) + _term(1, _C1, z, row, own) + _term(2, -_C1, x, row, own)
+    colors = _term(0, -_C1, y, row, own) + _term(1, _C1, z, row, own) + _term(2, -_C1, x, row, own)
     if DEGREE >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        colours += _term(3, _C20, x * y, row, own)
-        colours += _term(4, _C21, y * z, row, own)
-        colours += _term(5, _C22, 2 * zz - xx - yy, row, own)
-        colours += _term(6, _C23, x * z, row, own)
-        colours += _term(7, _C24, xx - yy, row, own)
+        colors += _term(3, _C20, x * y, row, own)
+        colors += _term(4, _C21, y * z, row, own)
+        colors += _term(5, _C22, 2 * zz - xx - yy, row, own)
+        colors += _term(6, _C23, x * z, row, own)
+        colors += _term(7, _C24, xx - yy, row, own)
         if DEGREE >= 3:
-            colours += _term(8, _C30, y * (3 * xx - yy), row, own)
-            colours += _term(9, _C31, x * y * z, row, own)
-            colours += _term(10, _C32, y * (4 * zz - xx - yy), row, own)
-            colours += _term(11, _C33, z * (2 * zz - 3 * xx - 3 * yy), row, own)
-            colours += _term(12, _C34, x * (4 * zz - xx - yy), row, own)
-            colours += _term(13, _C35, z * (xx - yy), row, own)
-            colours += _term(14, _C36, x * (xx - 3 * yy), row, own)
-    tl.store(out + 3 * p[:, None] + channel, colours, mask=own)
+            colors += _term(8, _C30, y * (3 * xx - yy), row, own)
+            colors += _term(9, _C31, x * y * z, row, own)
+            colors += _term(10, _C32, y * (4 * zz - xx - yy), row, own)
+            colors += _term(11, _C33, z * (2 * zz - 3 * xx - 3 * yy), row, own)
+            colors += _term(12, _C34, x * (4 * zz - xx - yy), row, own)
+            colors += _term(13, _C35, z * (xx - yy), row, own)
+            colors += _term(14, _C36, x * (xx - 3 * yy), row, own)
+    tl.store(out + 3 * p[:, None] + channel, colors, mask=own)

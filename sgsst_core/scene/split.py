@@ -70,7 +70,7 @@ class Refinement:
         psnr: of the unstylized picture against that of before, dB, over all measured views; None where nothing was cut.
         lowest_psnr: of one of these views.
         taken_back: Gaussians that were not cut after all, because the picture would have changed too much.
-        sh_dc: [M, 3] float32, colours of the refined scene: the parents', fitted to the picture; None for theirs.
+        sh_dc: [M, 3] float32, colors of the refined scene: the parents', fitted to the picture; None for theirs.
     """
 
     pieces: Tensor
@@ -107,7 +107,7 @@ def can_be_split(scene: Scene) -> Tensor:
 def split(scene: Scene, pieces: Tensor) -> Scene:
     """A scene with its Gaussians cut along their axes; children stand in their parent's place.
 
-    What is in one piece stays as it is, to the bit. Colours, spherical harmonics and orientation are the parent's.
+    What is in one piece stays as it is, to the bit. Colors, spherical harmonics and orientation are the parent's.
 
     Args:
         pieces: [N, 3] uint8, 1 to `MOST_PIECES` but not 2; more than 1 only of Gaussians that `can_be_split`.

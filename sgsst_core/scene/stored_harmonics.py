@@ -45,7 +45,7 @@ class RowLayout:
         rows: how many there are.
         row_bytes: length of a row, a multiple of 4.
         column: byte of a row at which its coefficients start, a multiple of 4.
-        coefficients: of one colour in a row: 3, 8 or 15.
+        coefficients: of one color in a row: 3, 8 or 15.
     """
 
     path: Path
@@ -103,7 +103,7 @@ class RowFile:
 def changed(path: Path) -> SceneError:
     """The error of a file that is no longer the one that was read."""
     return SceneError(
-        f"{path}: was changed after it was read; the new colours may belong to other Gaussians. "
+        f"{path}: was changed after it was read; the new colors may belong to other Gaussians. "
         "Put the original file back and run again."
     )
 
@@ -164,7 +164,7 @@ class StoredHarmonics:
         return StoredHarmonics(self.layout, chosen, self.shape[1], self._file, self._factor)
 
     def first(self, coefficients: int) -> StoredHarmonics:
-        """The first coefficients of each colour alone."""
+        """The first coefficients of each color alone."""
         return StoredHarmonics(self.layout, self._chosen, coefficients, self._file, self._factor)
 
     def times(self, factor: float) -> StoredHarmonics:
@@ -223,7 +223,7 @@ class StoredHarmonics:
             self._work_through(work, bounds)
         else:
             with ThreadPoolExecutor(threads, thread_name_prefix="harmonics") as pool:
-                # Neighbouring parts of the file to all threads at the same time: it may have to come from a disk.
+                # Neighboring parts of the file to all threads at the same time: it may have to come from a disk.
                 for done in [pool.submit(self._work_through, work, bounds[i::threads]) for i in range(threads)]:
                     done.result()
         self._file.check_unchanged(self.layout.stamp)

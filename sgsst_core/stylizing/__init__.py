@@ -1,1 +1,1 @@
-"""The optimiser: views, steps, phases, checkpoints."""
+"""The optimizer: views, steps, phases, checkpoints."""

@@ -23,7 +23,7 @@ from torch import Tensor
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.loss.feature_scale import EVEN_COLOUR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
+from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.terms import LossTerms
@@ -167,7 +167,7 @@ def fingerprint(
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
     digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
     if settings.feature_scale == "even":  # factors that a later version may choose otherwise: a run keeps to one loss
-        digest.update(repr((EVEN_SCALE, EVEN_COLOUR_SCALE, EVEN_PIXEL_SCALE)).encode())
+        digest.update(repr((EVEN_SCALE, EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE)).encode())
     return digest.hexdigest()
 
 
@@ -296,7 +296,7 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """A plan's tensors, and the rest for JSON."""
     tensors = {
         "plan.total_weights": plan.survey.total_blend_weights,
-        "plan.optimised": plan.optimised,
+        "plan.optimized": plan.optimized,
         "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not take twice
     }
     nothing = torch.empty(0)  # `asdict` would copy them
@@ -307,10 +307,10 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors["plan.refined_sh_dc"] = refinement.sh_dc
         plan = replace(plan, refinement=replace(refinement, pieces=nothing, sh_dc=None))
     survey = replace(plan.survey, total_blend_weights=nothing)
-    values = asdict(replace(plan, survey=survey, optimised=nothing, seen=nothing))
+    values = asdict(replace(plan, survey=survey, optimized=nothing, seen=nothing))
     if refinement is not None:
         del values["refinement"]["pieces"], values["refinement"]["sh_dc"]
-    del values["optimised"], values["seen"], values["survey"]["total_blend_weights"]
+    del values["optimized"], values["seen"], values["survey"]["total_blend_weights"]
     return tensors, values
 
 
@@ -347,7 +347,7 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     refined = values.pop("refinement", None)
     return Plan(
         survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **looked),
-        optimised=tensors["plan.optimised"],
+        optimized=tensors["plan.optimized"],
         seen=tensors["plan.seen"],
         covered=covered,
         decisions=decisions,

@@ -1,4 +1,4 @@
-"""The SOS loss of colours on some views, split by scale."""
+"""The SOS loss of colors on some views, split by scale."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def evaluation_views(covered: Sequence[int], most: int) -> list[int]:
 def evaluate(
     views: Views, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
 ) -> Evaluation:
-    """Mean SOS loss of colours [n, 3] over views, split by scale."""
+    """Mean SOS loss of colors [n, 3] over views, split by scale."""
     evaluations = []
     for index in indices:
         camera = views.cameras[index]
         with torch.no_grad():
-            image = views.render(index, views.colours(index, sh_dc))
+            image = views.render(index, views.colors(index, sh_dc))
         target = views.target(index, views.loss.scales(camera.height, camera.width))
         evaluations.append(views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
     return mean_evaluation(evaluations)

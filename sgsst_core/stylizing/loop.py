@@ -1,4 +1,4 @@
-"""The optimiser loop: all steps of a job, and when it ends before them.
+"""The optimizer loop: all steps of a job, and when it ends before them.
 
 The loop prints nothing and writes nothing; what is to be shown or saved goes through `Callbacks`. Of several ranks,
 each runs it; the first one decides when it ends.

@@ -1,6 +1,6 @@
 """Cutting large Gaussians before a job: look at the views, ask the loss, cut, and prove that the picture stays.
 
-Nothing is stylized yet. The gradient is taken once for each view, of colours that have the style's mean and spread in
+Nothing is stylized yet. The gradient is taken once for each view, of colors that have the style's mean and spread in
 closed form: what first steps would reach, and what is left to ask for is texture.
 """
 
@@ -32,7 +32,7 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.scene.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
@@ -42,7 +42,7 @@ from sgsst_core.stylizing.warm_start import with_moments
 GRADIENT_VIEWS = 24
 #: Views whose picture is compared.
 MEASURED_VIEWS = 6
-#: Steps in which colours of what is cut are fitted to the unstylized picture.
+#: Steps in which colors of what is cut are fitted to the unstylized picture.
 _FITTING_STEPS = 5
 #: Rounds in which Gaussians are taken back, until the picture is close enough; and in each, their share of its error.
 _ROUNDS, _TAKEN_BACK = 24, 0.25
@@ -152,7 +152,7 @@ class _Refining:
     ) -> tuple[Tensor, _Change | None]:
         """Fewer pieces, as many as leave the picture of some views what it is, and how much it changes.
 
-        Colours of what is cut are fitted to others before. None where nothing is cut, or is left to be cut.
+        Colors of what is cut are fitted to others before. None where nothing is cut, or is left to be cut.
         """
         for _ in range(_ROUNDS):
             if not bool((pieces > 1).any()):
@@ -211,7 +211,7 @@ class _Refining:
         return cancels, there_is
 
     def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
-        """What pieces [N, 3] do to the unstylized picture of some views, once colours are fitted to others."""
+        """What pieces [N, 3] do to the unstylized picture of some views, once colors are fitted to others."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
         options = rasterizer_options(name, self._settings, self._workshop.machine.memory)
         cut = make_rasterizer(name, scene, **options)
@@ -223,16 +223,16 @@ class _Refining:
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
             change = (render(scene, cut, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
-            squared += self._rasterizer.colour_gradient(change, camera).double().sum(dim=1).cpu()
+            squared += self._rasterizer.color_gradient(change, camera).double().sum(dim=1).cpu()
         every = [error for part in self._collectives.all_gather(errors) for error in part.values()]
         return _Change(psnr(sum(every) / len(every)), psnr(max(every)), scene.sh_dc, self._sum(squared))
 
     def _fit(self, scene: Scene, cut: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
-        """A cut scene whose children [M] bool have colours by which views look as before.
+        """A cut scene whose children [M] bool have colors by which views look as before.
 
-        Pictures are linear in colours. Each step adds to every child's what its pixels lack, their mean by blend
+        Pictures are linear in colors. Each step adds to every child's what its pixels lack, their mean by blend
         weights (simultaneous iterative reconstruction: Gilbert 1972), which converges because no pixel's weights add up
-        to more than 1; a child then has no colour that its pixels do not ask for.
+        to more than 1; a child then has no color that its pixels do not ask for.
         """
         children = children.to(self._rasterizer.device)
         for _ in range(_FITTING_STEPS):
@@ -240,7 +240,7 @@ class _Refining:
             for index in self._own(views):
                 camera = self._workshop.cameras[index]
                 missing = render(self._scene, self._rasterizer, camera) - render(scene, cut, camera)
-                lacks[:, :3] += cut.colour_gradient(missing, camera)
+                lacks[:, :3] += cut.color_gradient(missing, camera)
                 lacks[:, 3] += cut.survey(camera)[1]
             lacks = self._collectives.all_reduce(lacks)
             step = lacks[:, :3] / lacks[:, 3:].clamp_min(1.0) / SH_C0
@@ -279,8 +279,8 @@ class _Refining:
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
     """Image [H, W, 3] of a scene as it is, by a rasterizer of its geometry."""
     device = rasterizer.device
-    rest = rest_colours(scene.sh_rest.to(device), scene.means.to(device), camera)
-    return rasterizer.render(view_colours(scene.sh_dc.to(device), rest), camera)
+    rest = rest_colors(scene.sh_rest.to(device), scene.means.to(device), camera)
+    return rasterizer.render(view_colors(scene.sh_dc.to(device), rest), camera)
 
 
 def spread_evenly(views: Sequence[int], most: int) -> list[int]:

@@ -15,7 +15,7 @@ from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
-from sgsst_core.stylizing.unseen import neighbours_change
+from sgsst_core.stylizing.unseen import neighbors_change
 from sgsst_core.stylizing.warm_start import luminance_start, warm_start
 
 
@@ -41,7 +41,7 @@ class JobStyles:
 
         Args:
             regions: as `Regions.resolved` gives them.
-            sh_dc: [N, 3], of the scene; a region's style may take the colours of its own Gaussians.
+            sh_dc: [N, 3], of the scene; a region's style may take the colors of its own Gaussians.
             weights: [N] float64, total blend weights.
         """
         if regions is None:
@@ -88,7 +88,7 @@ class JobStyles:
         }
 
     def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, keep_chroma: bool = False) -> Tensor:
-        """Colours [n, 3] with the colours of their region's style: see `warm_start`.
+        """Colors [n, 3] with the colors of their region's style: see `warm_start`.
 
         Args:
             sh_dc: [n, 3], of some of the scene's Gaussians.
@@ -123,7 +123,7 @@ class JobStyles:
 class RegionMaps:
     """Renders what share of each pixel's blend weights the Gaussians of some regions have.
 
-    Blending is linear in the colours: with 1 as the colour of a region's Gaussians and 0 as that of all others, three
+    Blending is linear in the colors: with 1 as the color of a region's Gaussians and 0 as that of all others, three
     regions come with each pass.
 
     Args:
@@ -148,20 +148,20 @@ class RegionMaps:
     def _pass(self, camera: Camera, rows: Rows | None, places: tuple[int, ...]) -> Tensor:
         """Up to three regions. Without any it is what lies behind them, which all have in common to the last bit."""
         rasterizer = self._rasterizer
-        colours = torch.zeros((len(self._labels), 3), dtype=rasterizer.dtype, device=rasterizer.device)
+        colors = torch.zeros((len(self._labels), 3), dtype=rasterizer.dtype, device=rasterizer.device)
         for channel, place in enumerate(places):
-            colours[:, channel] = self._labels == place
-        return rasterizer.render(colours, camera, rows)
+            colors[:, channel] = self._labels == place
+        return rasterizer.render(colors, camera, rows)
 
 
-def neighbours_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
-    """Colour changes [N, 3] for the Gaussians that nothing optimises: those of neighbours in the same region.
+def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
+    """Color changes [N, 3] for the Gaussians that nothing optimizes: those of neighbors in the same region.
 
-    In a region of which nothing is optimised, they are those of any neighbours. Kept Gaussians have none.
+    In a region of which nothing is optimized, they are those of any neighbors. Kept Gaussians have none.
 
     Args:
-        means, change: as for `neighbours_change`.
-        weights: [N] float64, total blend weights of the optimised Gaussians; 0 for all others.
+        means, change: as for `neighbors_change`.
+        weights: [N] float64, total blend weights of the optimized Gaussians; 0 for all others.
     """
     result = torch.zeros_like(change)
     kept = regions.kept
@@ -172,5 +172,5 @@ def neighbours_change_by_region(means: Tensor, change: Tensor, weights: Tensor, 
             voters = weights
         rows = members | (voters > 0)
         takes = rows & (voters <= 0)
-        result[takes] = neighbours_change(means[rows], change[rows], voters[rows])
+        result[takes] = neighbors_change(means[rows], change[rows], voters[rows])
     return result

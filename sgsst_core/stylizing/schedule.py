@@ -1,4 +1,4 @@
-"""What is optimised when: the phases of a job."""
+"""What is optimized when: the phases of a job."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Phase:
     Attributes:
         stage: its name: "coarse" (phase 1) and "sos" (phase 2) in every preset.
         steps: how many.
-        scale: the one scale that is optimised, counted from the coarsest (0) of those that count; None for all of them,
+        scale: the one scale that is optimized, counted from the coarsest (0) of those that count; None for all of them,
             the SOS loss.
     """
 
@@ -27,7 +27,7 @@ class Phase:
     scale: int | None = None
 
     def scales(self, chosen: Sequence[int]) -> list[int]:
-        """Those of a view's chosen scales, the finest first, that are optimised."""
+        """Those of a view's chosen scales, the finest first, that are optimized."""
         return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
 
 

@@ -1,4 +1,4 @@
-"""The style's pictures as a job uses them: turned, and in the scene's colours, where that is asked."""
+"""The style's pictures as a job uses them: turned, and in the scene's colors, where that is asked."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
-from sgsst_core.stylizing.warm_start import in_colours_of, in_luminance_of
+from sgsst_core.stylizing.warm_start import in_colors_of, in_luminance_of
 
 
 def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
@@ -27,11 +27,11 @@ def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weigh
     """
     if settings.style_rotation:
         style = style.map(lambda picture: turned(picture, settings.style_rotation))
-    if settings.keep_colours == "match":
+    if settings.keep_colors == "match":
         # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
         # 2017, section 5.2.
-        style = in_colours_of(style, sh_dc, weights)
-    elif settings.keep_colours == "luminance":
+        style = in_colors_of(style, sh_dc, weights)
+    elif settings.keep_colors == "luminance":
         style = in_luminance_of(style, sh_dc, weights)  # section 5.1 there
     return style
 

@@ -1,4 +1,4 @@
-"""The optimiser loop: Adam on the DC colours, coarse phase then SOS, one view a step.
+"""The optimizer loop: Adam on the DC colors, coarse phase then SOS, one view a step.
 
 One step at a time; `loop.run` makes them all.
 """
@@ -45,14 +45,14 @@ from sgsst_core.stylizing.evaluation import (
     mean_evaluation,
     mean_loss,
 )
-from sgsst_core.stylizing.optimiser import ColourOptimiser, constrained, is_too_large
+from sgsst_core.stylizing.optimizer import ColorOptimizer, constrained, is_too_large
 from sgsst_core.stylizing.refining import refine, refined
-from sgsst_core.stylizing.regions import JobStyles, neighbours_change_by_region
+from sgsst_core.stylizing.regions import JobStyles, neighbors_change_by_region
 from sgsst_core.stylizing.schedule import Phase, drawn_round, drawn_views, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
-from sgsst_core.stylizing.surround import Colour, drawn_colour
+from sgsst_core.stylizing.surround import Color, drawn_color
 from sgsst_core.stylizing.team import Team
-from sgsst_core.stylizing.unseen import neighbours_change
+from sgsst_core.stylizing.unseen import neighbors_change
 from sgsst_core.stylizing.views import Views
 from sgsst_core.timing import Timer
 
@@ -140,7 +140,7 @@ class Stylizer:
         #: Of the Gaussians that are rendered, those that stay as they are; None where none do.
         self._kept = kept.to(rasterizer.device)[:, None] if kept.any() else None
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
-        self._optimiser = ColourOptimiser(
+        self._optimizer = ColorOptimizer(
             self.sh_dc,
             self.network.unit,
             chroma_of,
@@ -214,7 +214,7 @@ class Stylizer:
         )
 
     def transferred(self, own: Tensor | None = None) -> Tensor:
-        """The Gaussians that are rendered in the style's colours, [n, 3] on the CPU: see `warm_start`.
+        """The Gaussians that are rendered in the style's colors, [n, 3] on the CPU: see `warm_start`.
 
         Args:
             own: [n, 3] on the CPU, what they have; None for the scene's, as before any step.
@@ -223,28 +223,28 @@ class Stylizer:
         own = self.scene.sh_dc[seen] if own is None else own
         weights = self.plan.survey.total_blend_weights[seen]
         found = self.styles.transferred(own, weights, seen, keep_chroma=self._keeps_chroma)
-        # Of what no view decides, colours follow from what becomes of the others: see `stylized`.
-        return torch.where(self.plan.optimised[seen][:, None], found, own)
+        # Of what no view decides, colors follow from what becomes of the others: see `stylized`.
+        return torch.where(self.plan.optimized[seen][:, None], found, own)
 
     @property
     def transfers_last(self) -> bool:
-        """Whether results have the style's colours once more: see `ends_with_transfer`."""
+        """Whether results have the style's colors once more: see `ends_with_transfer`."""
         return ends_with_transfer(self.settings, warm=self.plan.warm_start)
 
-    def _transferred_last(self, optimised: Tensor) -> Tensor:
-        """What is written of optimised colours [n, 3]; before the first step they are the style's as they are."""
+    def _transferred_last(self, optimized: Tensor) -> Tensor:
+        """What is written of optimized colors [n, 3]; before the first step they are the style's as they are."""
         if not (self.transfers_last and self.step):
-            return optimised
-        found = self.transferred(optimised)
+            return optimized
+        found = self.transferred(optimized)
         if not self._keeps_chroma:
             return found
         bounded = constrained(found, self.scene.sh_dc[self.plan.seen], bounded=self.settings.bounded)
-        return torch.where(found != optimised, bounded, optimised)  # kept ones to the last bit
+        return torch.where(found != optimized, bounded, optimized)  # kept ones to the last bit
 
     @property
     def _keeps_chroma(self) -> bool:
-        """Whether colours change in luminance alone."""
-        return self.settings.keep_colours == "luminance"
+        """Whether colors change in luminance alone."""
+        return self.settings.keep_colors == "luminance"
 
     def _loss(self) -> SosLoss:
         settings = self.settings
@@ -371,9 +371,9 @@ class Stylizer:
         yield
         parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
 
-    def behind(self, index: int) -> Colour | None:
-        """The colour behind a view in the next step; None for the background of the settings."""
-        return drawn_colour(self.plan.surround, self.settings.seed, self.step, index, self.style)
+    def behind(self, index: int) -> Color | None:
+        """The color behind a view in the next step; None for the background of the settings."""
+        return drawn_color(self.plan.surround, self.settings.seed, self.step, index, self.style)
 
     def style_targets(self, camera: Camera) -> StyleTargets:
         """The style's statistics for views of the camera's size."""
@@ -388,7 +388,7 @@ class Stylizer:
         """One iteration.
 
         Raises:
-            DivergedError: the gradient has left the range of float32; the colours are those before the step.
+            DivergedError: the gradient has left the range of float32; the colors are those before the step.
         """
         started = time.perf_counter()
         self._stylized = None
@@ -400,8 +400,8 @@ class Stylizer:
             self._coarse = None  # phase 1 is over
         self.latest = views = [self._next_view() for _ in range(self.settings.views_per_step)]
         gradient, results = self._mean_gradient(views, phase)
-        with self.timer("optimiser"):
-            largest = self._optimiser.update(gradient, self.settings.learning_rate_at(self.share_done()))
+        with self.timer("optimizer"):
+            largest = self._optimizer.update(gradient, self.settings.learning_rate_at(self.share_done()))
         with self.timer("communication"):
             self._team.check_drift(self.step + 1, self.sh_dc)
         terms = self._read(largest, results)
@@ -453,7 +453,7 @@ class Stylizer:
                     gradient = self.collectives.all_reduce(gradient / self.group.size)
             gradient = gradient / len(views)
         if self._kept is not None:
-            gradient = gradient.masked_fill(self._kept, 0)  # Adam leaves colours of no gradient as they are
+            gradient = gradient.masked_fill(self._kept, 0)  # Adam leaves colors of no gradient as they are
         return gradient, results
 
     def _read(self, largest: Tensor, results: Sequence[SosResult]) -> Evaluation:
@@ -466,7 +466,7 @@ class Stylizer:
         Raises:
             DivergedError: that magnitude was too large for a step to be made.
         """
-        # The rasterizer, and with it the colours, may be on the CPU while the network is on a GPU.
+        # The rasterizer, and with it the colors, may be on the CPU while the network is on a GPU.
         first = largest.double()[None].to(self.network.device)
         numbers = torch.cat([first, *(result.values.flatten() for result in results)]).tolist()
         if is_too_large(numbers[0]):
@@ -484,8 +484,8 @@ class Stylizer:
 
     def _diverged(self, largest: float) -> DivergedError:
         return DivergedError(
-            f"Step {self.step + 1}: the colour gradient has grown to {largest:.3g}, which cannot be optimised; the "
-            f"largest colour coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a smaller "
+            f"Step {self.step + 1}: the color gradient has grown to {largest:.3g}, which cannot be optimized; the "
+            f"largest color coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a smaller "
             f"--learning-rate than {self.settings.learning_rate:g}, or look for extreme coefficients with `sgsst "
             "check`."
         )
@@ -529,14 +529,14 @@ class Stylizer:
         """Mean SOS loss over views, split by scale; changes nothing, its time does not count.
 
         Args:
-            sh_dc: [n, 3], colours to evaluate in place of the present ones of the n optimised Gaussians.
+            sh_dc: [n, 3], colors to evaluate in place of the present ones of the n optimized Gaussians.
         """
         self._keep_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
         return evaluate(self.views, self.style_targets, indices, values)
 
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
-        """dE/dsh_dc [n, 3] of the n optimised Gaussians on the CPU, as a step computes it, and its seconds.
+        """dE/dsh_dc [n, 3] of the n optimized Gaussians on the CPU, as a step computes it, and its seconds.
 
         Targets are prepared before the clock starts. Changes nothing.
         """
@@ -553,13 +553,13 @@ class Stylizer:
         style: StyleTargets,
         target: ViewTarget,
         scales: Sequence[int],
-        behind: Colour | None = None,
+        behind: Color | None = None,
     ) -> tuple[Tensor, SosResult]:
-        """dE/dsh_dc [n, 3] of one view with a colour behind it (None: the settings' background), and the loss."""
+        """dE/dsh_dc [n, 3] of one view with a color behind it (None: the settings' background), and the loss."""
         rasterizer = self._rasterizer_for(scales)
         with self.timer("render"), torch.no_grad():
-            colours = self.views.colours(index, self.sh_dc.detach())
-            image = self.views.render(index, colours, rasterizer)
+            colors = self.views.colors(index, self.sh_dc.detach())
+            image = self.views.render(index, colors, rasterizer)
             if behind is not None:
                 image = self.views.put_behind(index, image, behind, rasterizer.scale)
         with self.timer("loss"):
@@ -567,7 +567,7 @@ class Stylizer:
             result = evaluate(image, style, target, scales, image_scale=rasterizer.scale)
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
-            return self.views.gradient(index, result.image_gradient.to(colours.device), colours, rasterizer), result
+            return self.views.gradient(index, result.image_gradient.to(colors.device), colors, rasterizer), result
 
     def keep_weights(self, index: int, scales: Sequence[int]) -> None:
         """Keep a view's blend weights for some scales, as its first step does, where they fit.
@@ -598,23 +598,23 @@ class Stylizer:
         return self.views.rasterizer
 
     def stylized(self) -> Tensor:
-        """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimised colours, and those of unseen Gaussians.
+        """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimized colors, and those of unseen Gaussians.
 
-        They are what a job that ends now writes, so with the last transfer, where there is one. Kept until the colours
-        change, because the neighbours of millions of unseen Gaussians take seconds to find: it must not be written to.
+        They are what a job that ends now writes, so with the last transfer, where there is one. Kept until the colors
+        change, because the neighbors of millions of unseen Gaussians take seconds to find: it must not be written to.
         """
         if self._stylized is None:
             result = self.scene.sh_dc.clone()
             result[self.plan.seen] = self._transferred_last(self.sh_dc.detach().cpu())
-            if self.settings.unseen == "neighbours":
-                weights = torch.where(self.plan.optimised, self.plan.survey.total_blend_weights, 0.0)
+            if self.settings.unseen == "neighbors":
+                weights = torch.where(self.plan.optimized, self.plan.survey.total_blend_weights, 0.0)
                 change = result - self.scene.sh_dc
                 regions = self.regions
                 takes = weights <= 0 if regions is None else (weights <= 0) & ~regions.kept
                 if regions is None:
-                    change = neighbours_change(self.scene.means, change, weights)
+                    change = neighbors_change(self.scene.means, change, weights)
                 else:
-                    change = neighbours_change_by_region(self.scene.means, change, weights, regions)[takes]
+                    change = neighbors_change_by_region(self.scene.means, change, weights, regions)[takes]
                 change = change.mean(dim=1, keepdim=True) if self._keeps_chroma else change
                 own = self.scene.sh_dc[takes]
                 chroma_of = own if self._keeps_chroma else None
@@ -631,17 +631,17 @@ class Stylizer:
             return self.sh_dc.detach()
         return self.stylized()[self.plan.seen].to(self.sh_dc.device)
 
-    def set_colours(self, sh_dc: Tensor) -> None:
-        """Put the colours [N, 3] of the whole scene in place of the present ones, to evaluate them on these views."""
+    def set_colors(self, sh_dc: Tensor) -> None:
+        """Put the colors [N, 3] of the whole scene in place of the present ones, to evaluate them on these views."""
         self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(sh_dc[self.plan.seen])
 
     @contextmanager
-    def with_colours(self, sh_dc: Tensor) -> Iterator[None]:
-        """Have the colours [N, 3] of the whole scene for a while; the present ones come back, bit for bit."""
+    def with_colors(self, sh_dc: Tensor) -> Iterator[None]:
+        """Have the colors [N, 3] of the whole scene for a while; the present ones come back, bit for bit."""
         present, stylized = self.sh_dc.detach().clone(), self._stylized
-        self.set_colours(sh_dc)
+        self.set_colors(sh_dc)
         try:
             yield
         finally:
@@ -651,7 +651,7 @@ class Stylizer:
 
     def state(self) -> StylizerState:
         """A copy of all that a resumed run needs."""
-        first_moment, second_moment = self._optimiser.moments()
+        first_moment, second_moment = self._optimizer.moments()
         return StylizerState(
             sh_dc=self.sh_dc.detach().cpu().clone(),
             first_moment=first_moment,
@@ -672,7 +672,7 @@ class Stylizer:
         with torch.no_grad():
             self.sh_dc.copy_(state.sh_dc)
         if state.step:
-            self._optimiser.load_moments(state.step, state.first_moment, state.second_moment)
+            self._optimizer.load_moments(state.step, state.first_moment, state.second_moment)
         self.step = state.step
         self.seconds = state.seconds
         self._generator.set_state(state.generator)

@@ -13,7 +13,7 @@ from sgsst_core.parallel.collectives import Collectives, RankLeftOut, same_on_al
 from sgsst_core.planning.plan import Plan
 from sgsst_core.settings import Settings
 
-#: Steps between two proofs that all ranks have the same colours.
+#: Steps between two proofs that all ranks have the same colors.
 DRIFT_STEPS = 50
 #: Steps of a phase after which the ranks' speeds are compared; the first one, which prepares more, does not count.
 BALANCE_STEPS = 6
@@ -55,18 +55,18 @@ class Team:
         """Number of this rank's group."""
         return self.everybody.rank // self.group.size
 
-    def check_drift(self, step: int, colours: Tensor) -> None:
-        """Prove now and then that all ranks have the same colours [n, 3].
+    def check_drift(self, step: int, colors: Tensor) -> None:
+        """Prove now and then that all ranks have the same colors [n, 3].
 
         Raises:
             RanksDriftedError: they have not.
         """
         if self.everybody.size == 1 or step % DRIFT_STEPS:
             return
-        checksum = zlib.crc32(colours.detach().cpu().numpy().tobytes())
+        checksum = zlib.crc32(colors.detach().cpu().numpy().tobytes())
         if not same_on_all(self.everybody, checksum):
             raise RanksDriftedError(
-                f"Step {step}: the ranks' colours are no longer the same. They compute differently: run on "
+                f"Step {step}: the ranks' colors are no longer the same. They compute differently: run on "
                 "machines of one kind, with the same versions of this program and of PyTorch."
             )
 

@@ -1,4 +1,4 @@
-"""Colours for Gaussians that no view sees: the colour change of their nearest seen neighbours."""
+"""Colors for Gaussians that no view sees: the color change of their nearest seen neighbors."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-#: Seen neighbours that vote on an unseen Gaussian's colour change.
-NEIGHBOURS = 8
-#: Unseen Gaussians at a time: their neighbours' changes and weights take some tens of megabytes.
+#: Seen neighbors that vote on an unseen Gaussian's color change.
+NEIGHBORS = 8
+#: Unseen Gaussians at a time: their neighbors' changes and weights take some tens of megabytes.
 _CHUNK = 1 << 16
 #: Cells along each axis of the grid by which searches are ordered.
 _CELLS = 128
 
 
-def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """Colour changes for the Gaussians that no view sees.
+def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
+    """Color changes for the Gaussians that no view sees.
 
-    Each takes the mean change of its nearest seen neighbours, weighted by their total blend weights: what hardly any
+    Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: what hardly any
     pixel showed has a change that hardly any pixel asked for.
 
     Args:
         means: [N, 3].
-        change: [N, 3], what optimisation changed; rows of unseen Gaussians are not read.
+        change: [N, 3], what optimization changed; rows of unseen Gaussians are not read.
         weights: [N] float64, total blend weights; 0 for the U unseen ones, at least one positive.
 
     Returns:
@@ -31,7 +31,7 @@ def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     seen = weights > 0
     if bool(seen.all()):
         return torch.zeros((0, 3))
-    count = min(NEIGHBOURS, int(seen.sum()))
+    count = min(NEIGHBORS, int(seen.sum()))
     tree = cKDTree(means[seen].double().numpy())
     weights, change, places = weights[seen], change[seen], means[~seen]
     votes = torch.empty((len(places), 3))
@@ -42,7 +42,7 @@ def neighbours_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
 
 
 def _near_each_other(places: Tensor) -> Tensor:
-    """Order [U] of points [U, 3] by the cells of a coarse grid: searches of neighbours read the same part of a tree."""
+    """Order [U] of points [U, 3] by the cells of a coarse grid: searches of neighbors read the same part of a tree."""
     places = places.double()
     lowest = places.amin(dim=0)
     size = (places.amax(dim=0) - lowest).clamp_min(1e-300)

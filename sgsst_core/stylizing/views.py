@@ -21,10 +21,10 @@ from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_colours_gradient
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_colors_gradient
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
 from sgsst_core.stylizing.regions import RegionMaps
-from sgsst_core.stylizing.surround import Colour, put_behind
+from sgsst_core.stylizing.surround import Color, put_behind
 
 
 class Views:
@@ -34,7 +34,7 @@ class Views:
     that all of them find a view's targets, or none: preparing them takes all ranks.
 
     Args:
-        scene: supplies the colours' frozen part and the content (the unstylized render).
+        scene: supplies the colors' frozen part and the content (the unstylized render).
         cameras: one for each view.
         rasterizer: renders them.
         loss: prepares the targets.
@@ -42,12 +42,12 @@ class Views:
             in a thread too, see `look_ahead`.
         covered: indices of the views that see anything.
         weighted: weigh statistics by rendered coverage.
-        memory: bytes that content features, coverage and colours of views may take.
-        revive: let colours that the clamp holds at 0 come back (`view_colours_gradient`).
+        memory: bytes that content features, coverage and colors of views may take.
+        revive: let colors that the clamp holds at 0 come back (`view_colors_gradient`).
         keep_content: keep content features that fit; False computes them at each visit, for comparison.
         regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
         background: what the rasterizer has behind the Gaussians.
-        drawn: steps have other colours behind the Gaussians: images of the content are kept for them, not features.
+        drawn: steps have other colors behind the Gaussians: images of the content are kept for them, not features.
         maps: renders the share of each of the scene's regions; None where it has none.
         collectives: of the ranks that render each view together; `loss` has the same.
     """
@@ -66,7 +66,7 @@ class Views:
         keep_content: bool = True,
         revive: bool = False,
         regions: Sequence[Rectangle] | None = None,
-        background: Colour = (0.0, 0.0, 0.0),
+        background: Color = (0.0, 0.0, 0.0),
         drawn: bool = False,
         maps: RegionMaps | None = None,
         collectives: Collectives = ALONE,
@@ -115,15 +115,15 @@ class Views:
     def __len__(self) -> int:
         return len(self.cameras)
 
-    def colours(self, index: int, sh_dc: Tensor) -> Tensor:
-        """Colours [N, 3] of a view."""
+    def colors(self, index: int, sh_dc: Tensor) -> Tensor:
+        """Colors [N, 3] of a view."""
         if self.scene.sh_degree == 0:
-            return view_colours(sh_dc, torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device))
-        rest = self._rest.get(index, lambda: rest_colours(self._sh_rest, self._means, self.cameras[index]))
-        return view_colours(sh_dc, rest)
+            return view_colors(sh_dc, torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device))
+        rest = self._rest.get(index, lambda: rest_colors(self._sh_rest, self._means, self.cameras[index]))
+        return view_colors(sh_dc, rest)
 
-    def render(self, index: int, colours: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
-        """Image [h, w, 3] of a view with its colours [N, 3].
+    def render(self, index: int, colors: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
+        """Image [h, w, 3] of a view with its colors [N, 3].
 
         Args:
             rasterizer: takes the place of the views' own; h and w are those of its scale. Images of a coarse scale
@@ -131,17 +131,17 @@ class Views:
         """
         rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
         if rasterizer.scale:
-            return rasterizer.render(colours, camera)
+            return rasterizer.render(colors, camera)
         band = self._own_band(index)
         some = band[0] < band[1]
-        rows = rasterizer.render(colours, camera, band) if some else self._nothing(0, camera.width, 3)
+        rows = rasterizer.render(colors, camera, band) if some else self._nothing(0, camera.width, 3)
         with self.loss.timer("communication"):
             return self.collectives.all_gather_rows(rows, self._bands[index])
 
     def gradient(
-        self, index: int, image_gradient: Tensor, colours: Tensor, rasterizer: Rasterizer | None = None
+        self, index: int, image_gradient: Tensor, colors: Tensor, rasterizer: Rasterizer | None = None
     ) -> Tensor:
-        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [h, w, 3] and the colours that were rendered.
+        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [h, w, 3] and the colors that were rendered.
 
         Args:
             rasterizer: as for `render`.
@@ -154,10 +154,10 @@ class Views:
             with self.loss.timer("communication"):
                 rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
         some = len(rows) > 0
-        gradient = rasterizer.colour_gradient(rows, camera, band) if some else self._nothing(len(colours), 3)
+        gradient = rasterizer.color_gradient(rows, camera, band) if some else self._nothing(len(colors), 3)
         gradient = self._sum(gradient, self._shown_by(index, rasterizer, rows, band))
-        # After the sum: which colours are let through depends on the sign of their whole gradient.
-        return view_colours_gradient(gradient, colours, revive=self.revive)
+        # After the sum: which colors are let through depends on the sign of their whole gradient.
+        return view_colors_gradient(gradient, colors, revive=self.revive)
 
     def keep_weights(self, index: int, rasterizer: Rasterizer | None = None) -> None:
         """Keep the blend weights of this rank's part of a view, where its rasterizer keeps any and they fit.
@@ -207,7 +207,7 @@ class Views:
             mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
             with self.loss.timer("prepare"):
                 if len(rows):  # weights are never negative: their sum is 0 where all of them are
-                    mask = rasterizer.colour_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
+                    mask = rasterizer.color_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
             with self.loss.timer("communication"):
                 return ShownGaussians(self.collectives.union(mask))
 
@@ -226,7 +226,7 @@ class Views:
             return self._ahead(index)
         if self._photos is not None:
             return self._photos(index)
-        return self.render(index, self.colours(index, self._sh_dc), self._repeatable)
+        return self.render(index, self.colors(index, self._sh_dc), self._repeatable)
 
     def look_ahead(self, index: int, scales: Sequence[int]) -> None:
         """On a GPU, begin to read the photo of the view whose target is asked for next, if that will need it."""
@@ -255,17 +255,17 @@ class Views:
         maps = self._maps
         return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
 
-    def put_behind(self, index: int, image: Tensor, colour: Colour, scale: int = 0) -> Tensor:
-        """Image [h, w, 3] of a view, at a scale, with another colour behind the Gaussians, on the network's device."""
-        return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], colour, self._background)
+    def put_behind(self, index: int, image: Tensor, color: Color, scale: int = 0) -> Tensor:
+        """Image [h, w, 3] of a view, at a scale, with another color behind the Gaussians, on the network's device."""
+        return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background)
 
-    def target(self, index: int, scales: Sequence[int], behind: Colour | None = None) -> ViewTarget:
+    def target(self, index: int, scales: Sequence[int], behind: Color | None = None) -> ViewTarget:
         """What the view is compared with at some scales; kept where memory allows.
 
         Features are computed only of scales that are asked for: phase 1 needs those of one.
 
         Args:
-            behind: the colour behind the Gaussians, which their content has too; None for the rasterizer's own. Its
+            behind: the color behind the Gaussians, which their content has too; None for the rasterizer's own. Its
                 features are nobody else's: only the images that they are computed from are kept.
         """
         coverage = self.coverage(index) if self.weighted else None
@@ -293,10 +293,10 @@ class Views:
 
         return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
 
-    def _content_behind(self, index: int, image: Tensor, behind: Colour, scale: int) -> Tensor:
-        """The content of a view at a scale with another colour behind the Gaussians.
+    def _content_behind(self, index: int, image: Tensor, behind: Color, scale: int) -> Tensor:
+        """The content of a view at a scale with another color behind the Gaussians.
 
-        What a photo has where no Gaussian is gives way to the colour.
+        What a photo has where no Gaussian is gives way to the color.
         """
         if self._photos is None:
             return self.put_behind(index, image, behind, scale)

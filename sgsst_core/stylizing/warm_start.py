@@ -1,13 +1,13 @@
-"""Warm start: colours that are the style's before any step, with each Gaussian's weight in the views.
+"""Warm start: colors that are the style's before any step, with each Gaussian's weight in the views.
 
-`warm_start` gives them the distribution of the style's colours (see `colour_transport`); `with_moments` only its mean
-and covariance, by the linear map that moves colours least (optimal transport between Gaussian distributions; Pitié and
-Kokaram, "The Linear Monge-Kantorovitch Linear Colour Mapping for Example-Based Colour Transfer", 2007):
+`warm_start` gives them the distribution of the style's colors (see `color_transport`); `with_moments` only its mean
+and covariance, by the linear map that moves colors least (optimal transport between Gaussian distributions; Pitié and
+Kokaram, "The Linear Monge-Kantorovitch Linear Color Mapping for Example-Based Color Transfer", 2007):
 
     A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2,   c -> A (c - m) + m_style
 
 with S, m the scene's covariance and mean and T the style's. What it moves out of 0..1 is cut off: of a dark object and
-a bright style of two colours, a pale grey was left.
+a bright style of two colors, a pale gray was left.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 from sgsst_core.loss.nearest import chosen_places
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
-from sgsst_core.stylizing.colour_transport import transported
+from sgsst_core.stylizing.color_transport import transported
 
-#: A direction in which the scene's colours vary by less than this share of their largest variance has no spread that
+#: A direction in which the scene's colors vary by less than this share of their largest variance has no spread that
 #: could be stretched to the style's: it is left flat instead of blowing rounding up.
 _FLAT = 1e-9
 #: Pixels of a style that stand for all of them, at most.
@@ -30,20 +30,20 @@ _PIXELS = 1 << 16
 
 
 def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
-    """DC coefficients with the distribution of the style's colours, all of which a picture can show (0..1).
+    """DC coefficients with the distribution of the style's colors, all of which a picture can show (0..1).
 
     Args:
         sh_dc: [N, 3] float32.
         weights: [N] float64, total blend weights, at least one positive.
-        style: pictures [H, W, 3] in 0..1; of several, colours are as frequent as in the mixture.
+        style: pictures [H, W, 3] in 0..1; of several, colors are as frequent as in the mixture.
 
     Returns:
         [N, 3] float32.
     """
-    colours = COLOUR_OFFSET + SH_C0 * sh_dc.double()
-    wanted = _some_pixels(StyleMixture.of(style)).to(colours)
-    moved = transported(colours, weights.double() / weights.double().amax(), wanted)
-    return on_screen(((moved.clamp(0, 1) - COLOUR_OFFSET) / SH_C0).to(sh_dc.dtype))
+    colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
+    wanted = _some_pixels(StyleMixture.of(style)).to(colors)
+    moved = transported(colors, weights.double() / weights.double().amax(), wanted)
+    return on_screen(((moved.clamp(0, 1) - COLOR_OFFSET) / SH_C0).to(sh_dc.dtype))
 
 
 def _some_pixels(style: StyleMixture) -> Tensor:
@@ -60,23 +60,23 @@ def _some_pixels(style: StyleMixture) -> Tensor:
 
 def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
     """DC coefficients with the style's mean and covariance, cut off at 0..1; arguments as of `warm_start`."""
-    colours = 0.5 + SH_C0 * sh_dc.double()
-    mean, covariance = _moments(colours, weights.double() / weights.double().amax())
+    colors = 0.5 + SH_C0 * sh_dc.double()
+    mean, covariance = _moments(colors, weights.double() / weights.double().amax())
     wanted_mean, wanted = _style_moments(StyleMixture.of(style))
-    matched = (colours - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
+    matched = (colors - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
     return on_screen(((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype))
 
 
-def in_colours_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """A style, of pictures [H, W, 3] in 0..1, with mean and covariance of a scene's colours: the inverse map.
+def in_colors_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+    """A style, of pictures [H, W, 3] in 0..1, with mean and covariance of a scene's colors: the inverse map.
 
     Of several pictures, those are the mixture's: all take the same map.
 
     Args:
         sh_dc, weights: as in `warm_start`.
     """
-    colours = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
-    wanted_mean, wanted = _moments(colours, weights.double() / weights.double().amax())
+    colors = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
+    wanted_mean, wanted = _moments(colors, weights.double() / weights.double().amax())
     mean, covariance = _style_moments(style)
     turned = _monge_map(covariance, wanted.to(mean)).T
 
@@ -97,25 +97,25 @@ def _style_moments(style: StyleMixture) -> tuple[Tensor, Tensor]:
 
 
 def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
-    """As `warm_start`, in luminance alone: mean and spread of the style's, clamped to 0..1, with the colours' chroma.
+    """As `warm_start`, in luminance alone: mean and spread of the style's, clamped to 0..1, with the colors' chroma.
 
     Returns:
         [N, 3] float32.
     """
-    own = luminance(COLOUR_OFFSET + SH_C0 * sh_dc.double())
+    own = luminance(COLOR_OFFSET + SH_C0 * sh_dc.double())
     matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(StyleMixture.of(style)))
     return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
 
 
 def in_luminance_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """A style, of pictures [H, W, 3] in 0..1, without colour, its luminance with mean and deviation of a scene's.
+    """A style, of pictures [H, W, 3] in 0..1, without color, its luminance with mean and deviation of a scene's.
 
     Of several pictures, those are the mixture's: all take the same map.
 
     Args:
         sh_dc, weights: as in `warm_start`.
     """
-    wanted = _luminance_moments(luminance((COLOUR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
+    wanted = _luminance_moments(luminance((COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
     own = _style_luminance(style)
 
     def match(picture: Tensor) -> Tensor:
@@ -152,12 +152,12 @@ def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, T
     return ((values - mean) * factor + wanted_mean).clamp(0, 1)
 
 
-def _moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean [3] and covariance [3, 3] of colours [n, 3]."""
+def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean [3] and covariance [3, 3] of colors [n, 3]."""
     total = weights.sum()
-    mean = (weights[:, None] * colours).sum(dim=0) / total
-    centred = colours - mean
-    return mean, (weights[:, None] * centred).T @ centred / total
+    mean = (weights[:, None] * colors).sum(dim=0) / total
+    centered = colors - mean
+    return mean, (weights[:, None] * centered).T @ centered / total
 
 
 def _monge_map(source: Tensor, target: Tensor) -> Tensor:

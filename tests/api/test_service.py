@@ -123,9 +123,9 @@ def result(client: httpx.Client, job_id: str) -> bytes:
     return client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
 
 
-def check_colours(client: httpx.Client, job_id: str, scene: Path) -> None:
-    """The stylized colours alone are those of the PLY, as float16."""
-    found = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colours.f16").content, "<f2").reshape(-1, 3)
+def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
+    """The stylized colors alone are those of the PLY, as float16."""
+    found = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colors.f16").content, "<f2").reshape(-1, 3)
     stylized = PlyData.read(io.BytesIO(result(client, job_id)))["vertex"]
     exact = np.stack([stylized[f"f_dc_{channel}"] for channel in range(3)], 1).astype(np.float64)
     assert np.abs(found - exact).max() <= max(2.0**-11 * np.abs(exact).max(), 2.0**-25)
@@ -177,7 +177,7 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         assert {"stylized.ply", "plan.json", "report.json", "report.html", "log.txt"} <= names
         assert not any(name.startswith(".") for name in names)
         assert found["preview"] == max(name for name in names if name.startswith("previews/"))
-        check_colours(client, job_id, files["scene"])
+        check_colors(client, job_id, files["scene"])
         check_course(client, job_id, steps)
         for entry in listed:
             content = client.get(entry["url"])

@@ -26,7 +26,7 @@ def test_pixels_in_another_order_have_the_same_palette() -> None:
     assert sliced_distance([shuffled, shuffled], _palette(picture)) == pytest.approx(0, abs=1e-6)
 
 
-def test_two_colours_are_as_far_apart_as_on_the_mean_direction() -> None:
+def test_two_colors_are_as_far_apart_as_on_the_mean_direction() -> None:
     """A difference d has mean square d^2 / 3 along directions of equal share in all of space; 64 of them are drawn."""
     first, second = torch.full((4, 4, 3), 0.2), torch.tensor([0.9, 0.5, 0.2]).expand(7, 3, 3)
     found = sliced_distance([first, first], _palette(second))

@@ -33,7 +33,7 @@ def test_a_small_fleet_does_all_that_it_is_asked_for() -> None:
     found = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
     assert found["jobs"] == found["attempts"] == round(200_000 * 0.016 / 48)
     assert found["ended"] > 0.7 * found["jobs"]
-    assert 0.4 < found["utilisation"] <= 1
+    assert 0.4 < found["utilization"] <= 1
     assert found["starved"] == found["host_failures"] == found["lost_gpu_hours"] == 0
     again = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
     for figures in (found, again):

@@ -84,7 +84,7 @@ def test_device_and_host_work_at_the_same_time() -> None:
 
 def test_what_is_kept_is_not_made_anew() -> None:
     everything = forecast.kept_shares(SMALL, make_loss("float32"), coarse=False)
-    assert everything == {"content": 1.0, "lists": 1.0, "colours": 1.0}
+    assert everything == {"content": 1.0, "lists": 1.0, "colors": 1.0}
     garden = forecast.kept_shares(JOBS["5187x3361"], make_loss("float32"), coarse=False)
     assert all(0 < share < 1 for share in garden.values())
     parts = forecast.step_parts(SMALL, "bfloat16")
@@ -94,7 +94,7 @@ def test_what_is_kept_is_not_made_anew() -> None:
 def test_the_range_holds_the_likely_figure() -> None:
     found = forecast.forecast(SMALL, "tf32", LAUNCHES)
     for kind in ("sos", "coarse"):
-        low, mid, high = (found[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))
+        low, mid, high = (found[kind][name]["total"] for name in ("optimiztic", "likely", "pessimistic"))
         assert 0 < low < mid < high
     assert found["coarse"]["likely"]["total"] <= found["sos"]["likely"]["total"]
     assert "| **a step** |" in forecast.table({"tf32": found})

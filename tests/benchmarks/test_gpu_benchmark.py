@@ -52,7 +52,7 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
         assert entry["planned_peak_bytes"] > 0
     assert len(found["curve"]["losses"]) == len(found["curve"]["losses_on_the_cpu"]) == 4
     assert found["curve"]["loss"]["passed"]
-    assert found["ranks"]["colours"]["passed"]
+    assert found["ranks"]["colors"]["passed"]
     assert found["tests"]["failed"] == {}
 
 

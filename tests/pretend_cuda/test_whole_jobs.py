@@ -15,7 +15,7 @@ if torch.cuda.is_available():
 
 from sgsst_core.files.ply import read_scene
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.optimiser import is_too_large
+from sgsst_core.stylizing.optimizer import is_too_large
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import networks
 from tests.pretend_cuda.counts import Counts
@@ -185,10 +185,10 @@ def test_a_gradient_that_cannot_be_squared_changes_nothing(counts: Counts, tmp_p
     stylizer = prepare(request_(tmp_path, learning_rate=0.5)).stylizer
     stylizer.run_step()
     before = stylizer.state()
-    optimiser = stylizer._optimiser
+    optimizer = stylizer._optimizer
     huge = torch.full_like(stylizer.sh_dc.detach(), 1e20)
-    assert is_too_large(float(optimiser.update(huge, 0.5)))
-    assert is_too_large(float(optimiser.update(huge * torch.nan, 0.5)))
+    assert is_too_large(float(optimizer.update(huge, 0.5)))
+    assert is_too_large(float(optimizer.update(huge * torch.nan, 0.5)))
     after = stylizer.state()
     assert torch.equal(after.sh_dc, before.sh_dc)
     assert torch.equal(after.first_moment, before.first_moment)

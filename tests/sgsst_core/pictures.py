@@ -23,7 +23,7 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
     return float((value.double() - expected).norm() / expected.norm())
 
 
-def nearly_one_colour(height: int = 40, width: int = 50) -> Tensor:
+def nearly_one_color(height: int = 40, width: int = 50) -> Tensor:
     """[h, w, 3] float32 of 100 and up to seven times more of its rounding, 2^-17, the mean of which float32 rounds."""
     steps = torch.randint(8, (height, width, 3), generator=torch.Generator().manual_seed(3))
     return 100 + 2.0**-17 * steps.float()

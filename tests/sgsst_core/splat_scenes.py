@@ -81,8 +81,8 @@ def empty_scene() -> Scene:
     )
 
 
-def colours_of(scene: Scene, seed: int = 5) -> Tensor:
-    """Random colours in 0..2, float32."""
+def colors_of(scene: Scene, seed: int = 5) -> Tensor:
+    """Random colors in 0..2, float32."""
     return 2 * torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(seed))
 
 

@@ -70,11 +70,11 @@ def step(timer: Timer, work: Any) -> None:
             work(16.0)
         work(32.0)
     work(64.0)
-    with timer("optimiser"):
+    with timer("optimizer"):
         work(128.0)
 
 
-SECONDS = {"loss": 33.0, "forward": 26.0, "statistics": 4.0, "optimiser": 128.0}
+SECONDS = {"loss": 33.0, "forward": 26.0, "statistics": 4.0, "optimizer": 128.0}
 
 
 def test_nested_blocks_count_for_the_inner_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,7 @@ def needles() -> Scene:
 
 
 def around_the_camera() -> Scene:
-    """The camera is inside every one of them; centres just behind the near plane and farther away."""
+    """The camera is inside every one of them; centers just behind the near plane and farther away."""
     means = torch.tensor([[0.0, 0.0, 0.21], [0.5, -0.5, 0.3], [-3.0, 2.0, 1.0], [0.0, 1.0, 2.0]])
     sizes = torch.tensor([0.5, 3.0, 30.0, 1e4]).log()
     return replace(repeated(4, logit=-1.0), means=means, scales=sizes[:, None].repeat(1, 3))

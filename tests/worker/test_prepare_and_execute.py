@@ -224,17 +224,17 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
 
 
 def with_scene(request: StylizeRequest, scene: Scene, **options: object) -> StylizeRequest:
-    """The same job of another scene, with its colours alone as well."""
+    """The same job of another scene, with its colors alone as well."""
     write_scene(request.source.scene, scene)
-    return replace(request, source=request.source.model_copy(update=options), colours=True)
+    return replace(request, source=request.source.model_copy(update=options), colors=True)
 
 
-def test_colours_alone_are_those_of_the_result(request_: StylizeRequest, tmp_path: Path) -> None:
+def test_colors_alone_are_those_of_the_result(request_: StylizeRequest, tmp_path: Path) -> None:
     for request in (with_scene(request_, wall(sh_degree=1)), small_request(tmp_path / "not", 1)):
         go_on(prepare(request))
-        alone = request.out.with_name("s.colours.f16")
-        assert alone.exists() == request.colours
-        if request.colours:
+        alone = request.out.with_name("s.colors.f16")
+        assert alone.exists() == request.colors
+        if request.colors:
             exact = read_scene(request.out).scene.sh_dc
             found = np.fromfile(alone, "<f2").reshape(-1, 3)
             assert found.shape == exact.shape
@@ -242,7 +242,7 @@ def test_colours_alone_are_those_of_the_result(request_: StylizeRequest, tmp_pat
 
 
 @pytest.mark.parametrize("why", ["cut", "dropped", "faded"])
-def test_colours_alone_are_not_written_where_more_than_colours_changes(tmp_path: Path, why: str) -> None:
+def test_colors_alone_are_not_written_where_more_than_colors_changes(tmp_path: Path, why: str) -> None:
     if why == "cut":
         request = with_scene(small_request(tmp_path, 1, refine=3.0), large_wall())
     elif why == "dropped":
@@ -254,4 +254,4 @@ def test_colours_alone_are_not_written_where_more_than_colours_changes(tmp_path:
     result = go_on(prepare(request))
     assert result.report_error is None
     assert request.out.exists()
-    assert not request.out.with_name("s.colours.f16").exists()
+    assert not request.out.with_name("s.colors.f16").exists()

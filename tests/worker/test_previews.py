@@ -16,7 +16,7 @@ from tests.small_scenes import cameras, wall
 from worker.previews import Previews
 
 
-def test_the_first_preview_shows_the_colours_of_a_warm_start_before_any_step(
+def test_the_first_preview_shows_the_colors_of_a_warm_start_before_any_step(
     tiny_weights: BackboneWeights, tmp_path: Path
 ) -> None:
     settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
@@ -34,7 +34,7 @@ def test_the_first_preview_shows_the_colours_of_a_warm_start_before_any_step(
     index = stylizer.evaluation_views[0]
     wanted = warm_start(scene.sh_dc, stylizer.plan.survey.total_blend_weights, style)[stylizer.plan.seen]
     views = stylizer.views
-    save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colours(index, wanted), views.cameras[index]))
+    save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colors(index, wanted), views.cameras[index]))
     found, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
     np.testing.assert_array_equal(found, expected)
     assert found.std() > 1

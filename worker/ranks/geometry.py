@@ -26,13 +26,13 @@ from sgsst_core.errors import SceneTooLargeError, SgsstError
 from sgsst_core.files.ply import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.files.scene_headers import read_scene_header
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.planning.cost import OPTIMISER_BYTES
+from sgsst_core.planning.cost import OPTIMIZER_BYTES
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home
 
-#: Bytes that a rank needs for each Gaussian beside the scene and the optimiser: its place in a view (centre, conic,
-#: depth, extent, sorting keys), its colour there, and both colours' gradients.
+#: Bytes that a rank needs for each Gaussian beside the scene and the optimizer: its place in a view (center, conic,
+#: depth, extent, sorting keys), its color there, and both colors' gradients.
 VIEW_BYTES = 96
 #: Array starts are multiples of this, so that every type finds its alignment.
 _ALIGNMENT = 64
@@ -183,7 +183,7 @@ def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
 
 def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: int) -> SceneTooLargeError | None:
     """What is missing on this rank; None where there is room."""
-    own = count * (OPTIMISER_BYTES + VIEW_BYTES)
+    own = count * (OPTIMIZER_BYTES + VIEW_BYTES)
     each = scene_bytes + own  # every rank has what the views show once for itself
     where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
     advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."

@@ -216,7 +216,7 @@ class ProcessGroupCollectives:
         moments = []
         for part, mean in zip(parts, means, strict=True):
             away = part.mean - mean
-            moment = part.centred + torch.outer(away, away) * part.count
+            moment = part.centered + torch.outer(away, away) * part.count
             moments.append(moment[self._half(moment)])  # symmetric: one half travels
         halves = self.all_reduce(torch.cat(moments), "statistics").split([len(moment) for moment in moments])
         merged = [
@@ -302,5 +302,5 @@ def _machine() -> tuple[str, str]:
 
 def _keep_for(stream: torch.cuda.Stream, parts: Sequence[LayerStatistics], numbers: Tensor) -> None:
     """Memory of tensors of another stream is not given to others before this one has done with it."""
-    for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centred))):
+    for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centered))):
         tensor.record_stream(stream)

@@ -61,7 +61,7 @@ def _from_all(group: RankGroup, method: str, arguments: list[tuple[Any, ...]] | 
 
 
 def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
-    """Ranks by number: rank 0 writes the files, so it belongs where the driver is; neighbours share a machine."""
+    """Ranks by number: rank 0 writes the files, so it belongs where the driver is; neighbors share a machine."""
 
     def order(rank: RankHandle) -> tuple[bool, str]:
         place = _place(rank)

@@ -31,20 +31,20 @@ export class ViewCamera {
   /**
    * Look at a scene as a whole.
    *
-   * @param {{centre: Vector, radius: number}} middle
+   * @param {{center: Vector, radius: number}} middle
    * @param {Vector} up
    */
-  frame({ centre, radius }, up = [0, -1, 0]) {
+  frame({ center, radius }, up = [0, -1, 0]) {
     this.up = unit(up);
     const aside = Math.abs(this.up[2]) > 0.9 ? [0, -1, 0] : [0, 0, -1];
     const level = unit(difference(aside, times(this.up, dot(aside, this.up))));
     const from = unit(sum(level, times(this.up, 0.18)));
     this.size = radius;
-    this.target = centre;
-    this.eye = sum(centre, times(from, 2.6 * radius));
+    this.target = center;
+    this.eye = sum(center, times(from, 2.6 * radius));
     this.focal = [FOCAL, FOCAL];
     this.shape = 0;
-    this.lookAt(centre);
+    this.lookAt(center);
   }
 
   /** @param {Vector} target */
@@ -59,14 +59,14 @@ export class ViewCamera {
    * Stand where a camera of the job stood.
    *
    * @param {JobCamera} camera
-   * @param {{centre: Vector, radius: number} | null} middle
+   * @param {{center: Vector, radius: number} | null} middle
    */
   stand(camera, middle) {
     this.eye = [...camera.position];
     this.axes = camera.axes.map((axis) => [...axis]);
     this.focal = [camera.fx / camera.height, camera.fy / camera.height];
     this.shape = camera.width / camera.height;
-    const depth = middle ? dot(difference(middle.centre, this.eye), this.axes[2]) : 3 * this.size;
+    const depth = middle ? dot(difference(middle.center, this.eye), this.axes[2]) : 3 * this.size;
     if (middle) this.size = middle.radius;
     this.target = sum(this.eye, times(this.axes[2], Math.max(depth, 0.3 * this.size)));
     this.number++;

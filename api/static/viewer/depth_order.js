@@ -15,13 +15,13 @@ const WIDER = 1.3;
  * millionth of the depth), which two passes of counting sort. Equal depths are in the order of the file, which is nearest
  * first, as in `sgsst render`.
  *
- * @param {Float32Array} centres [n * 3]
+ * @param {Float32Array} centers [n * 3]
  * @param {Float32Array} reach [n], see `Packed`; negative for what shows nowhere
  * @param {number} count of Gaussians, at most n
  * @param {Pose} pose
  * @returns {Uint32Array}
  */
-export function depthOrder(centres, reach, count, { axes, eye, tan, near }) {
+export function depthOrder(centers, reach, count, { axes, eye, tan, near }) {
   const [[rx, ry, rz], [dx, dy, dz], [fx, fy, fz]] = axes, [ex, ey, ez] = eye;
   const across = tan[0] * WIDER, down = tan[1] * WIDER;
   const slantX = Math.hypot(1, across), slantY = Math.hypot(1, down);
@@ -30,7 +30,7 @@ export function depthOrder(centres, reach, count, { axes, eye, tan, near }) {
   for (let i = 0; i < count; i++) {
     const far = reach[i];
     if (far < 0) continue;
-    const x = centres[3 * i] - ex, y = centres[3 * i + 1] - ey, z = centres[3 * i + 2] - ez;
+    const x = centers[3 * i] - ex, y = centers[3 * i + 1] - ey, z = centers[3 * i + 2] - ez;
     const depth = fx * x + fy * y + fz * z;
     if (depth < near) continue;
     const room = far + 0.02 * depth; // a dilated Gaussian covers a pixel and more, however far it is

@@ -15,7 +15,7 @@ import { words } from "../words.js";
 
 const SH_C0 = 0.28209479177387814;
 const NAMES = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
-const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOUR = 11, HARMONICS = NAMES.length;
+const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOR = 11, HARMONICS = NAMES.length;
 /** Logits of opacities of so many 255ths; none and full are a quarter of a step from it. */
 const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
   const share = Math.min(Math.max(i / 255, 0.25 / 255), 1 - 0.25 / 255);
@@ -91,7 +91,7 @@ export function compressedPly(reader, { elements }) {
 }
 
 /**
- * Bounds of all chunks, low and high of each of 9 values (colours are in 0..1 where the file has none), and all rows.
+ * Bounds of all chunks, low and high of each of 9 values (colors are in 0..1 where the file has none), and all rows.
  *
  * @param {ByteReader} reader
  * @param {import("./ply.js").Element} chunk
@@ -116,15 +116,15 @@ async function chunksAndRows(reader, chunk, vertex) {
  * @param {number} o where its row begins
  */
 function unpackRow({ bounds, rows }, i, order, into, o) {
-  const [position, rotation, scale, colour] = order.map((place) => rows[4 * i + place]), b = 18 * Math.floor(i / CHUNK);
+  const [position, rotation, scale, color] = order.map((place) => rows[4 * i + place]), b = 18 * Math.floor(i / CHUNK);
   const between = (/** @type {number} */ part, /** @type {number} */ share) => bounds[b + 2 * part] * (1 - share) + bounds[b + 2 * part + 1] * share;
   [[position, 0, 0], [scale, 3, SCALES]].forEach(([packed, part, place]) => {
     into[o + place] = between(part, (packed >>> 21) / 2047);
     into[o + place + 1] = between(part + 1, ((packed >>> 11) & 1023) / 1023);
     into[o + place + 2] = between(part + 2, (packed & 2047) / 2047);
   });
-  for (let c = 0; c < 3; c++) into[o + COLOUR + c] = (between(6 + c, ((colour >>> (24 - 8 * c)) & 255) / 255) - 0.5) / SH_C0;
-  into[o + OPACITY] = LOGITS[colour & 255];
+  for (let c = 0; c < 3; c++) into[o + COLOR + c] = (between(6 + c, ((color >>> (24 - 8 * c)) & 255) / 255) - 0.5) / SH_C0;
+  into[o + OPACITY] = LOGITS[color & 255];
   setRotation(into, o + ROTATION, rotation >>> 30, [20, 10, 0].map((shift) => (((rotation >>> shift) & 1023) / 1023 - 0.5) * Math.SQRT2));
 }
 
@@ -163,21 +163,21 @@ export async function spz(zipped) {
 }
 
 /**
- * @param {Uint8Array<ArrayBuffer>[]} sections positions, opacities, colours, scales, rotations
+ * @param {Uint8Array<ArrayBuffer>[]} sections positions, opacities, colors, scales, rotations
  * @param {number} i which Gaussian
  * @param {number} version
  * @param {number} unit of a position
  * @param {Float32Array} into
  * @param {number} o where its row begins
  */
-function unpackSpz([positions, opacities, colours, scales, rotations], i, version, unit, into, o) {
+function unpackSpz([positions, opacities, colors, scales, rotations], i, version, unit, into, o) {
   for (let axis = 0; axis < 3; axis++) {
     const sign = axis ? -1 : 1, p = 9 * i + 3 * axis;
     into[o + axis] = sign * (version === 1
       ? fromHalf(positions[6 * i + 2 * axis] | (positions[6 * i + 2 * axis + 1] << 8))
       : (((positions[p] | (positions[p + 1] << 8) | (positions[p + 2] << 16)) << 8) >> 8) * unit);
     into[o + SCALES + axis] = scales[3 * i + axis] / 16 - 10;
-    into[o + COLOUR + axis] = (colours[3 * i + axis] / 255 - 0.5) / 0.15;
+    into[o + COLOR + axis] = (colors[3 * i + axis] / 255 - 0.5) / 0.15;
   }
   into[o + OPACITY] = LOGITS[opacities[i]];
   if (version < 3) setRotation(into, o + ROTATION, 0, [0, 1, 2].map((part) => rotations[3 * i + part] / 127.5 - 1));
@@ -199,7 +199,7 @@ function fromHalf(half) {
 
 // --- .splat ----------------------------------------------------------------------------------------------------------
 
-/** Bytes of a Gaussian: place and size (float32), colour and opacity, rotation (bytes). */
+/** Bytes of a Gaussian: place and size (float32), color and opacity, rotation (bytes). */
 const RECORD = 32;
 
 /**
@@ -231,7 +231,7 @@ export function splat(reader, size) {
       for (let axis = 0; axis < 3; axis++) {
         into[o + axis] = values[r / 4 + axis];
         into[o + SCALES + axis] = Math.log(values[r / 4 + 3 + axis]);
-        into[o + COLOUR + axis] = (bytes[r + 24 + axis] / 255 - 0.5) / SH_C0;
+        into[o + COLOR + axis] = (bytes[r + 24 + axis] / 255 - 0.5) / SH_C0;
       }
       into[o + OPACITY] = LOGITS[bytes[r + 27]];
       for (let part = 0; part < 4; part++) into[o + ROTATION + part] = (bytes[r + 28 + part] - 128) / 128;

@@ -4,7 +4,7 @@
  *
  * Geometry, 2 texels of 4 uint32: x, y, z as float32, then opacity (low half, of 65535) and the first scale; the
  * quaternion as four signed 16-bit fractions, the other two scales, nothing. Scales are natural logarithms in steps of
- * 32 / 65535 from -20 (0.025 % each). Colours: three halves. Harmonics: 8 halves in each texel, coefficient by
+ * 32 / 65535 from -20 (0.025 % each). Colors: three halves. Harmonics: 8 halves in each texel, coefficient by
  * coefficient.
  */
 import { halfOf } from "./half.js";
@@ -14,8 +14,8 @@ export const BATCH = 1 << 16;
 export const SCALE_LOW = -20, SCALE_RANGE = 32;
 
 /**
- * @typedef {{geometry: Uint32Array, colours: Uint16Array, harmonics: Uint16Array, centres: Float32Array,
- *   reach: Float32Array}} Packed `centres` [n * 3]; `reach` [n]: three of the longest standard deviations, world units
+ * @typedef {{geometry: Uint32Array, colors: Uint16Array, harmonics: Uint16Array, centers: Float32Array,
+ *   reach: Float32Array}} Packed `centers` [n * 3]; `reach` [n]: three of the longest standard deviations, world units
  */
 
 /** @param {number} degree of spherical harmonics */
@@ -32,15 +32,15 @@ export const harmonicTexels = (degree) => Math.ceil((((degree + 1) ** 2 - 1) * 3
 export function pack(values, width, at, stored, degree) {
   const count = values.length / width, texels = harmonicTexels(degree);
   const packed = {
-    geometry: new Uint32Array(count * 8), colours: new Uint16Array(count * 3),
-    harmonics: new Uint16Array(count * texels * 8), centres: new Float32Array(count * 3), reach: new Float32Array(count),
+    geometry: new Uint32Array(count * 8), colors: new Uint16Array(count * 3),
+    harmonics: new Uint16Array(count * texels * 8), centers: new Float32Array(count * 3), reach: new Float32Array(count),
   };
   packGeometry(packed, values, width, at, count);
   const bits = new Uint32Array(values.buffer, values.byteOffset, values.length);
   for (let i = 0, o = 0; i < count; i++, o += width) {
-    packed.colours[3 * i] = halfOf(bits[o + at.f_dc_0]);
-    packed.colours[3 * i + 1] = halfOf(bits[o + at.f_dc_1]);
-    packed.colours[3 * i + 2] = halfOf(bits[o + at.f_dc_2]);
+    packed.colors[3 * i] = halfOf(bits[o + at.f_dc_0]);
+    packed.colors[3 * i + 1] = halfOf(bits[o + at.f_dc_1]);
+    packed.colors[3 * i + 2] = halfOf(bits[o + at.f_dc_2]);
   }
   if (degree) packHarmonics(packed.harmonics, bits, width, at, count, stored, degree);
   return packed;
@@ -53,7 +53,7 @@ export function pack(values, width, at, stored, degree) {
  * @param {Record<string, number>} at
  * @param {number} count
  */
-function packGeometry({ geometry, centres, reach }, values, width, at, count) {
+function packGeometry({ geometry, centers, reach }, values, width, at, count) {
   const floats = new Float32Array(geometry.buffer), { x, y, z, opacity, scale_0, scale_1, scale_2, rot_0, rot_1, rot_2, rot_3 } = at;
   const step = 65535 / SCALE_RANGE;
   const scale = (/** @type {number} */ value) => Math.min(65535, Math.max(0, Math.round((value - SCALE_LOW) * step)));
@@ -70,7 +70,7 @@ function packGeometry({ geometry, centres, reach }, values, width, at, count) {
     geometry[g + 4] = part(a / length) | (part(b / length) << 16);
     geometry[g + 5] = part(c / length) | (part(d / length) << 16);
     geometry[g + 6] = scale(s1) | (scale(s2) << 16);
-    centres[3 * i] = px; centres[3 * i + 1] = py; centres[3 * i + 2] = pz;
+    centers[3 * i] = px; centers[3 * i + 1] = py; centers[3 * i + 2] = pz;
     reach[i] = alpha < 257 ? -1 : 3.4 * Math.exp(Math.max(s0, s1, s2)); // below 1/255 nothing is drawn; sqrt(2 ln 255) = 3.33
   }
 }

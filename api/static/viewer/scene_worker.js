@@ -9,11 +9,11 @@ import { words } from "../words.js";
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 const port = /** @type {any} */ (self);
-let centres = new Float32Array(0), reach = new Float32Array(0), count = 0, degree = 0;
+let centers = new Float32Array(0), reach = new Float32Array(0), count = 0, degree = 0;
 
 port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
   if (data.kind === "sort") {
-    const order = depthOrder(centres, reach, count, data.pose);
+    const order = depthOrder(centers, reach, count, data.pose);
     port.postMessage({ kind: "order", order, number: data.number, of: count }, [order.buffer]);
   } else if (data.kind === "load") {
     try {
@@ -33,7 +33,7 @@ async function load(source, room) {
   const [stream, size] = await opened(source), reader = new ByteReader(stream);
   const file = await openScene(reader, size);
   degree = keptDegree(file, room);
-  centres = new Float32Array(file.count * 3);
+  centers = new Float32Array(file.count * 3);
   reach = new Float32Array(file.count);
   port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size }, degree });
   for await (const rows of file.batches()) give(rows, file);
@@ -75,32 +75,32 @@ function keptDegree(file, { texels, bytes }) {
  */
 function give(rows, file) {
   const packed = pack(rows, file.width, file.at, file.degree, degree);
-  centres.set(packed.centres, count * 3);
+  centers.set(packed.centers, count * 3);
   reach.set(packed.reach, count);
   const begin = count;
   count += packed.reach.length;
-  const { geometry, colours, harmonics } = packed;
+  const { geometry, colors, harmonics } = packed;
   const first = begin === 0 ? middle() : undefined;
-  port.postMessage({ kind: "batch", begin, count: count - begin, geometry, colours, harmonics, middle: first },
-    [geometry.buffer, colours.buffer, harmonics.buffer]);
+  port.postMessage({ kind: "batch", begin, count: count - begin, geometry, colors, harmonics, middle: first },
+    [geometry.buffer, colors.buffer, harmonics.buffer]);
 }
 
 /**
  * Middle and radius of where most Gaussians are: strays and background do not count.
  *
- * @returns {{centre: number[], radius: number, low: number[], high: number[]}}
+ * @returns {{center: number[], radius: number, low: number[], high: number[]}}
  */
 function middle() {
   const step = Math.max(1, Math.floor(count / 20000));
   /** @type {number[]} */
   const picked = [];
   for (let i = 0; i < count; i += step) if (reach[i] > 0) picked.push(i);
-  const along = [0, 1, 2].map((axis) => Float64Array.from(picked, (i) => centres[3 * i + axis]).sort());
+  const along = [0, 1, 2].map((axis) => Float64Array.from(picked, (i) => centers[3 * i + axis]).sort());
   const quantile = (/** @type {ArrayLike<number>} */ values, /** @type {number} */ share) => values[Math.floor(share * (values.length - 1))] ?? 0;
-  const centre = along.map((values) => quantile(values, 0.5));
-  const away = Float64Array.from(picked, (i) => Math.hypot(...centre.map((c, axis) => centres[3 * i + axis] - c))).sort();
+  const center = along.map((values) => quantile(values, 0.5));
+  const away = Float64Array.from(picked, (i) => Math.hypot(...center.map((c, axis) => centers[3 * i + axis] - c))).sort();
   return {
-    centre, radius: Math.max(quantile(away, 0.9), 1e-6),
+    center, radius: Math.max(quantile(away, 0.9), 1e-6),
     low: along.map((values) => quantile(values, 0.05)), high: along.map((values) => quantile(values, 0.95)),
   };
 }

@@ -1,7 +1,7 @@
 // @ts-check
 /**
  * What the GPU computes: EWA splatting as `sgsst render` does it (blur of 0.3 square pixels, alpha between 1/255 and 0.99,
- * slopes clamped at 1.3 half fields of view), once with two colours. The determinant is a sum of squares (Cauchy-Binet),
+ * slopes clamped at 1.3 half fields of view), once with two colors. The determinant is a sum of squares (Cauchy-Binet),
  * which needles cannot cancel.
  */
 import { harmonicTexels, SCALE_LOW, SCALE_RANGE } from "./packing.js";
@@ -43,12 +43,12 @@ precision highp float; precision highp int; precision highp sampler2D; precision
 layout(location = 0) in vec2 corner;
 layout(location = 1) in uint index;
 uniform usampler2D geometry, harmonics;
-uniform sampler2D leftColours, rightColours;
+uniform sampler2D leftColors, rightColors;
 uniform mat3 axes;          // columns: right, down, forward
 uniform vec3 eye;
 uniform vec2 focal, size, fade;
 uniform float near;
-out vec3 leftColour, rightColour;
+out vec3 leftColor, rightColor;
 out vec2 at;
 flat out float opacity;
 ivec2 place(int texel) { return ivec2(texel & ${(1 << bits) - 1}, texel >> ${bits}); }
@@ -59,9 +59,9 @@ void main() {
   gl_Position = vec4(2, 2, 2, 1);
   int i = int(index);
   uvec4 g = texelFetch(geometry, place(2 * i), 0), h = texelFetch(geometry, place(2 * i + 1), 0);
-  vec3 away = uintBitsToFloat(g.xyz) - eye, centre = away * axes;
+  vec3 away = uintBitsToFloat(g.xyz) - eye, center = away * axes;
   opacity = float(g.w & 0xffffu) / 65535.;
-  if (!(centre.z >= near) || opacity * 255. < 1.) return;
+  if (!(center.z >= near) || opacity * 255. < 1.) return;
   vec4 q = normalize(vec4(fractions(h.x), fractions(h.y)));
   vec3 s = vec3(deviation(g.w >> 16), deviation(h.z & 0xffffu), deviation(h.z >> 16));
   mat3 turned = mat3(
@@ -69,8 +69,8 @@ void main() {
     2. * (q.y * q.z - q.x * q.w), 1. - 2. * (q.y * q.y + q.w * q.w), 2. * (q.z * q.w + q.x * q.y),
     2. * (q.y * q.w + q.x * q.z), 2. * (q.z * q.w - q.x * q.y), 1. - 2. * (q.y * q.y + q.z * q.z));
   vec3 along = (axes[0] * turned) * s, across = (axes[1] * turned) * s, ahead = (axes[2] * turned) * s;
-  vec2 most = 0.65 * size / focal, slope = clamp(centre.xy / centre.z, -most, most);
-  vec3 m = focal.x / centre.z * (along - slope.x * ahead), n = focal.y / centre.z * (across - slope.y * ahead);
+  vec2 most = 0.65 * size / focal, slope = clamp(center.xy / center.z, -most, most);
+  vec3 m = focal.x / center.z * (along - slope.x * ahead), n = focal.y / center.z * (across - slope.y * ahead);
   float A = dot(m, m) + 0.3, B = dot(m, n), C = dot(n, n) + 0.3;
   vec3 minors = cross(m, n);
   float determinant = dot(minors, minors) + 0.3 * (A + C - 0.3);
@@ -79,26 +79,26 @@ void main() {
   d = dot(d, d) > 1e-20 ? normalize(d) : vec2(1, 0);
   float reach = sqrt(2. * log(255. * opacity));   // to where alpha is 1/255
   vec2 offset = reach * (corner.x * sqrt(longer) * d + corner.y * sqrt(shorter) * vec2(-d.y, d.x));
-  vec2 pixel = focal * centre.xy / centre.z + offset;
+  vec2 pixel = focal * center.xy / center.z + offset;
   gl_Position = vec4(2. * pixel.x / size.x, -2. * pixel.y / size.y, 0, 1);
   at = corner * reach;
   vec3 rest = directional(i, normalize(away));
   ivec2 where = place(i);
-  leftColour = max(0.5 + fade.x * rest + 0.28209479177387814 * texelFetch(leftColours, where, 0).rgb, 0.);
-  rightColour = max(0.5 + fade.y * rest + 0.28209479177387814 * texelFetch(rightColours, where, 0).rgb, 0.);
+  leftColor = max(0.5 + fade.x * rest + 0.28209479177387814 * texelFetch(leftColors, where, 0).rgb, 0.);
+  rightColor = max(0.5 + fade.y * rest + 0.28209479177387814 * texelFetch(rightColors, where, 0).rgb, 0.);
 }`;
 
 export const splatFragment = `#version 300 es
 precision highp float;
-in vec3 leftColour, rightColour;
+in vec3 leftColor, rightColor;
 in vec2 at;
 flat in float opacity;
-uniform float cut;          // pixels; what is left of it has the left colours
-out vec4 colour;
+uniform float cut;          // pixels; what is left of it has the left colors
+out vec4 color;
 void main() {
   float alpha = min(opacity * exp(-0.5 * dot(at, at)), 0.99);
   if (alpha < 1. / 255.) discard;
-  colour = vec4((gl_FragCoord.x < cut ? leftColour : rightColour) * alpha, alpha);
+  color = vec4((gl_FragCoord.x < cut ? leftColor : rightColor) * alpha, alpha);
 }`;
 
 /** A triangle over everything. */
@@ -110,11 +110,11 @@ precision highp float;
 uniform highp sampler2D picture;
 uniform vec3 background;
 uniform vec2 scale;         // texels of the picture for a pixel
-out vec4 colour;
+out vec4 color;
 void main() {
   vec4 found = scale.x == 1. ? texelFetch(picture, ivec2(gl_FragCoord.xy), 0)
     : texture(picture, gl_FragCoord.xy * scale / vec2(textureSize(picture, 0)));
-  colour = vec4(found.rgb + (1. - found.a) * background, 1);
+  color = vec4(found.rgb + (1. - found.a) * background, 1);
 }`;
 
 export const lineVertex = `#version 300 es
@@ -132,5 +132,5 @@ void main() {
 export const lineFragment = `#version 300 es
 precision highp float;
 uniform vec4 ink;
-out vec4 colour;
-void main() { colour = ink; }`;
+out vec4 color;
+void main() { color = ink; }`;

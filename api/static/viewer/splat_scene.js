@@ -1,9 +1,9 @@
 // @ts-check
-/** A scene on the GPU: geometry and harmonics once, and any number of colour sets. */
+/** A scene on the GPU: geometry and harmonics once, and any number of color sets. */
 import { BATCH, harmonicTexels } from "./packing.js";
 import { words } from "../words.js";
 
-/** @typedef {{centre: number[], radius: number, low: number[], high: number[]}} Middle */
+/** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
 /** @typedef {import("./depth_order.js").Pose} Pose */
 /** @typedef {{count: number, degree: number, size: number}} Shown of a file's header */
 
@@ -32,7 +32,7 @@ export class SplatScene {
     this.sortedOf = 0;
     this.drawn = 0;
     /** @type {Map<string, WebGLTexture>} */
-    this.colours = new Map();
+    this.colors = new Map();
     this.order = gl.createBuffer();
     this.room = 0;
     this.busy = false;
@@ -82,7 +82,7 @@ export class SplatScene {
     this.texels = harmonicTexels(degree);
     this.geometry = this.texture(gl.RGBA32UI, 2 * header.count);
     this.harmonics = degree ? this.texture(gl.RGBA32UI, this.texels * header.count) : this.geometry;
-    this.colours.set("own", this.texture(gl.RGB16F, header.count));
+    this.colors.set("own", this.texture(gl.RGB16F, header.count));
     this.tellHeader?.(header);
   }
 
@@ -98,11 +98,11 @@ export class SplatScene {
     return made;
   }
 
-  /** @param {{begin: number, count: number, geometry: Uint32Array, colours: Uint16Array, harmonics: Uint16Array, middle?: Middle}} batch */
-  take({ begin, count, geometry, colours, harmonics, middle }) {
+  /** @param {{begin: number, count: number, geometry: Uint32Array, colors: Uint16Array, harmonics: Uint16Array, middle?: Middle}} batch */
+  take({ begin, count, geometry, colors, harmonics, middle }) {
     const { gl } = this;
     this.fill(this.geometry, begin * 2, geometry, gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4);
-    this.fill(this.colours.get("own"), begin, colours, gl.RGB, gl.HALF_FLOAT, 3);
+    this.fill(this.colors.get("own"), begin, colors, gl.RGB, gl.HALF_FLOAT, 3);
     if (this.degree) this.fill(this.harmonics, begin * (this.texels ?? 0), new Uint32Array(harmonics.buffer), gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4);
     this.middle = middle ?? this.middle;
     this.loaded = begin + count;
@@ -128,12 +128,12 @@ export class SplatScene {
   }
 
   /**
-   * Another colour set: three halves for each Gaussian, as `colours.f16` has them.
+   * Another color set: three halves for each Gaussian, as `colors.f16` has them.
    *
    * @param {string} name
    * @param {ReadableStream<Uint8Array>} stream
    */
-  async addColours(name, stream) {
+  async addColors(name, stream) {
     await this.headerRead;
     const { gl } = this, count = this.header?.count ?? 0, texture = this.texture(gl.RGB16F, count);
     const whole = new Uint8Array(count * 6), reader = stream.getReader();
@@ -141,16 +141,16 @@ export class SplatScene {
     for (;;) {
       const { value, done } = await reader.read();
       if (done) break;
-      if (filled + value.length > whole.length) throw new Error(words.scene.otherColours);
+      if (filled + value.length > whole.length) throw new Error(words.scene.otherColors);
       whole.set(value, filled);
       filled += value.length;
     }
-    if (filled !== whole.length) throw new Error(words.scene.otherColours);
+    if (filled !== whole.length) throw new Error(words.scene.otherColors);
     const halves = new Uint16Array(whole.buffer);
     for (let begin = 0; begin < count; begin += BATCH) {
       this.fill(texture, begin, halves.subarray(begin * 3, Math.min(count, begin + BATCH) * 3), gl.RGB, gl.HALF_FLOAT, 3);
     }
-    this.colours.set(name, texture);
+    this.colors.set(name, texture);
     this.changed();
   }
 
@@ -186,14 +186,14 @@ export class SplatScene {
   /** Bytes of its textures and its order. */
   get bytes() {
     const count = this.header?.count ?? 0;
-    return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colours.size) + this.room * 4;
+    return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colors.size) + this.room * 4;
   }
 
   /** Let go of everything. */
   end() {
     this.worker.terminate();
     const { gl } = this;
-    for (const texture of new Set([this.geometry, this.harmonics, ...this.colours.values()])) gl.deleteTexture(texture ?? null);
+    for (const texture of new Set([this.geometry, this.harmonics, ...this.colors.values()])) gl.deleteTexture(texture ?? null);
     gl.deleteBuffer(this.order);
   }
 }

@@ -1,11 +1,11 @@
 // @ts-check
-/** Draws one or two scenes with two colour sets and a wipe between them; only when something has changed. */
+/** Draws one or two scenes with two color sets and a wipe between them; only when something has changed. */
 import { ViewCamera } from "./camera.js";
 import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, wholeVertex } from "./shaders.js";
 import { SplatScene } from "./splat_scene.js";
 import { words } from "../words.js";
 
-/** @typedef {{scene: SplatScene, colours: string, fade?: number}} Side what stands on one side of the wipe */
+/** @typedef {{scene: SplatScene, colors: string, fade?: number}} Side what stands on one side of the wipe */
 /** @typedef {{program: WebGLProgram, at: (name: string) => WebGLUniformLocation | null}} Program */
 
 /** Milliseconds of a frame above which a moving picture has half, or a fourth, as many pixels on each side. */
@@ -293,14 +293,14 @@ export class Viewer {
 
   /**
    * @param {Side} left
-   * @param {Side} right colours of the same scene
+   * @param {Side} right colors of the same scene
    * @param {number} cut pixels
    * @param {number} width
    * @param {number} height
    */
   drawScene(left, right, cut, width, height) {
     const { gl } = this, { scene } = left;
-    const own = scene.colours.get("own");
+    const own = scene.colors.get("own");
     if (!scene.drawn || !own) return;
     const key = scene.degree * 100 + scene.bits;
     const { program, at } = this.splatPrograms.get(key) ?? this.program(splatVertex(scene.degree, scene.bits), splatFragment);
@@ -309,7 +309,7 @@ export class Viewer {
     this.setView(at, width, height);
     gl.uniform2f(at("fade"), 1 - (left.fade ?? 0), 1 - (right.fade ?? 0));
     gl.uniform1f(at("cut"), cut);
-    const textures = { geometry: scene.geometry, leftColours: scene.colours.get(left.colours) ?? own, rightColours: scene.colours.get(right.colours) ?? own, harmonics: scene.harmonics };
+    const textures = { geometry: scene.geometry, leftColors: scene.colors.get(left.colors) ?? own, rightColors: scene.colors.get(right.colors) ?? own, harmonics: scene.harmonics };
     Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture ?? null);

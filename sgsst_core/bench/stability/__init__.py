@@ -9,7 +9,7 @@ from __future__ import annotations
 from sgsst_core.bench.stability import form_cases as forms
 from sgsst_core.bench.stability import gaussian_cases as gaussians
 from sgsst_core.bench.stability import job_cases as jobs
-from sgsst_core.bench.stability import optimisation_cases as optimisation
+from sgsst_core.bench.stability import optimization_cases as optimization
 from sgsst_core.bench.stability import picture_cases as pictures
 from sgsst_core.bench.stability import precision_cases as precision
 from sgsst_core.bench.stability import view_cases as views
@@ -18,7 +18,7 @@ from sgsst_core.bench.stability.case import Case, CaseResult, Group, Measurement
 __all__ = ["Case", "CaseResult", "Group", "Measurement", "all_cases", "measure"]
 
 
-_GROUPS = (gaussians, views, pictures, optimisation, precision, jobs, forms)
+_GROUPS = (gaussians, views, pictures, optimization, precision, jobs, forms)
 
 
 def all_cases() -> list[Case]:

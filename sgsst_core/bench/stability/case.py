@@ -28,14 +28,14 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 
 Group = Literal[
-    "Gaussians", "views", "style and content", "stiff optimisation", "precision", "jobs", "files and orbits"
+    "Gaussians", "views", "style and content", "stiff optimization", "precision", "jobs", "files and orbits"
 ]
 
-#: Images and coverage in float32 agree with float64 to this share of the brightest colour.
+#: Images and coverage in float32 agree with float64 to this share of the brightest color.
 IMAGE_BOUND = 1e-4
 #: Where a value lies within this of a cut-off, float32 may skip what float64 keeps: a step, not an error.
 CLOSE_TO_CUT = 2e-5
-#: A contribution just above ALPHA_MIN, or a crossing Gaussian at a transmittance of up to 1e-2, times the colour.
+#: A contribution just above ALPHA_MIN, or a crossing Gaussian at a transmittance of up to 1e-2, times the color.
 LARGEST_STEP = 1e-2
 #: Loss and gradient in float32 agree with float64 under the same ReLU and max-pool decisions to this.
 LOSS_BOUND = 1e-5
@@ -156,43 +156,43 @@ def compare_rasterizers(
     view: Camera,
     *,
     near: float = NEAR,
-    colours: Tensor | None = None,
+    colors: Tensor | None = None,
     expected_scene: Scene | None = None,
     keep: Tensor | None = None,
 ) -> CaseResult:
     """Largest error of `fast_rasterizers` against the float64 reference.
 
-    Images and coverage: as a share of the brightest colour, outside pixels where a cut-off hangs by a thread (there
-    a step up to LARGEST_STEP is allowed, and counted). Colour gradients: as a share of the largest one.
+    Images and coverage: as a share of the brightest color, outside pixels where a cut-off hangs by a thread (there
+    a step up to LARGEST_STEP is allowed, and counted). Color gradients: as a share of the largest one.
 
     Args:
-        colours: [N, 3]; None for random ones in 0..2.
+        colors: [N, 3]; None for random ones in 0..2.
         expected_scene: what the reference renders, where that is not the scene itself; it holds the scene's rows `keep`
             ([N] bool), and the others must contribute nothing.
     """
     generator = torch.Generator().manual_seed(5)
-    if colours is None:
-        colours = 2 * torch.rand(len(scene), 3, generator=generator)
+    if colors is None:
+        colors = 2 * torch.rand(len(scene), 3, generator=generator)
     pixels = torch.randn(view.height, view.width, 3, generator=generator)
     kept = torch.ones(len(scene), dtype=torch.bool) if keep is None else keep
     reference = ReferenceRasterizer(expected_scene or scene, near=near)
     band = reference.near_cutoff(view, CLOSE_TO_CUT)
-    brightest = max(float(colours.abs().max()) if len(colours) else 0.0, 1.0)
-    image, coverage = reference.render(colours[kept], view), reference.coverage(view)
+    brightest = max(float(colors.abs().max()) if len(colors) else 0.0, 1.0)
+    image, coverage = reference.render(colors[kept], view), reference.coverage(view)
     pixels[band] = 0
     gradient = torch.zeros(len(scene), 3, dtype=torch.float64)
-    gradient[kept] = reference.colour_gradient(pixels, view)
+    gradient[kept] = reference.color_gradient(pixels, view)
     error, flipped = 0.0, 0
     for name in fast_rasterizers():
         fast = make_rasterizer(name, scene, near=near)
-        shown = torch.cat([fast.render(colours, view) / brightest, fast.coverage(view)[..., None]], dim=-1).cpu()
+        shown = torch.cat([fast.render(colors, view) / brightest, fast.coverage(view)[..., None]], dim=-1).cpu()
         off = (shown.double() - torch.cat([image / brightest, coverage[..., None]], dim=-1)).abs().amax(-1)
         # a step that a cut-off explains is no error, any larger one is
         explained = band & (off > IMAGE_BOUND) & (off <= LARGEST_STEP)
         flipped += int(explained.sum())
         error = _worst(error, off[~explained])
         largest = max(float(gradient.abs().max()) if len(scene) else 0.0, 1e-30)
-        error = _worst(error, (fast.colour_gradient(pixels, view).cpu().double() - gradient).abs() / largest)
+        error = _worst(error, (fast.color_gradient(pixels, view).cpu().double() - gradient).abs() / largest)
     note = f"{flipped} pixels differ by one cut-off" if flipped else ""
     return CaseResult(error, IMAGE_BOUND, note)
 

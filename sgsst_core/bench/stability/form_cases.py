@@ -73,7 +73,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
     "300 Gaussians at one place": lambda: repeated(300),
     "sizes from 5e-5 to 365": _extreme_scales,
     "positions from 1e-4 to 1e4": _far_and_near,
-    "colours, opacities and harmonics out of range": _saturated,
+    "colors, opacities and harmonics out of range": _saturated,
 }
 
 
@@ -99,7 +99,7 @@ def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResu
 
 
 def _sorted(values: torch.Tensor, scene: Scene) -> torch.Tensor:
-    """Rows by position: compressed PLYs may hold them in another order, which neighbours at one place do not show."""
+    """Rows by position: compressed PLYs may hold them in another order, which neighbors at one place do not show."""
     order = np.lexsort(scene.means.double().numpy().round(3).T)
     return values.double()[torch.from_numpy(order)]
 
@@ -120,14 +120,14 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
     """Bytes made by hand: positions and sizes come back as they are, the rest within the rounding of a byte."""
     scene = make()
     sizes = scene.scales.exp().numpy().astype("<f4")
-    colours = (0.5 + 0.28209479177387814 * scene.sh_dc.double()).clamp(0, 1)
+    colors = (0.5 + 0.28209479177387814 * scene.sh_dc.double()).clamp(0, 1)
     opacity = torch.sigmoid(scene.opacities.double())[:, None]
     quats = torch.nn.functional.normalize(scene.quats.double(), dim=1)
-    rgba = (torch.cat([colours, opacity], 1) * 255).round().to(torch.uint8).numpy()
+    rgba = (torch.cat([colors, opacity], 1) * 255).round().to(torch.uint8).numpy()
     turned = (quats * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy()
     rows = [
-        position.astype("<f4").tobytes() + size.tobytes() + colour.tobytes() + quat.tobytes()
-        for position, size, colour, quat in zip(scene.means.numpy(), sizes, rgba, turned, strict=True)
+        position.astype("<f4").tobytes() + size.tobytes() + color.tobytes() + quat.tobytes()
+        for position, size, color, quat in zip(scene.means.numpy(), sizes, rgba, turned, strict=True)
     ]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.splat"
@@ -137,12 +137,12 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
         except InvalidInputError as error:
             return CaseResult(math.inf, 0.0, f"was refused: {error}")
     shown = 0.5 + 0.28209479177387814 * found.sh_dc.double()
-    wrong = float((shown - colours).abs().max()) * 255
+    wrong = float((shown - colors).abs().max()) * 255
     wrong = max(wrong, float((torch.sigmoid(found.opacities.double())[:, None] - opacity).abs().max()) * 255)
     same = torch.equal(found.means, scene.means) and bool(
         torch.allclose(found.scales.double(), torch.from_numpy(sizes).double().log(), rtol=1e-6, atol=1e-6)
     )
-    return CaseResult(wrong if same and _finite(found) else math.inf, 0.8, "colours and opacities, in 255ths")
+    return CaseResult(wrong if same and _finite(found) else math.inf, 0.8, "colors and opacities, in 255ths")
 
 
 def _cloud(x: float, y: float, z: float, count: int = 200) -> Scene:

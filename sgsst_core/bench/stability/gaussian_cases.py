@@ -29,7 +29,7 @@ from sgsst_core.files.ply import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.projection import Outcome, project
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours, view_directions
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_directions
 from sgsst_core.scene.stored_harmonics import held
 
 _IMAGE = "image, coverage, gradient against float64"
@@ -60,8 +60,8 @@ def cases() -> list[Case]:
         Case("near plane, one ulp before, on and behind it", "Gaussians", _IMAGE, _near_plane),
         Case("equal depths blend in the order of the file", "Gaussians", "rows out of order", _equal_depths),
         Case("world moved by 1e6", "Gaussians", "image against the same world at the origin", _moved_world),
-        Case("SH coefficients of 1e4 that cancel", "Gaussians", "colours, share of the largest", _large_harmonics),
-        Case("view direction of length 0", "Gaussians", "colours", _no_direction),
+        Case("SH coefficients of 1e4 that cancel", "Gaussians", "colors, share of the largest", _large_harmonics),
+        Case("view direction of length 0", "Gaussians", "colors", _no_direction),
     ]
 
 
@@ -93,10 +93,10 @@ def _flat_or_thin() -> Scene:
 
 
 def _opacities_at_the_cut() -> Scene:
-    """1/255 and its float32 neighbours: there alpha reaches the cut in one pixel centre at most."""
+    """1/255 and its float32 neighbors: there alpha reaches the cut in one pixel center at most."""
     cut = np.float32(math.log(ALPHA_MIN / (1 - ALPHA_MIN)))
     values = [np.nextafter(cut, np.float32(-9)), cut, np.nextafter(cut, np.float32(9)), cut + np.float32(1e-3)]
-    # centred on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30
+    # centered on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30
     scene = repeated(4, mean=(4 * 0.7 / 30, 4 * 0.7 / 33, 4.0))
     return _columns(scene, opacities=torch.tensor(np.array(values)))
 
@@ -107,14 +107,14 @@ def _logits() -> Scene:
 
 
 def _depths() -> Scene:
-    """Depth 0, around 0, and a centre at the camera: all nearer than the near plane."""
+    """Depth 0, around 0, and a center at the camera: all nearer than the near plane."""
     scene = repeated(7, scale=0.5)
     depths = torch.tensor([0.0, -0.0, 1e-38, -1e-38, 1e-6, -1e-6, -4.0])
     return _columns(scene, means=torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1))
 
 
 def _off_screen() -> Scene:
-    """Centres far outside the view, footprints on it; one with a centre of a million pixels."""
+    """Centers far outside the view, footprints on it; one with a center of a million pixels."""
     means = torch.tensor([[-20.0, 0, 4], [20, 1, 4], [0, -15, 4], [0, 1e3, 4], [-1.3e5, 0, 4]])
     sizes = torch.tensor([6.0, 6.0, 5.0, 400.0, 5e4]).log()
     return _columns(repeated(5, logit=-1.0), means=means, scales=sizes[:, None].expand(5, 3).clone())
@@ -126,7 +126,7 @@ def _stacked(count: int, logit: float) -> Scene:
 
 
 def _sub_pixel() -> Scene:
-    """Thousands of points between the pixel centres."""
+    """Thousands of points between the pixel centers."""
     scene = ordinary(3000, seed=7)
     return _columns(scene, scales=torch.full((3000, 3), math.log(1e-6)))
 
@@ -144,8 +144,8 @@ _SCENES: dict[str, Callable[[], Scene]] = {
     "axes without any extent": _flat_or_thin,
     "opacities of 1/255 and one ulp to either side": _opacities_at_the_cut,
     "logits to +-3e38": _logits,
-    "depth 0, +-1e-38, +-1e-6; a centre at the camera": _depths,
-    "centres off screen with a footprint on it": _off_screen,
+    "depth 0, +-1e-38, +-1e-6; a center at the camera": _depths,
+    "centers off screen with a footprint on it": _off_screen,
     "5000 faint Gaussians on one pixel": partial(_stacked, 5000, math.log(1.5 / 253.5)),
     "5000 opaque Gaussians on one pixel": partial(_stacked, 5000, 5.0),
     "thousands of Gaussians smaller than a pixel": _sub_pixel,
@@ -246,9 +246,9 @@ def _moved_world(full: bool) -> CaseResult:
     pose = view.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ offset
     moved = replace(scene, means=scene.means + offset.float())
-    colours = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
-    image = make_rasterizer("reference", scene).render(colours, view)
-    found = make_rasterizer("cpu", moved).render(colours, replace(view, world_to_camera=pose)).double()
+    colors = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
+    image = make_rasterizer("reference", scene).render(colors, view)
+    found = make_rasterizer("cpu", moved).render(colors, replace(view, world_to_camera=pose)).double()
     error = float((found - image).abs().max()) / 2
     return CaseResult(error, 1e-4, "float32 positions step by 0.06 there; nothing is lost beyond that")
 
@@ -258,28 +258,28 @@ def _large_harmonics(full: bool) -> CaseResult:
     scene = ordinary(200, seed=10, degree=3)
     scene = replace(scene, sh_rest=held(scene.sh_rest) * 1e4)
     view = camera()
-    rest = rest_colours(scene.sh_rest, scene.means, view)
+    rest = rest_colors(scene.sh_rest, scene.means, view)
     dc = (torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) - rest) / SH_C0
-    found = view_colours(dc, rest).double()
-    exact = rest_colours(held(scene.sh_rest).double(), scene.means.double(), view)
+    found = view_colors(dc, rest).double()
+    exact = rest_colors(held(scene.sh_rest).double(), scene.means.double(), view)
     expected = (0.5 + SH_C0 * dc.double() + exact).clamp_min(0)
     error = float((found - expected).abs().max() / exact.abs().max())
-    image = compare_rasterizers(scene, view, colours=view_colours(scene.sh_dc, rest))
+    image = compare_rasterizers(scene, view, colors=view_colors(scene.sh_dc, rest))
     absolute = float((found - expected).abs().max())
-    return CaseResult(max(error, 0.0 if image.passed else math.inf), 1e-6, f"colours are off by up to {absolute:.1e}")
+    return CaseResult(max(error, 0.0 if image.passed else math.inf), 1e-6, f"colors are off by up to {absolute:.1e}")
 
 
 def _no_direction(full: bool) -> CaseResult:
-    """A Gaussian at the camera's centre: its harmonics are those of direction 0, finite, and it is never drawn."""
+    """A Gaussian at the camera's center: its harmonics are those of direction 0, finite, and it is never drawn."""
     scene = replace(repeated(3), sh_rest=torch.ones(3, 15, 3))
     means = torch.tensor([[0.0, 0, 0], [1e-45, 0, 0], [0, 1e38, 1e38]])
     scene = replace(scene, means=means)
-    directions = view_directions(means, camera().centre)
+    directions = view_directions(means, camera().center)
     lengths = directions.norm(dim=1)
     error = float((lengths - torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)).abs().max())
-    colours = rest_colours(scene.sh_rest, means, camera())
+    colors = rest_colors(scene.sh_rest, means, camera())
     drawn = project(scene, camera()).outcomes[Outcome.VISIBLE]
-    finite = bool(torch.isfinite(colours).all()) and drawn == 0
+    finite = bool(torch.isfinite(colors).all()) and drawn == 0
     return CaseResult(
-        error if finite else math.inf, 1e-12, "the zero vector: finite colours, nearer than the near plane"
+        error if finite else math.inf, 1e-12, "the zero vector: finite colors, nearer than the near plane"
     )

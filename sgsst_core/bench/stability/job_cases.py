@@ -14,7 +14,7 @@ from torch import Tensor
 from sgsst_core.bench.stability.case import Case, CaseResult, repeated, texture, vgg16
 from sgsst_core.bench.stability.situations import (
     Situation,
-    coloured,
+    colored,
     crowd,
     even_network,
     make,
@@ -39,7 +39,7 @@ def cases() -> list[Case]:
         Case(name, "jobs", "jobs that were not refused", partial(_refused, situation))
         for name, situation in _REFUSED.items()
     ]
-    return [*found, Case("chroma of colours from 1e-6 to 1e3", "jobs", "change of chroma, relative", _chroma)]
+    return [*found, Case("chroma of colors from 1e-6 to 1e3", "jobs", "change of chroma, relative", _chroma)]
 
 
 def _strained(situation: Callable[[], Situation], full: bool) -> CaseResult:
@@ -59,7 +59,7 @@ def _flat(red: float, green: float, blue: float, height: int = 12, width: int = 
     return torch.tensor([red, green, blue], dtype=torch.float32).expand(height, width, 3).clone()
 
 
-def _grey(scene: Scene) -> Scene:
+def _gray(scene: Scene) -> Scene:
     return replace(scene, sh_dc=scene.sh_dc[:, :1].expand(-1, 3).clone())
 
 
@@ -83,8 +83,8 @@ def _with_harmonics(size: float, degree: int = 2) -> Scene:
 
 
 def _scan(**settings: object) -> Situation:
-    """One colour, little of the view, and that colour behind it."""
-    scene = coloured(replace(crowd(20), scales=torch.full((20, 3), math.log(0.2))), 0.4, 0.4, 0.4)
+    """One color, little of the view, and that color behind it."""
+    scene = colored(replace(crowd(20), scales=torch.full((20, 3), math.log(0.2))), 0.4, 0.4, 0.4)
     return Situation(scene, _flat(0.4, 0.4, 0.4), settings, falls=False)
 
 
@@ -109,7 +109,7 @@ def _black_views(scale: str) -> Situation:
     weights = vgg16()
     if scale == "paper":
         weights = with_scales(weights, dict.fromkeys(PUBLISHED, 20.0))
-    job = _job(lambda: coloured(crowd(), 0.0, 0.0, 0.0), feature_scale=scale, steps_coarse=0, steps_sos=1)
+    job = _job(lambda: colored(crowd(), 0.0, 0.0, 0.0), feature_scale=scale, steps_coarse=0, steps_sos=1)
     return replace(job, weights=weights, cameras=views()[:1])
 
 
@@ -124,7 +124,7 @@ def _white_on_white() -> Situation:
     """What differs from the style is a hundredth of what both are: each rounding counts a hundred times as much."""
     style = partial(_flat, 1, 1, 1, 64, 64)
     settings = {"background": (1.0, 1.0, 1.0), "content_weight": 0, "learning_rate": 0.01}
-    job = _unlike(lambda: coloured(crowd(), 0.95, 0.95, 0.95), style, **settings)
+    job = _unlike(lambda: colored(crowd(), 0.95, 0.95, 0.95), style, **settings)
     return replace(_pixels(job), cameras=views(32, 32))
 
 
@@ -138,7 +138,7 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "style of one column": lambda: _job(style=lambda: texture(60, 1, 3)),
     "flat style: black": lambda: _job(style=lambda: _flat(0, 0, 0)),
     "flat style: white": lambda: _job(style=lambda: _flat(1, 1, 1)),
-    "flat style: one colour": lambda: _job(style=lambda: _flat(0.9, 0.3, 0.1)),
+    "flat style: one color": lambda: _job(style=lambda: _flat(0.9, 0.3, 0.1)),
     "strokes larger than the view": lambda: _job(style_scale=4),
     "strokes larger than a view of 3 x 2": lambda: _tiny_views(3, 2, style_scale=4),
     "strokes smaller than a pixel": lambda: _job(style=lambda: texture(3, 3, 1), style_scale=0.25),
@@ -147,17 +147,15 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "style of one pixel turned by 45 degrees": lambda: _job(
         style=lambda: _flat(0.1, 0.2, 0.9, 1, 1), style_rotation=45
     ),
-    "colours matched to a scene of one colour": lambda: _job(
-        lambda: coloured(crowd(), 0.2, 0.5, 0.7), keep_colours="match"
+    "colors matched to a scene of one color": lambda: _job(
+        lambda: colored(crowd(), 0.2, 0.5, 0.7), keep_colors="match"
     ),
-    "colours matched to a grey scene": lambda: _job(lambda: _grey(crowd()), keep_colours="match"),
-    "colours of a flat style matched": lambda: _job(style=lambda: _flat(1, 1, 1), keep_colours="match"),
-    "luminance of a scene of one colour": lambda: _job(
-        lambda: coloured(crowd(), 0.2, 0.5, 0.7), keep_colours="luminance"
-    ),
-    "luminance of a grey scene": lambda: _job(lambda: _grey(crowd()), keep_colours="luminance"),
-    "luminance of a black scene": lambda: _job(lambda: coloured(crowd(), 0, 0, 0), keep_colours="luminance"),
-    "luminance of a flat style": lambda: _job(style=lambda: _flat(0, 0, 0), keep_colours="luminance"),
+    "colors matched to a gray scene": lambda: _job(lambda: _gray(crowd()), keep_colors="match"),
+    "colors of a flat style matched": lambda: _job(style=lambda: _flat(1, 1, 1), keep_colors="match"),
+    "luminance of a scene of one color": lambda: _job(lambda: colored(crowd(), 0.2, 0.5, 0.7), keep_colors="luminance"),
+    "luminance of a gray scene": lambda: _job(lambda: _gray(crowd()), keep_colors="luminance"),
+    "luminance of a black scene": lambda: _job(lambda: colored(crowd(), 0, 0, 0), keep_colors="luminance"),
+    "luminance of a flat style": lambda: _job(style=lambda: _flat(0, 0, 0), keep_colors="luminance"),
     "one Gaussian in a job": lambda: _job(lambda: repeated(1, scale=1.0)),
     "all Gaussians at one place": lambda: _job(_coincident),
     "needles": lambda: _job(lambda: _shaped((3.0, 1e-5, 1e-5))),
@@ -166,15 +164,15 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "opacity 0 and 1": lambda: _job(lambda: _opacities(-80.0, 80.0, 0.0)),
     "opacity 1 alone": lambda: _job(lambda: _opacities(90.0)),
     "hardly any opacity": lambda: _job(lambda: _opacities(-5.4)),
-    "surround in the object's colour": lambda: _scan(surround="palette"),
-    "surround of random colours, style of one": lambda: _scan(surround="random"),
-    "scan of one colour, warm start": lambda: _scan(warm_start=True, surround="background"),
-    "scan of one colour, warm start in luminance": lambda: _scan(
-        warm_start=True, surround="palette", keep_colours="luminance"
+    "surround in the object's color": lambda: _scan(surround="palette"),
+    "surround of random colors, style of one": lambda: _scan(surround="random"),
+    "scan of one color, warm start": lambda: _scan(warm_start=True, surround="background"),
+    "scan of one color, warm start in luminance": lambda: _scan(
+        warm_start=True, surround="palette", keep_colors="luminance"
     ),
-    "nearest neighbours in a flat style": lambda: _unlike(crowd, lambda: _flat(0.5, 0.5, 0.5), style_loss="nnfm"),
-    "nearest neighbours of a black scene": lambda: _unlike(
-        lambda: coloured(crowd(), 0, 0, 0), lambda: _flat(0, 0, 0), style_loss="nnfm"
+    "nearest neighbors in a flat style": lambda: _unlike(crowd, lambda: _flat(0.5, 0.5, 0.5), style_loss="nnfm"),
+    "nearest neighbors of a black scene": lambda: _unlike(
+        lambda: colored(crowd(), 0, 0, 0), lambda: _flat(0, 0, 0), style_loss="nnfm"
     ),
     "both losses, a flat style": lambda: _unlike(crowd, lambda: _flat(1, 1, 1), style_loss="mixed"),
     "content weight 0": lambda: _job(content_weight=0),
@@ -190,12 +188,12 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
         lambda: _with_harmonics(1e4), lambda: texture(30, 26, 7), sh_fade=0.5
     ),
     "harmonics of 1e30 that fade out": lambda: _job(lambda: _with_harmonics(1e30), sh_fade=1.0),
-    "pixels of one colour, style of the same": lambda: _pixels(_scan()),
-    "pixels of one colour, style of another": lambda: _pixels(
-        _unlike(lambda: coloured(crowd(), 0.4, 0.4, 0.4), lambda: _flat(0.9, 0.3, 0.1))
+    "pixels of one color, style of the same": lambda: _pixels(_scan()),
+    "pixels of one color, style of another": lambda: _pixels(
+        _unlike(lambda: colored(crowd(), 0.4, 0.4, 0.4), lambda: _flat(0.9, 0.3, 0.1))
     ),
-    "pixels of one colour, style of many": lambda: _pixels(_job(lambda: coloured(crowd(), 0.2, 0.5, 0.7))),
-    "pixels in luminance, a grey scene": lambda: _pixels(_job(lambda: _grey(crowd()), keep_colours="luminance")),
+    "pixels of one color, style of many": lambda: _pixels(_job(lambda: colored(crowd(), 0.2, 0.5, 0.7))),
+    "pixels in luminance, a gray scene": lambda: _pixels(_job(lambda: _gray(crowd()), keep_colors="luminance")),
     "pixels, a style of one pixel": lambda: _pixels(_job(style=lambda: _flat(0.9, 0.5, 0.1, 1, 1))),
     "pixels, views of 3 x 2": lambda: _pixels(_tiny_views(3, 2)),
     "pixels 1e6 times as large": lambda: _pixels(_job(), 1e6),
@@ -206,18 +204,18 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
 }
 
 _REFUSED: dict[str, Callable[[], Situation]] = {
-    "nearest neighbours in a style without a cell": lambda: _job(style=lambda: texture(3, 3, 1), style_loss="nnfm"),
+    "nearest neighbors in a style without a cell": lambda: _job(style=lambda: texture(3, 3, 1), style_loss="nnfm"),
     "both losses, a style without a cell": lambda: _job(style=lambda: texture(1, 60, 1), style_loss="mixed"),
     "a scale that no view has": lambda: _job(scales=(0.0, 0.0, 1.0)),
 }
 
 
 def _chroma(full: bool) -> CaseResult:
-    """Colours that are far apart in size keep their chroma to a rounding of the larger of before and after."""
+    """Colors that are far apart in size keep their chroma to a rounding of the larger of before and after."""
     scene = crowd(60)
     sizes = torch.logspace(-6, 3, 60)[:, None]
     scene = replace(scene, sh_dc=scene.sh_dc * sizes)
-    job = make(Situation(scene, texture(30, 26, 7), {"keep_colours": "luminance", "steps_sos": 20 if full else 4}))
+    job = make(Situation(scene, texture(30, 26, 7), {"keep_colors": "luminance", "steps_sos": 20 if full else 4}))
     while job.step < job.total:
         job.run_step()
     found = job.stylized().double()

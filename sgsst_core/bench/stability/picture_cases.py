@@ -57,15 +57,15 @@ def _checkerboard() -> Tensor:
 
 
 def _contrast() -> Tensor:
-    """Values of -100 and 100: colours are not clamped before the network."""
+    """Values of -100 and 100: colors are not clamped before the network."""
     return 200 * (texture(_HEIGHT, _WIDTH, 4) > 0.5).float() - 100
 
 
 _PICTURES: dict[str, Callable[[], Tensor]] = {
     "black": partial(_constant, 0.0, 0.0, 0.0),
     "white": partial(_constant, 1.0, 1.0, 1.0),
-    "constant grey": partial(_constant, 0.4, 0.4, 0.4),
-    "one saturated colour": partial(_constant, 1.0, 0.0, 0.0),
+    "constant gray": partial(_constant, 0.4, 0.4, 0.4),
+    "one saturated color": partial(_constant, 1.0, 0.0, 0.0),
     "1-pixel checkerboard": _checkerboard,
     "values of +-100": _contrast,
 }

@@ -103,10 +103,10 @@ def _half_weights(full: bool) -> CaseResult:
     """Weights down to 4e-7 lie below float16's normal range; they are kept scaled by 2^14, so that none is lost."""
     scene, view = ordinary(1500, seed=2), camera(100, 60)
     scene = replace(scene, opacities=torch.linspace(-5.5, 6.0, 1500)[torch.randperm(1500)])
-    colours = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
+    colors = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
     reference = ReferenceRasterizer(scene)
-    image, band = reference.render(colours, view), reference.near_cutoff(view, CLOSE_TO_CUT)
-    found = CachedRasterizer(scene, precision="half").render(colours, view).double()
+    image, band = reference.render(colors, view), reference.near_cutoff(view, CLOSE_TO_CUT)
+    found = CachedRasterizer(scene, precision="half").render(colors, view).double()
     off = ((found - image).abs() / image.clamp_min(1e-3))[~band]
     return CaseResult(
         float(off.max()) if bool(torch.isfinite(found).all()) else math.inf, 2**-11 + 1e-5, "bound: 2^-11"

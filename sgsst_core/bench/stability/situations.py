@@ -1,6 +1,6 @@
 """Whole jobs so small that hundreds of them can be run: what a scene, a style and settings come to together.
 
-Cases and the random search (`benchmarks.stability_search`) hold them against the same bounds: finite colours, steps no
+Cases and the random search (`benchmarks.stability_search`) hold them against the same bounds: finite colors, steps no
 longer than Adam's, the same bits again, a loss that does not rise, and loss and gradient of the last picture as in
 float64.
 """
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, ordinary
-from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork
@@ -28,7 +28,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimiser import constrained
+from sgsst_core.stylizing.optimizer import constrained
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Loss and pixel gradient of the last picture against float64, relative.
@@ -89,10 +89,10 @@ def crowd(count: int = 60, *, seed: int = 0, degree: int = 0) -> Scene:
     return replace(scene, scales=scene.scales + 2.2, sh_dc=0.6 * scene.sh_dc)
 
 
-def coloured(scene: Scene, red: float, green: float, blue: float) -> Scene:
-    """The same scene in one colour (0..1)."""
-    colour = (torch.tensor([red, green, blue], dtype=torch.float32) - COLOUR_OFFSET) / SH_C0
-    return replace(scene, sh_dc=colour.expand(len(scene), 3).clone())
+def colored(scene: Scene, red: float, green: float, blue: float) -> Scene:
+    """The same scene in one color (0..1)."""
+    color = (torch.tensor([red, green, blue], dtype=torch.float32) - COLOR_OFFSET) / SH_C0
+    return replace(scene, sh_dc=color.expand(len(scene), 3).clone())
 
 
 @functools.cache
@@ -144,16 +144,16 @@ def strain(situation: Situation) -> CaseResult:
         run(job)
     job = jobs[0]
     after = mean_loss(job.evaluate(job.evaluation_views), job.loss.weights)
-    colours, moved = job.stylized(), _moved(job, begun)
+    colors, moved = job.stylized(), _moved(job, begun)
     judged = job.plan.surround == "background"  # else steps have another loss than what is judged
     most = job.total * job.settings.learning_rate * LONGEST_STEP
     broken = [
         what
         for what, holds in {
-            "colours are not finite": bool(torch.isfinite(colours).all()) and math.isfinite(moved),
+            "colors are not finite": bool(torch.isfinite(colors).all()) and math.isfinite(moved),
             "the loss is not finite": math.isfinite(before) and math.isfinite(after),
-            f"colours moved by {moved:.3g} in {job.total} steps": moved <= most + 1e-5 * float(begun.abs().max()),
-            "another run has other bits": torch.equal(colours, jobs[1].stylized()),
+            f"colors moved by {moved:.3g} in {job.total} steps": moved <= most + 1e-5 * float(begun.abs().max()),
+            "another run has other bits": torch.equal(colors, jobs[1].stylized()),
             f"the loss rose from {before:.6g} to {after:.6g}": not (situation.falls and judged)
             or after <= max((1 + RISE) * before, NO_LOSS),
         }.items()
@@ -165,9 +165,9 @@ def strain(situation: Situation) -> CaseResult:
 
 
 def _moved(job: Stylizer, begun: Tensor) -> float:
-    """How far a coefficient has moved at most, beside what brings colours that began beyond the bounds into them."""
+    """How far a coefficient has moved at most, beside what brings colors that began beyond the bounds into them."""
     found = job.sh_dc.detach()
-    chroma_of = begun if job.settings.keep_colours == "luminance" else None
+    chroma_of = begun if job.settings.keep_colors == "luminance" else None
     within = constrained(begun, chroma_of, bounded=job.settings.bounded)
     return float(torch.minimum((found - begun).abs(), (found - within).abs()).max())
 
@@ -181,7 +181,7 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     alone: another nearest vector, as near, is no error; and cosines that are 1 but for their rounding are.
     """
     index = job.views.covered[0]
-    picture = job.views.render(index, job.views.colours(index, job.sh_dc.detach()))
+    picture = job.views.render(index, job.views.colors(index, job.sh_dc.detach()))
     content = job.views.content(index)
     coverage = job.views.coverage(index)[0] if job.views.weighted else None
     double = DecisionsOf(job.weights, job.network)

@@ -124,7 +124,7 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["--region", "a:cube=1"], "selects nothing that is known"),
         (["--region", "a:mask=nowhere.npy"], "cannot be read as .npy"),
-        (["--region", "a:property=colour>1"], "no property 'colour'"),
+        (["--region", "a:property=color>1"], "no property 'color'"),
         (["--region-keep", "rest"], "Every Gaussian is kept (rest)"),
         (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),
     ],
@@ -186,12 +186,12 @@ def test_stylize_writes_a_scene_that_differs_in_f_dc_only(files: Files, capsys: 
         "stylized.report.html",
         "stylized.report.json",
     ]
-    colours = {"f_dc_0", "f_dc_1", "f_dc_2"}
+    colors = {"f_dc_0", "f_dc_1", "f_dc_2"}
     with_plyfile = [PlyData.read(path)["vertex"].data for path in (files.ply, files.out)]
     by_hand = [second_reader(path) for path in (files.ply, files.out)]
     for before, after in (with_plyfile, by_hand):
         names = before.dtype.names if isinstance(before, np.ndarray) else before.keys()
-        assert {name for name in names if not np.array_equal(before[name], after[name])} == colours
+        assert {name for name in names if not np.array_equal(before[name], after[name])} == colors
     heads = [path.read_bytes().partition(b"end_header\n")[0] for path in (files.ply, files.out)]
     assert heads[0] == heads[1]
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
@@ -914,7 +914,7 @@ def test_check_tells_what_is_extreme_and_what_is_done_about_it(
     before = sorted(files.ply.parent.iterdir())
     assert main(["check", str(files.ply), *options]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for expected in ("infinite values", "1 of 616", "Gaussian 5: 0", "never drawn", "one colour"):
+    for expected in ("infinite values", "1 of 616", "Gaussian 5: 0", "never drawn", "one color"):
         assert expected in shown, shown
     assert sorted(files.ply.parent.iterdir()) == before
 

@@ -15,7 +15,7 @@ from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
-CONTROLS = ["--keep-colours", "luminance", "--sh-fade", "0.25", "--scales", "1,0,0.5", "--coarsest-side", "16"]
+CONTROLS = ["--keep-colors", "luminance", "--sh-fade", "0.25", "--scales", "1,0,0.5", "--coarsest-side", "16"]
 
 
 def command(name: str, folder: Path, *options: str) -> list[str]:
@@ -30,7 +30,7 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     assert main(command("stylize", tmp_path, "--out", str(out), *steps, *CONTROLS)) == 0
     shown = capsys.readouterr().out
     for line in (
-        "luminance alone is compared and optimised",
+        "luminance alone is compared and optimized",
         "0.75 times as large",
         "scale 0 1, scale 2 0.5; 1 of 3 scales are not computed",
         "2 of 3 scales",
@@ -42,7 +42,7 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     assert float(change.abs().max()) > 0.1
     torch.testing.assert_close(change, change.mean(1, keepdim=True).expand(-1, 3), atol=1e-6, rtol=0)
     report = json.loads((tmp_path / "new" / "out.report.json").read_text())
-    assert report["settings"]["keep_colours"] == "luminance"
+    assert report["settings"]["keep_colors"] == "luminance"
     assert report["settings"]["scales"] == [1, 0, 0.5]
     assert report["settings"]["sh_fade"] == 0.25
     assert report["scene"]["sh_degree"] == 1
@@ -56,7 +56,7 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
 def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command("plan", tmp_path, "--out", str(tmp_path / "plan.json"), *CONTROLS)) == 0
     items = [entry["item"] for entry in json.loads((tmp_path / "plan.json").read_text())["decisions"]]
-    assert {"colours", "spherical harmonics", "weights of scales"} <= set(items)
+    assert {"colors", "spherical harmonics", "weights of scales"} <= set(items)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["--scales", "fine"], "are no numbers with commas between them"),
         (["--scales", "0,1"], "the views have one scale, 0"),
         (["--sh-fade", "1.5"], "less than or equal to 1"),
-        (["--keep-colours", "hue"], "hue"),
+        (["--keep-colors", "hue"], "hue"),
     ],
     ids=str,
 )

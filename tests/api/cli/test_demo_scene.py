@@ -12,8 +12,8 @@ from skimage import data
 from api.cli import demo_scene
 from api.cli.demo_scene import (
     BASELINE,
-    CENTRE_X,
-    CENTRE_Y,
+    CENTER_X,
+    CENTER_Y,
     DISPARITY_OFFSET,
     FLATNESS,
     FOCAL,
@@ -39,16 +39,16 @@ def scene(demo: DemoScene) -> Scene:
     return read_scene(demo.ply).scene
 
 
-def photo_camera(x: float, centre_x: float) -> Camera:
+def photo_camera(x: float, center_x: float) -> Camera:
     pose = torch.eye(4, dtype=torch.float64)
     pose[0, 3] = -x
-    return Camera("photo", 741, 500, FOCAL, FOCAL, centre_x, CENTRE_Y, pose)
+    return Camera("photo", 741, 500, FOCAL, FOCAL, center_x, CENTER_Y, pose)
 
 
 def render(scene: Scene, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     rasterizer = CpuRasterizer(scene)
-    colours = (0.5 + 0.28209479177387814 * scene.sh_dc).clamp_min(0)
-    return rasterizer.render(colours, camera), rasterizer.coverage(camera)
+    colors = (0.5 + 0.28209479177387814 * scene.sh_dc).clamp_min(0)
+    return rasterizer.render(colors, camera), rasterizer.coverage(camera)
 
 
 def test_scene_is_of_a_size_to_work_with(scene: Scene) -> None:
@@ -60,7 +60,7 @@ def test_scene_is_of_a_size_to_work_with(scene: Scene) -> None:
 
 @pytest.mark.parametrize(
     ("photo", "camera"),
-    [(0, photo_camera(0.0, CENTRE_X)), (1, photo_camera(BASELINE, CENTRE_X + DISPARITY_OFFSET))],
+    [(0, photo_camera(0.0, CENTER_X)), (1, photo_camera(BASELINE, CENTER_X + DISPARITY_OFFSET))],
     ids=["left", "right"],
 )
 def test_both_photos_come_back_from_their_cameras(scene: Scene, photo: int, camera: Camera) -> None:
@@ -75,7 +75,7 @@ def test_both_photos_come_back_from_their_cameras(scene: Scene, photo: int, came
 def test_views_have_hardly_a_hole(demo: DemoScene, scene: Scene) -> None:
     cameras = read_cameras(demo.cameras)
     assert len(cameras) == demo_scene.VIEWS
-    xs = [float(camera.centre[0]) for camera in cameras]
+    xs = [float(camera.center[0]) for camera in cameras]
     assert min(xs) < 0
     assert max(xs) > BASELINE
     for camera in cameras[::3]:
@@ -97,7 +97,7 @@ def test_no_gaussian_is_stretched_over_an_edge(scene: Scene) -> None:
 
 
 def test_discs_lie_in_their_surface() -> None:
-    """Samples of a slanted plane: centres on it, thin axes along its normal, round projections of one pixel's width."""
+    """Samples of a slanted plane: centers on it, thin axes along its normal, round projections of one pixel's width."""
     slope_x, slope_y, constant = 0.03, -0.05, 40.0
     generator = np.random.default_rng(0)
     x, y = generator.uniform(0, 741, 50), generator.uniform(0, 500, 50)
@@ -108,7 +108,7 @@ def test_discs_lie_in_their_surface() -> None:
     )
     means, quats, scales, sh_dc = demo_scene._gaussians(samples, 0.0)
     # d = a x + b y + c over d = f B / z and x = f X / z + cx: f (a X + b Y) + (a cx + b cy + c) Z = f B.
-    offset = constant + DISPARITY_OFFSET + slope_x * CENTRE_X + slope_y * CENTRE_Y
+    offset = constant + DISPARITY_OFFSET + slope_x * CENTER_X + slope_y * CENTER_Y
     normal = np.array([FOCAL * slope_x, FOCAL * slope_y, offset])
     np.testing.assert_allclose(means @ normal, FOCAL * BASELINE, rtol=1e-12)
     rotation = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()

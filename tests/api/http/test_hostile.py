@@ -62,8 +62,8 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
     for form in PACKED_FORMS:
         write_packed(folder / form, scene, form)
         found[form] = (folder / form).read_bytes()
-    colour = bytes([200, 100, 50, 255, 255, 128, 128, 128])
-    rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + colour for mean in scene.means.tolist()]
+    color = bytes([200, 100, 50, 255, 255, 128, 128, 128])
+    rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + color for mean in scene.means.tolist()]
     return {**found, "splat": b"".join(rows)}
 
 

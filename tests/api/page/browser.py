@@ -18,7 +18,7 @@ from PIL import Image
 from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 #: Where WebGL is computed by the processor: the same pixels on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
@@ -118,8 +118,8 @@ class Watched:
 def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
     """What `sgsst render` makes of a scene's file, [h, w, 3] of 0 to 255."""
     found = read_scene(scene).scene
-    colours = view_colours(found.sh_dc, rest_colours(found.sh_rest, found.means, camera))
-    image = make_rasterizer("cpu", found).render(colours, camera)
+    colors = view_colors(found.sh_dc, rest_colors(found.sh_rest, found.means, camera))
+    image = make_rasterizer("cpu", found).render(colors, camera)
     return (image.double().clamp(0, 1) * 255).round().numpy()
 
 
@@ -139,7 +139,7 @@ VIEW = """async ([base, scene, cameras, name, width, height]) => {
   const viewer = new Viewer(canvas), blob = await (await fetch(cameras)).blob();
   const camera = (await readCameras([{ name: "cameras.json", blob }])).find((each) => each.name === name);
   const source = viewer.open(new URL(scene, location.href).href);
-  viewer.show({ scene: source, colours: "own" });
+  viewer.show({ scene: source, colors: "own" });
   await source.ready;
   viewer.camera.stand(camera, source.middle);
   viewer.draw();

@@ -322,11 +322,11 @@ def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service
     right = watched.pixels()
     watched.wipe("End")
     assert np.abs(watched.pixels() - right).mean() > 5
-    watched.check("status of 404")  # that there are no colours alone is asked first
+    watched.check("status of 404")  # that there are no colors alone is asked first
 
 
 def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """Geometry comes from the packed file, colours from the result: in the file's order."""
+    """Geometry comes from the packed file, colors from the result: in the file's order."""
     packed = files["scene"].with_name("scene.spz")
     write_packed(packed, read_scene(files["scene"]).scene, "spz")
     job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))

@@ -15,7 +15,7 @@ import torch
 
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene, write_packed
-from sgsst_core.files.quantised import SH_C0
+from sgsst_core.files.quantized import SH_C0
 from sgsst_core.files.scene_headers import SPLAT_BYTES, splat_rows
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -91,7 +91,7 @@ def splat_bytes(scene: Scene) -> bytes:
     quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
     shown = torch.cat([scene.sh_dc * SH_C0 + 0.5, scene.opacities.sigmoid()[:, None]], dim=1)
     rows["position"], rows["scale"] = scene.means.numpy(), scene.scales.exp().numpy()
-    rows["colour"] = (shown * 255).round().clamp(0, 255).numpy()
+    rows["color"] = (shown * 255).round().clamp(0, 255).numpy()
     rows["rotation"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
     return rows.tobytes()
 
@@ -145,10 +145,10 @@ def test_less_memory_shows_fewer_harmonics_and_says_so(visit: Visit, tmp_path: P
 def test_wipe_is_exact_to_the_pixel(visit: Visit, tmp_path: Path) -> None:
     write_files(tmp_path, wall(sh_degree=1), cameras(1, 200, 150))
     halves = struct.pack("<1848e", *np.linspace(-2, 2, 1848))
-    (tmp_path / "colours.f16").write_bytes(halves)
+    (tmp_path / "colors.f16").write_bytes(halves)
     steps = """async (viewer, source, picture) => {
-      await source.addColours("other", (await fetch("/given/colours.f16")).body);
-      viewer.show({ scene: source, colours: "own" }, { scene: source, colours: "other" });
+      await source.addColors("other", (await fetch("/given/colors.f16")).body);
+      viewer.show({ scene: source, colors: "own" }, { scene: source, colors: "other" });
       const found = [];
       for (const cut of [0, 0.333, 1]) { viewer.wipe(cut); found.push(await picture()); }
       return found;
@@ -166,7 +166,7 @@ def test_two_scenes_share_the_wipe(visit: Visit, tmp_path: Path) -> None:
       const other = viewer.open(source.source);
       await other.ready;
       const alone = await picture();
-      viewer.show({ scene: source, colours: "own" }, { scene: other, colours: "own" });
+      viewer.show({ scene: source, colors: "own" }, { scene: other, colors: "own" });
       viewer.wipe(0.5);
       return [alone, await picture()];
     }"""
@@ -179,18 +179,18 @@ def test_order_is_right_from_every_side(visit: Visit, tmp_path: Path) -> None:
     write_files(tmp_path, wall())
     steps = """async (viewer, source, picture, base) => {
       const { depthOrder } = await import(`${base}/viewer/depth_order.js`);
-      const count = 20000, centres = new Float32Array(count * 3), reach = new Float32Array(count).fill(0.01);
+      const count = 20000, centers = new Float32Array(count * 3), reach = new Float32Array(count).fill(0.01);
       let seed = 7;
-      for (let i = 0; i < centres.length; i++) {
+      for (let i = 0; i < centers.length; i++) {
         seed = (Math.imul(seed, 1103515245) + 12345) >>> 0;
-        centres[i] = (seed / 2 ** 32 - 0.5) * (i % 97 ? 4 : 400);
+        centers[i] = (seed / 2 ** 32 - 0.5) * (i % 97 ? 4 : 400);
       }
       const worst = [];
       for (let turn = 0; turn < 12; turn++) {
         const c = Math.cos(turn), s = Math.sin(turn);
         const axes = [[c, 0, -s], [0, 1, 0], [s, 0, c]], eye = [-5 * s, 0, -5 * c];
-        const order = depthOrder(centres, reach, count, { axes, eye, tan: [1e6, 1e6], near: 0.2 });
-        const depth = (i) => axes[2].reduce((sum, part, k) => sum + part * (centres[3 * i + k] - eye[k]), 0);
+        const order = depthOrder(centers, reach, count, { axes, eye, tan: [1e6, 1e6], near: 0.2 });
+        const depth = (i) => axes[2].reduce((sum, part, k) => sum + part * (centers[3 * i + k] - eye[k]), 0);
         let expected = 0, back = 0;
         for (let i = 0; i < count; i++) expected += depth(i) >= 0.2;
         for (let k = 1; k < order.length; k++) {
@@ -226,7 +226,7 @@ def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:
       const before = await picture(), device = viewer.gl.getExtension("WEBGL_lose_context");
       viewer.onReload = () => {
         const again = viewer.open(source.source);
-        viewer.show({ scene: again, colours: "own" });
+        viewer.show({ scene: again, colors: "own" });
       };
       device.loseContext();
       while (!viewer.lost) await new Promise((go) => setTimeout(go, 20));

@@ -163,6 +163,6 @@ def test_killed_ranks_cost_time_only(service: Service, files: dict[str, Path], e
     two, one = (read_scene(path).scene for path in (service.data / "two.ply", expected))
     before = read_scene(files["scene"]).scene
     moved = (one.sh_dc - before.sh_dc).norm()
-    # two ranks add in another order, and rounding grows along the path of the optimiser
+    # two ranks add in another order, and rounding grows along the path of the optimizer
     assert (two.sh_dc - one.sh_dc).norm() < 0.05 * moved
     assert torch.equal(two.means, one.means)

@@ -1,4 +1,4 @@
-"""Variants judged by a network that none of them optimises."""
+"""Variants judged by a network that none of them optimizes."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> N
     assert (before.name, transfer.name) == (UNSTYLIZED, TRANSFER)
     assert [outcome.name for outcome in variants] == ["standard", "one-scale"]
     assert [curve.variant.name for curve in quality.curves if curve.left_out] == ["tf32"]  # there is no GPU for it
-    assert before.judgement.content == 0
-    assert transfer.judgement.palette < before.judgement.palette
+    assert before.judgment.content == 0
+    assert transfer.judgment.palette < before.judgment.palette
     for outcome in variants:
         assert outcome.loss is not None
         assert outcome.loss < 1
         assert outcome.steps > 0
-        assert outcome.judgement.content > 0
+        assert outcome.judgment.content > 0
         assert outcome.short is not None
     values = json.loads(json.dumps(quality.as_dict()))
     assert values["outcomes"][2]["consistency"]["short"]["rmse"] > 0
@@ -49,8 +49,8 @@ def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> N
 
 def test_the_front_holds_what_nothing_beats_in_style_and_content(quality: Quality) -> None:
     def outcome(name: str, style: float, content: float) -> Outcome:
-        judgement = replace(quality.outcomes[0].judgement, style=style, content=content)
-        return replace(quality.outcomes[0], name=name, judgement=judgement)
+        judgment = replace(quality.outcomes[0].judgment, style=style, content=content)
+        return replace(quality.outcomes[0], name=name, judgment=judgment)
 
     outcomes = [
         outcome(UNSTYLIZED, 2.0, 0.0),  # is no result
@@ -72,6 +72,6 @@ def test_pictures_are_written(quality: Quality, tmp_path: Path) -> None:
     assert on_white.shape == (72, 96, 3)
 
 
-def test_without_neighbours_there_is_nothing_to_judge(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
+def test_without_neighbors_there_is_nothing_to_judge(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
     with pytest.raises(SettingsError, match="more cameras"):
         compare_quality(wall(), cameras(1, 96, 72), style(), [], 1.0, weights=tiny_weights, coarsest_side=36)

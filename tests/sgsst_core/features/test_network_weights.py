@@ -33,7 +33,7 @@ TORCHVISION_VGG16 = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
 
 
 def random_vgg(name: str, seed: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
-    """Random convolutions (He initialisation) of a network on ImageNet-normalised RGB."""
+    """Random convolutions (He initialization) of a network on ImageNet-normalized RGB."""
     generator = torch.Generator().manual_seed(seed)
     layers = {}
     for layer, (width, channels) in sources.convolution_shapes(name).items():
@@ -112,9 +112,9 @@ def test_one_network_in_both_conventions_gives_the_same_features(vgg19_folder: P
         torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-4 * float(first.abs().max()))
 
 
-def test_features_are_kappa_times_those_of_the_normalised_network(vgg19_folder: Path) -> None:
+def test_features_are_kappa_times_those_of_the_normalized_network(vgg19_folder: Path) -> None:
     rgb = torch.rand(48, 80, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    normalised = BackboneWeights(
+    normalized = BackboneWeights(
         name="vgg19",
         source="",
         sha256="",
@@ -123,7 +123,7 @@ def test_features_are_kappa_times_those_of_the_normalised_network(vgg19_folder: 
         input_shift=-torch.tensor(sources.IMAGENET_MEAN, dtype=torch.float64)
         / torch.tensor(sources.IMAGENET_STD, dtype=torch.float64),
     )
-    pairs = zip(features(load_network_weights("vgg19", vgg19_folder), rgb), features(normalised, rgb), strict=True)
+    pairs = zip(features(load_network_weights("vgg19", vgg19_folder), rgb), features(normalized, rgb), strict=True)
     for scaled, plain in pairs:
         torch.testing.assert_close(scaled, plain * sources.KAPPA, rtol=1e-5, atol=1e-5 * float(scaled.max()))
 

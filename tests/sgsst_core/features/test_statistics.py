@@ -132,5 +132,5 @@ def test_blocks_and_strips_of_any_shape(channels, width):
 def test_statistics_of_a_slice_are_those_of_a_copy():
     x = features(60, 70, 24, dtype=torch.float32)[5:50, 3:40]
     found, expected = layer_statistics(x), layer_statistics(x.clone())
-    assert torch.equal(found.centred, expected.centred)
+    assert torch.equal(found.centered, expected.centered)
     assert torch.equal(found.mean, expected.mean)

@@ -260,7 +260,7 @@ def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights, monkeypa
     assert forward.names == {
         "cudnn_convolution_relu": convolved,
         "max_pool2d_with_indices": pools,
-        "mul": 1,  # the input's normalisation
+        "mul": 1,  # the input's normalization
         "add": 1,
     }
     assert backward.names == {

@@ -314,7 +314,7 @@ def test_a_rotation_with_few_digits_becomes_exact(tmp_path: Path) -> None:
         rotation = view.world_to_camera[:3, :3]
         assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
         assert torch.allclose(rotation, exact.world_to_camera[:3, :3], atol=2e-4)
-        assert torch.allclose(view.centre, exact.centre, atol=1e-12)
+        assert torch.allclose(view.center, exact.center, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -58,15 +58,15 @@ def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, fade: f
         path = in_another_form(path, form)
     source = read_scene(path)
     wanted = source.scene.faded(fade)
-    colours = source.scene.sh_dc + 1
-    write_stylized(source, tmp_path / "out.ply", colours, sh_fade=fade)
+    colors = source.scene.sh_dc + 1
+    write_stylized(source, tmp_path / "out.ply", colors, sh_fade=fade)
     found = read_scene(tmp_path / "out.ply").scene
     rest = torch.zeros_like(held(found.sh_rest)) if fade == 1 else held(wanted.sh_rest)
     assert torch.equal(held(found.sh_rest), rest)
     if fade == 1:
         assert wanted.sh_degree == 0
         assert not torch.signbit(held(found.sh_rest)).any()
-    assert torch.equal(found.sh_dc, colours)
+    assert torch.equal(found.sh_dc, colors)
     for name in ("means", "quats", "scales", "opacities"):
         assert torch.equal(getattr(found, name), getattr(source.scene, name))
     before, after = (PlyData.read(each)["vertex"].data for each in (path, tmp_path / "out.ply"))

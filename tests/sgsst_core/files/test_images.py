@@ -69,11 +69,11 @@ def test_transparency_is_composited_on_white(tmp_path: Path) -> None:
     alpha = rgba[:, :, 3:] / 255.0
     expected = rgba[:, :, :3] / 255.0 * alpha + 1 - alpha
     assert np.abs(image.numpy() - expected).max() <= 1 / 255
-    grey = load_image(save(tmp_path / "b.png", Image.fromarray(rgba).convert("LA")))
-    assert torch.equal(grey[0, 0], torch.ones(3))
+    gray = load_image(save(tmp_path / "b.png", Image.fromarray(rgba).convert("LA")))
+    assert torch.equal(gray[0, 0], torch.ones(3))
 
 
-def test_palettes_with_and_without_a_transparent_colour(tmp_path: Path) -> None:
+def test_palettes_with_and_without_a_transparent_color(tmp_path: Path) -> None:
     palette = Image.fromarray(gradient()).quantize(8)
     expected = torch.from_numpy(np.asarray(palette.convert("RGB")).copy()).float() / 255
     assert torch.equal(load_image(save(tmp_path / "a.png", palette)), expected)
@@ -84,7 +84,7 @@ def test_palettes_with_and_without_a_transparent_colour(tmp_path: Path) -> None:
     assert torch.equal(image[~clear], expected[~clear])
 
 
-def test_grey_of_8_16_and_32_bits(tmp_path: Path) -> None:
+def test_gray_of_8_16_and_32_bits(tmp_path: Path) -> None:
     wide = (np.arange(54).reshape(6, 9) * 1200).astype("u2")
     expected = torch.from_numpy(wide.astype("f4") / 65535)[:, :, None].expand(6, 9, 3)
     assert torch.equal(load_image(save(tmp_path / "a.png", Image.fromarray(wide))), expected)
@@ -100,7 +100,7 @@ def test_grey_of_8_16_and_32_bits(tmp_path: Path) -> None:
     assert torch.equal(one[:, :, 2], torch.from_numpy(narrow > 100).float())
 
 
-def test_a_transparent_grey_of_16_bits(tmp_path: Path) -> None:
+def test_a_transparent_gray_of_16_bits(tmp_path: Path) -> None:
     values = np.array([[1000, 2000]], dtype="u2")
     image = load_image(save(tmp_path / "a.png", Image.fromarray(values), transparency=1000))
     assert image[0, 0].tolist() == [1, 1, 1]
@@ -120,7 +120,7 @@ def test_cmyk_becomes_rgb(tmp_path: Path) -> None:
 
 
 def test_of_an_animation_the_first_frame_is_read(tmp_path: Path) -> None:
-    frames = [Image.new("RGB", (5, 4), colour) for colour in ("red", "blue")]
+    frames = [Image.new("RGB", (5, 4), color) for color in ("red", "blue")]
     for name in ("a.gif", "a.png", "a.webp"):
         path = save(tmp_path / name, frames[0], save_all=True, append_images=frames[1:], duration=100)
         assert load_image(path)[0, 0].tolist() == pytest.approx([1, 0, 0], abs=0.02)

@@ -29,7 +29,7 @@ from sgsst_core.files.scene_headers import PackedForm, form_of_name, read_scene_
 from sgsst_core.quality.packed import measure_packed
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import basis, rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import basis, rest_colors, view_colors
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import camera, cloud
 from tests.small_scenes import cameras, wall
@@ -61,7 +61,7 @@ def gsply_of(scene: Scene) -> gsply.GSData:
 
 
 def turned(scene: Scene) -> Scene:
-    """The same Gaussians in SPZ's axes. Coefficients are found by looking: those that give the same colours."""
+    """The same Gaussians in SPZ's axes. Coefficients are found by looking: those that give the same colors."""
     turn = torch.diag(TURN.double())
     directions = torch.nn.functional.normalize(
         torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1
@@ -190,8 +190,8 @@ def test_full_and_no_opacity_are_finite_and_come_back(tmp_path: Path) -> None:
         assert torch.equal(read_scene(path).scene.opacities.sort().values, back.opacities.sort().values)
 
 
-def test_bounds_without_colours(tmp_path: Path) -> None:
-    """Older compressed PLYs have colours between 0 and 1."""
+def test_bounds_without_colors(tmp_path: Path) -> None:
+    """Older compressed PLYs have colors between 0 and 1."""
     path = tmp_path / "scene.ply"
     scene = replace(wall(), sh_dc=torch.zeros(616, 3))
     write_packed(path, scene, "compressed.ply")
@@ -245,7 +245,7 @@ def test_the_loss_is_that_of_pictures(tmp_path: Path) -> None:
     back = read_scene(path).scene
     first, second = (
         make_rasterizer("cpu", each, near=0.01)
-        .render(view_colours(each.sh_dc, rest_colours(each.sh_rest, each.means, view)), view)
+        .render(view_colors(each.sh_dc, rest_colors(each.sh_rest, each.means, view)), view)
         .clamp(0, 1)
         for each in (scene, back)
     )
@@ -253,7 +253,7 @@ def test_the_loss_is_that_of_pictures(tmp_path: Path) -> None:
     assert measure_packed(path, scene, [view], near=0.01).psnr == pytest.approx(float(expected))
 
 
-def test_neighbours_share_bounds(tmp_path: Path) -> None:
+def test_neighbors_share_bounds(tmp_path: Path) -> None:
     """Whatever the order of the scene: an error of 1 in 1024 of the whole extent would be forty times larger."""
     scene = cloud(20_000)
     scene = scene.subset(torch.randperm(len(scene), generator=torch.Generator().manual_seed(1)))
@@ -298,15 +298,15 @@ def test_a_float_ply_is_what_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_packed_scene_becomes_a_float_ply_with_the_new_colours(tmp_path: Path, form: PackedForm) -> None:
+def test_a_packed_scene_becomes_a_float_ply_with_the_new_colors(tmp_path: Path, form: PackedForm) -> None:
     packed, out = tmp_path / "scene.any", tmp_path / "out.ply"
     write_packed(packed, wall(sh_degree=2), form)
     source = read_scene(packed)
-    colours = torch.randn(616, 3, generator=torch.Generator().manual_seed(1))
-    write_stylized(source, out, colours)
+    colors = torch.randn(616, 3, generator=torch.Generator().manual_seed(1))
+    write_stylized(source, out, colors)
     found = read_scene(out)
     assert found.form == "ply"
-    assert torch.equal(found.scene.sh_dc, colours)
+    assert torch.equal(found.scene.sh_dc, colors)
     for name in ("means", "quats", "scales", "opacities", "sh_rest"):
         assert torch.equal(getattr(found.scene, name), getattr(source.scene, name)), name
 

@@ -152,7 +152,7 @@ def files(draw: st.DrawFn) -> File:
 
 @settings(max_examples=120, deadline=None, suppress_health_check=list(HealthCheck))
 @given(files(), st.floats(-50, 50, width=32))
-def test_any_3dgs_ply_comes_back_with_new_colours_and_nothing_else_changed(
+def test_any_3dgs_ply_comes_back_with_new_colors_and_nothing_else_changed(
     tmp_path_factory: pytest.TempPathFactory, file: File, shift: float
 ) -> None:
     folder = tmp_path_factory.mktemp("ply")
@@ -170,17 +170,17 @@ def test_any_3dgs_ply_comes_back_with_new_colours_and_nothing_else_changed(
             column = f"f_rest_{channel * coefficients + k}"
             assert held(scene.sh_rest)[:, k, channel].tolist() == [f32(row[column]) for row in rows]
 
-    colours = scene.sh_dc + torch.tensor([shift, 0.0, -shift])
-    write_stylized(source, folder / "out.ply", colours)
+    colors = scene.sh_dc + torch.tensor([shift, 0.0, -shift])
+    write_stylized(source, folder / "out.ply", colors)
     lines, elements = second_reader((folder / "out.ply").read_bytes())
     expected_lines, expected_elements = second_reader(file.to_bytes())
     for index, (row, old) in enumerate(zip(elements["vertex"], expected_elements["vertex"], strict=True)):
         for channel in range(3):
             new, before = row[f"f_dc_{channel}"], old[f"f_dc_{channel}"]
-            assert f32(new) == colours[index, channel]
-            if (("double", f"f_dc_{channel}") in kinds) and f32(before) != colours[index, channel]:
-                assert new == float(colours[index, channel])  # doubles hold the colour exactly, in text too
-            if f32(before) == colours[index, channel]:
+            assert f32(new) == colors[index, channel]
+            if (("double", f"f_dc_{channel}") in kinds) and f32(before) != colors[index, channel]:
+                assert new == float(colors[index, channel])  # doubles hold the color exactly, in text too
+            if f32(before) == colors[index, channel]:
                 assert new == before  # a value that does not change keeps its double precision
             old[f"f_dc_{channel}"] = new
     assert lines == expected_lines
@@ -189,7 +189,7 @@ def test_any_3dgs_ply_comes_back_with_new_colours_and_nothing_else_changed(
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("block", [1, 2, 1 << 16])
-def test_only_the_bytes_of_the_colours_change(
+def test_only_the_bytes_of_the_colors_change(
     tmp_path: Path, form: str, block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ply, "BLOCK_ROWS", block)
@@ -197,10 +197,10 @@ def test_only_the_bytes_of_the_colours_change(
     behind = b"" if form == "ascii" else b"bytes behind the last element \xff\r\n"
     data = file.to_bytes() + behind
     source = read_scene(save(tmp_path, data))
-    colours = torch.rand(5, 3)
-    write_stylized(source, tmp_path / "out.ply", colours)
+    colors = torch.rand(5, 3)
+    write_stylized(source, tmp_path / "out.ply", colors)
     for i, row in enumerate(file.elements[0][2]):
-        row |= {f"f_dc_{c}": float(colours[i, c]) for c in range(3)}
+        row |= {f"f_dc_{c}": float(colors[i, c]) for c in range(3)}
     written = (tmp_path / "out.ply").read_bytes()
     if form == "ascii":
         old, new = data.split(b"\n"), written.split(b"\n")
@@ -209,7 +209,7 @@ def test_only_the_bytes_of_the_colours_change(
         assert [{name: f32(value) for name, value in row.items()} for row in rows] == file.elements[0][2]
     else:
         assert written == file.to_bytes() + behind
-    assert torch.equal(read_scene(tmp_path / "out.ply").scene.sh_dc, colours)
+    assert torch.equal(read_scene(tmp_path / "out.ply").scene.sh_dc, colors)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -234,14 +234,14 @@ def test_a_cut_gaussian_has_a_row_for_each_part_with_all_that_its_row_held(
     refined = source.refined(made)
     assert source.refined(None) is source
     assert refined.dropped == int(dropped)
-    colours = torch.rand(len(refined.scene), 3)
-    write_stylized(refined, tmp_path / "out.ply", colours)
+    colors = torch.rand(len(refined.scene), 3)
+    write_stylized(refined, tmp_path / "out.ply", colors)
     written = (tmp_path / "out.ply").read_bytes()
     assert written.endswith(behind)
     found = read_scene(tmp_path / "out.ply").scene
     for name in ("means", "quats", "scales", "opacities", "sh_rest"):
         assert torch.equal(getattr(found, name), getattr(refined.scene, name)), name
-    assert torch.equal(found.sh_dc, colours)
+    assert torch.equal(found.sh_dc, colors)
     kept = [row for i, row in enumerate(rows) if not (dropped and i == 1)]
     parents = [kept[parent] for parent in parents_of(pieces).tolist()]
     for row, parent in zip(second_reader(written.removesuffix(behind))[1]["vertex"], parents, strict=True):
@@ -260,7 +260,7 @@ def test_shapes_that_are_stored_as_integers_cannot_be_cut(tmp_path: Path) -> Non
         source.refined(Refinement(pieces, 1, 4))
 
 
-def test_unchanged_colours_give_the_same_bytes(tmp_path: Path) -> None:
+def test_unchanged_colors_give_the_same_bytes(tmp_path: Path) -> None:
     text = simple(form="ascii").to_bytes().replace(b"  ", b"\t ").replace(b"0.03", b"+.30e-1")
     source = read_scene(save(tmp_path, text))
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
@@ -282,7 +282,7 @@ def test_a_source_that_was_changed_meanwhile_is_refused(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["scene.ply"]
 
 
-def test_colours_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
+def test_colors_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
     source = read_scene(save(tmp_path, simple()))
     for wrong in (torch.zeros(2, 3), torch.full((3, 3), torch.nan)):
         with pytest.raises(ValueError, match="sh_dc must be finite"):
@@ -303,8 +303,8 @@ def test_non_finite_values_are_counted_by_property_and_may_be_dropped(tmp_path: 
         read_scene(path)
     source = read_scene(path, drop_invalid=True)
     assert (len(source.scene), source.dropped) == (3, 2)
-    colours = torch.tensor([[9.0] * 3, [8.0] * 3, [7.0] * 3])
-    write_stylized(source, tmp_path / "out.ply", colours)
+    colors = torch.tensor([[9.0] * 3, [8.0] * 3, [7.0] * 3])
+    write_stylized(source, tmp_path / "out.ply", colors)
     lines, elements = second_reader((tmp_path / "out.ply").read_bytes())
     left = [rows[i] | {f"f_dc_{c}": value for c in range(3)} for i, value in ((0, 9.0), (2, 8.0), (4, 7.0))]
     assert elements == {"vertex": left, "after": [{"a": 3}]}
@@ -467,25 +467,25 @@ def test_a_written_scene_reads_back(tmp_path: Path, degree: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["biker", "snowmiku_plush", "playbot_synthetic_sh2"])
-def test_real_scenes_differ_in_their_colours_only(shared_data: Path, tmp_path: Path, name: str) -> None:
+def test_real_scenes_differ_in_their_colors_only(shared_data: Path, tmp_path: Path, name: str) -> None:
     path = shared_data / "scenes" / name / "point_cloud.ply"
     source = read_scene(path)
-    colours = source.scene.sh_dc.flip(0) + 0.25
-    write_stylized(source, tmp_path / "out.ply", colours)
+    colors = source.scene.sh_dc.flip(0) + 0.25
+    write_stylized(source, tmp_path / "out.ply", colors)
     old, new = PlyData.read(path)["vertex"].data, PlyData.read(tmp_path / "out.ply")["vertex"].data
     assert old.dtype == new.dtype
     for column in old.dtype.names:
         if column.startswith("f_dc_"):
-            assert np.array_equal(new[column], colours[:, int(column[-1])].numpy())
+            assert np.array_equal(new[column], colors[:, int(column[-1])].numpy())
         else:
             assert np.array_equal(new[column], old[column])
     before, after = path.read_bytes(), (tmp_path / "out.ply").read_bytes()
     start = before.index(b"end_header\n") + len(b"end_header\n")
     assert after[:start] == before[:start]
     assert len(after) == len(before)
-    # the second reader: colours by their place in the row, without plyfile or our own header parser
+    # the second reader: colors by their place in the row, without plyfile or our own header parser
     names = [line.split()[-1] for line in before[:start].split(b"\n") if line.startswith(b"property")]
     row = 4 * len(names)
     for index in (0, 1, len(old) // 2, len(old) - 1):
         values = struct.unpack_from(f"<{len(names)}f", after, start + index * row)
-        assert [values[names.index(f"f_dc_{c}".encode())] for c in range(3)] == colours[index].tolist()
+        assert [values[names.index(f"f_dc_{c}".encode())] for c in range(3)] == colors[index].tolist()

@@ -10,7 +10,7 @@ from PIL import Image
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.feature_scale import (
-    EVEN_COLOUR_SCALE,
+    EVEN_COLOR_SCALE,
     EVEN_PIXEL_SCALE,
     EVEN_SCALE,
     PUBLISHED,
@@ -66,9 +66,9 @@ def test_scales_of_torchvisions_vgg16(vgg16_weights: BackboneWeights) -> None:
     assert paper_scales(vgg16_weights) == pytest.approx(wanted, rel=0.02)
 
 
-def test_even_scales_are_one_factor_but_for_the_layer_that_knows_colours(trained_anew: BackboneWeights) -> None:
+def test_even_scales_are_one_factor_but_for_the_layer_that_knows_colors(trained_anew: BackboneWeights) -> None:
     scaled = at_scale(trained_anew, "even")
-    assert scaled.scales["relu1_1"] == EVEN_COLOUR_SCALE
+    assert scaled.scales["relu1_1"] == EVEN_COLOR_SCALE
     assert scaled.scales[PIXELS] == EVEN_PIXEL_SCALE
     assert {factor for layer, factor in scaled.scales.items() if layer not in ("relu1_1", PIXELS)} == {EVEN_SCALE}
     picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))

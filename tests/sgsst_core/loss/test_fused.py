@@ -11,7 +11,7 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics_ref
 from sgsst_core.loss import terms
 from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 from sgsst_core.loss.terms import LayerTarget, StyleGradient, style_loss
-from tests.sgsst_core.pictures import nearly_one_colour, relative_error
+from tests.sgsst_core.pictures import nearly_one_color, relative_error
 
 pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -40,7 +40,7 @@ def target_of(channels: int) -> LayerTarget:
 
 
 def on_cpu(statistics: LayerStatistics) -> LayerStatistics:
-    return LayerStatistics(statistics.count.cpu(), statistics.mean.cpu(), statistics.centred.cpu())
+    return LayerStatistics(statistics.count.cpu(), statistics.mean.cpu(), statistics.centered.cpu())
 
 
 def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tuple[Tensor, Tensor]:
@@ -70,8 +70,8 @@ def test_agrees_with_float64(channels: int, height: int, width: int, weighted: b
     found, exact = on_cpu(fused_statistics(x, a)), layer_statistics_reference(x.cpu(), None if a is None else a.cpu())
     assert float(found.count) == pytest.approx(float(exact.count), rel=1e-6)
     assert relative_error(found.mean, exact.mean) < 1e-6
-    assert relative_error(found.centred, exact.centred) < 3e-6
-    assert torch.equal(found.centred, found.centred.T)
+    assert relative_error(found.centered, exact.centered) < 3e-6
+    assert torch.equal(found.centered, found.centered.T)
     target = target_of(channels)
     terms_, gradient = fused_gradient(x, a, target)
     exact_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
@@ -102,8 +102,8 @@ def test_survives_a_large_mean_to_sigma_ratio() -> None:
 
 
 def test_channels_that_differ_by_less_than_their_mean_is_rounded() -> None:
-    """Pixels of nearly one colour, which have no Gram term: their map is about the mean as float32 has it."""
-    x = nearly_one_colour()
+    """Pixels of nearly one color, which have no Gram term: their map is about the mean as float32 has it."""
+    x = nearly_one_color()
     weights = terms.TermWeights(0.0, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
     target = target_of(3)
     on_host = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
@@ -139,7 +139,7 @@ def test_without_any_weight_all_is_nothing(shape: tuple[int, int]) -> None:
     found = on_cpu(fused_statistics(x, a))
     assert found.empty
     assert not found.mean.any()
-    assert not found.centred.any()
+    assert not found.centered.any()
     target = target_of(16)
     terms_, *maps = fused_style_loss(fused_statistics(x, a), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)
     assert not terms_.any()
@@ -151,7 +151,7 @@ def test_bfloat16_features_are_summed_in_float32() -> None:
     exact = layer_statistics_reference(x.cpu())
     found = on_cpu(fused_statistics(x))
     # In the interpreter products are whole; TF32, which a GPU takes for them, keeps three digits.
-    assert relative_error(found.centred, exact.centred) < (2e-3 if DEVICE == "cuda" else 3e-6)
+    assert relative_error(found.centered, exact.centered) < (2e-3 if DEVICE == "cuda" else 3e-6)
     target = target_of(32)
     _, gradient = fused_gradient(x, None, target)
     cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
@@ -161,7 +161,7 @@ def test_bfloat16_features_are_summed_in_float32() -> None:
 def test_repeats_to_the_bit() -> None:
     x, a = features(60, 70, 64, seed=4), position_weights(60, 70)
     first, second = fused_statistics(x, a), fused_statistics(x, a)
-    assert torch.equal(first.centred, second.centred)
+    assert torch.equal(first.centered, second.centered)
     assert torch.equal(first.mean, second.mean)
 
 

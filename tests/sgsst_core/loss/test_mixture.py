@@ -6,7 +6,7 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import layer_statistics_reference, merge_all
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.mixture import StyleMixture, mixed_moments, mixed_target, normalised, shares_of
+from sgsst_core.loss.mixture import StyleMixture, mixed_moments, mixed_target, normalized, shares_of
 from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
@@ -28,7 +28,7 @@ def test_a_mixture_has_the_moments_of_all_positions_together():
     """Pictures with as many positions as their weights say, as if they were one picture."""
     parts = [features(1, 40), features(2, 10, offset=0.3)]
     statistics = [layer_statistics_reference(part) for part in parts]
-    mixed = mixed_target([LayerTarget.of(part) for part in statistics], normalised([4, 1]))
+    mixed = mixed_target([LayerTarget.of(part) for part in statistics], normalized([4, 1]))
     assert_same(mixed, LayerTarget.of(merge_all(statistics)), rtol=1e-12, atol=1e-14)
 
 
@@ -44,7 +44,7 @@ def test_digits_do_not_cancel_at_large_means():
 
 def test_equal_pictures_are_one_picture():
     target = LayerTarget.of(layer_statistics_reference(features(3)))
-    assert_same(mixed_target([target] * 3, normalised([0.2, 3, 1])), target, rtol=1e-13, atol=1e-15)
+    assert_same(mixed_target([target] * 3, normalized([0.2, 3, 1])), target, rtol=1e-13, atol=1e-15)
 
 
 def test_one_picture_is_itself(tiny_weights):
@@ -97,16 +97,16 @@ def test_too_many_vectors_are_shared_out_by_weight():
 @pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])
 def test_weights_that_are_no_shares(weights):
     with pytest.raises(SettingsError, match="style picture"):
-        normalised(weights)
+        normalized(weights)
 
 
 def test_weights_of_any_size_add_up_to_one():
-    assert normalised([1e308, 1e308]) == (0.5, 0.5)
-    assert normalised([1e-300, 3e-300]) == pytest.approx((0.25, 0.75))
-    assert normalised([0.3]) == (1.0,)
+    assert normalized([1e308, 1e308]) == (0.5, 0.5)
+    assert normalized([1e-300, 3e-300]) == pytest.approx((0.25, 0.75))
+    assert normalized([0.3]) == (1.0,)
 
 
-def test_colour_moments_of_a_mixture():
+def test_color_moments_of_a_mixture():
     pixels = [torch.rand(30, 3, generator=torch.Generator().manual_seed(s)).double() for s in (1, 2)]
     moments = [(part.mean(0), part.T.cov(correction=0)) for part in pixels]
     mean, covariance = mixed_moments(moments, [0.5, 0.5])

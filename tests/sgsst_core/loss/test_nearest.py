@@ -1,4 +1,4 @@
-"""Nearest-neighbour feature matching against its definition, and where angles do not exist."""
+"""Nearest-neighbor feature matching against its definition, and where angles do not exist."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def test_statistics_of_two_regions_together_are_merged_statistics():
     first, second = shares((9, 13), 2)
     whole = layer_statistics(features, first + second)
     parts = merge(layer_statistics(features, first), layer_statistics(features, second))
-    for name in ("count", "mean", "centred"):
+    for name in ("count", "mean", "centered"):
         torch.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=1e-12, atol=1e-13)
 
 

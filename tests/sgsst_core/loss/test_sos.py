@@ -49,10 +49,10 @@ def test_float64_agrees_with_untiled_autograd(tiny_weights, size, tile_sizes, co
     check_against_untiled_autograd(tiny_weights, size, tile_sizes, covered, 100)
 
 
-@pytest.mark.parametrize("grey", [False, True])
+@pytest.mark.parametrize("gray", [False, True])
 @pytest.mark.parametrize("covered", [False, True])
-def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, grey):
-    weights = replace(comparing_pixels(tiny_weights), grey=grey)
+def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray):
+    weights = replace(comparing_pixels(tiny_weights), gray=gray)
     check_against_untiled_autograd(weights, (129, 190), [None, 64], covered, 100)
 
 

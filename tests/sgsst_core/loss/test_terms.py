@@ -16,7 +16,7 @@ from sgsst_core.loss.terms import (
     content_factor,
     style_loss,
 )
-from tests.sgsst_core.pictures import nearly_one_colour, relative_error
+from tests.sgsst_core.pictures import nearly_one_color, relative_error
 
 
 def make_features(height, width, channels, seed, dtype=torch.float64):
@@ -67,8 +67,8 @@ def test_dead_channels_give_finite_gradients(dead_in):
 
 
 def test_a_map_about_the_rounded_mean_is_the_same_map():
-    """Where features differ by less than float32 rounds their mean, as pixels of nearly one colour do."""
-    x, target = nearly_one_colour(), LayerTarget.of(layer_statistics(make_features(30, 20, 3, 2)))
+    """Where features differ by less than float32 rounds their mean, as pixels of nearly one color do."""
+    x, target = nearly_one_color(), LayerTarget.of(layer_statistics(make_features(30, 20, 3, 2)))
     _, gradient = style_loss(layer_statistics(x), target, weights=TermWeights(gram=0.0))
     exact = gradient.apply(x.double())
     assert relative_error(gradient.about_rounded_mean().apply(x), exact) < 1e-5
@@ -134,10 +134,10 @@ def test_terms_travel_between_processes_and_cannot_be_changed():
 
 
 def test_a_term_that_is_not_declared_is_refused():
-    with pytest.raises(TypeError, match="no term colour; it has gram, mean"):
-        LossTerms(colour=1.0)
+    with pytest.raises(TypeError, match="no term color; it has gram, mean"):
+        LossTerms(color=1.0)
     with pytest.raises(KeyError):
-        LossTerms()["colour"]
+        LossTerms()["color"]
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])

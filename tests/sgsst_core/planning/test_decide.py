@@ -15,7 +15,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.planning.choices import rasterizer_anew
-from sgsst_core.planning.cost import OPTIMISER_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
+from sgsst_core.planning.cost import OPTIMIZER_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
 from sgsst_core.planning.decide import LEAST_PASSES, decide
 from sgsst_core.planning.memory import MEASURING_BYTES, SHAPE_BYTES
 from sgsst_core.planning.plan import Decision, Plan
@@ -76,13 +76,13 @@ def said(plan: Plan, item: str) -> str:
 
 def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
     plan = plan_of(probe())
-    assert plan.seen.tolist() == plan.optimised.tolist() == [False, True, True, True, True, True]
-    assert said(plan, "unseen Gaussians").startswith("1 of 6 are not rendered and not optimised; they take their neigh")
-    assert line(plan, "unseen Gaussians").bytes == OPTIMISER_BYTES  # type: ignore[union-attr]
-    assert "they keep their colours" in said(plan_of(probe(), unseen="keep"), "unseen Gaussians")
+    assert plan.seen.tolist() == plan.optimized.tolist() == [False, True, True, True, True, True]
+    assert said(plan, "unseen Gaussians").startswith("1 of 6 are not rendered and not optimized; they take their neigh")
+    assert line(plan, "unseen Gaussians").bytes == OPTIMIZER_BYTES  # type: ignore[union-attr]
+    assert "they keep their colors" in said(plan_of(probe(), unseen="keep"), "unseen Gaussians")
     everything = plan_of(probe(), keep=("unseen",))
     assert everything.seen.all()
-    assert not everything.optimised.all()
+    assert not everything.optimized.all()
     assert line(everything, "unseen Gaussians") is None
 
 
@@ -138,8 +138,8 @@ def test_position_weights_are_for_views_with_an_empty_surround(share: float, wan
     [
         (0.0, {}, "background", True),
         (0.05, {}, "background", True),  # a room with holes
-        (0.05, {"keep_colours": "luminance"}, "background", False),
-        (0.5, {"keep_colours": "luminance"}, "palette", True),
+        (0.05, {"keep_colors": "luminance"}, "background", False),
+        (0.5, {"keep_colors": "luminance"}, "palette", True),
         (0.5, {}, "palette", True),
         (0.5, {"position_weights": "off"}, "background", True),
         (0.5, {"preset": "paper"}, "background", False),
@@ -148,7 +148,7 @@ def test_position_weights_are_for_views_with_an_empty_surround(share: float, wan
         (0.0, {"surround": "random", "warm_start": True}, "random", True),
     ],
 )
-def test_what_is_behind_a_scan_and_what_its_colours_begin_with(
+def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
     share: float, values: dict[str, Any], surround: str, warm: bool
 ) -> None:
     plan = plan_of(probe(uncovered_share=share), **values)
@@ -173,7 +173,7 @@ def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end()
     assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 1e-6, rel=0.01)
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
     assert "0.6 s in every iteration" in said(drawn, "surround")
-    assert said(drawn, "early stop").startswith("none: every step is made: losses with different colours")
+    assert said(drawn, "early stop").startswith("none: every step is made: losses with different colors")
     without = plan_of(probe(uncovered_share=0.5), surround="random", content_weight=0.0)
     assert "every iteration" not in said(without, "surround")
     anew = plan_of(probe(uncovered_share=0.5), surround="random", keep=("content",))

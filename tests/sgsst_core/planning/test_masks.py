@@ -8,15 +8,15 @@ from tests.small_scenes import cameras, wall
 
 
 def test_votes_are_the_blend_weights_where_masks_are_white():
-    """Against pixels: what they show of one Gaussian, with 1 as its colour."""
+    """Against pixels: what they show of one Gaussian, with 1 as its color."""
     scene, views = wall(8, 6), cameras(2)
     rasterizer = make_rasterizer("cpu", scene)
     masks = [torch.rand(view.height, view.width, generator=torch.Generator().manual_seed(7)) for view in views]
     inside, total = count_votes(rasterizer, views, [lambda mask=mask: mask for mask in masks], len(scene))
     for index in (0, 20, 47):
-        colours = torch.zeros(len(scene), 3)
-        colours[index] = 1
-        shown = [rasterizer.render(colours, view)[:, :, 0].double() for view in views]
+        colors = torch.zeros(len(scene), 3)
+        colors[index] = 1
+        shown = [rasterizer.render(colors, view)[:, :, 0].double() for view in views]
         wanted = sum(float((own * mask).sum()) for own, mask in zip(shown, masks, strict=True))
         torch.testing.assert_close(float(inside[index]), wanted, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(float(total[index]), float(sum(own.sum() for own in shown)), rtol=1e-4, atol=1e-5)
@@ -29,11 +29,11 @@ def test_a_half_of_a_wall():
     inside, total = count_votes(make_rasterizer("cpu", scene), views, [lambda: mask], len(scene))
     found = decide_by_votes(scene.means, inside, total)
     x = scene.means[:, 0]
-    assert bool(found[x > 0.2].all())  # those beyond the view's edge, too, by their neighbours
+    assert bool(found[x > 0.2].all())  # those beyond the view's edge, too, by their neighbors
     assert not bool(found[x < -0.2].any())
 
 
-def test_those_between_and_those_unseen_follow_their_neighbours():
+def test_those_between_and_those_unseen_follow_their_neighbors():
     places = torch.arange(12.0)[:, None] * torch.tensor([1.0, 0, 0])
     total = torch.ones(12, dtype=torch.float64)
     inside = torch.tensor([0.0] * 3 + [1.0] * 9, dtype=torch.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sgsst_core.planning.cost import OPTIMISER_BYTES, RasterCost, gaussian_bytes
+from sgsst_core.planning.cost import OPTIMIZER_BYTES, RasterCost, gaussian_bytes
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.planning.memory import BUILDING_BYTES, MEASURING_BYTES, SEARCH_BYTES, SHAPE_BYTES
@@ -21,7 +21,7 @@ def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
     """Five of six Gaussians are rendered, as a copy of the scene of degree 3; its lists take those of the survey's."""
     plain = expected(LARGE).peak_bytes
     whole = expected(LARGE, keep=("unseen",)).peak_bytes
-    own = OPTIMISER_BYTES + 12 + 12 * VIEWS
+    own = OPTIMIZER_BYTES + 12 + 12 * VIEWS
     assert plain - whole == 5 * (own + gaussian_bytes(3)) - 6 * (own + SHAPE_BYTES)
     assert gaussian_bytes(3) == 4 * 59
     assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "what does not fit is built anew, and not kept"
@@ -42,13 +42,13 @@ def test_lists_of_held_out_views_take_what_the_jobs_leave() -> None:
 
 
 def test_views_that_no_step_comes_to_take_nothing() -> None:
-    """Of four, one step sees one: a quarter of the content, and of the colours."""
+    """Of four, one step sees one: a quarter of the content, and of the colors."""
     every, one = expected(LARGE, keep=("unseen",)), expected(LARGE, steps_sos=1, keep=("unseen",))
     without = [expected(LARGE, steps_sos=steps, keep=("unseen", "content")) for steps in (40, 1)]
-    colours = 6 * 12 * VIEWS * 3 // 4
-    assert without[0].peak_bytes - without[1].peak_bytes == colours
+    colors = 6 * 12 * VIEWS * 3 // 4
+    assert without[0].peak_bytes - without[1].peak_bytes == colors
     content = expected(LARGE, keep=("unseen",)).peak_bytes - without[0].peak_bytes
-    assert every.peak_bytes - one.peak_bytes == colours + content * 3 // 4
+    assert every.peak_bytes - one.peak_bytes == colors + content * 3 // 4
 
 
 def test_weights_take_the_room_of_the_surveys_lists() -> None:
@@ -63,7 +63,7 @@ def test_weights_take_the_room_of_the_surveys_lists() -> None:
 
 
 def test_the_largest_of_what_comes_and_goes_counts() -> None:
-    """Of many Gaussians it is a view's lists being built, or the search for unseen ones' neighbours at the end."""
+    """Of many Gaussians it is a view's lists being built, or the search for unseen ones' neighbors at the end."""
     few = expected(LARGE)
     many = plan_of(probe(gaussians=10**8, used_degree=0, held_degree=0)).prediction
     assert many is not None

@@ -27,7 +27,7 @@ def elevations(scene: Scene, made: Orbit) -> list[float]:
     """Of each camera above the horizon, degrees."""
     up = made.up.direction
     middle = middle_of(find_subject(scene), up)
-    offsets = [camera.centre - middle for camera in made.cameras]
+    offsets = [camera.center - middle for camera in made.cameras]
     return [math.degrees(math.asin(float(offset @ up / offset.norm()))) for offset in offsets]
 
 

@@ -18,7 +18,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import EVERYTHING, Item, PresetName, make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.unseen import neighbours_change
+from sgsst_core.stylizing.unseen import neighbors_change
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import ball, cameras, wall
 
@@ -51,7 +51,7 @@ def test_what_is_left_out_changes_nothing(tiny_weights: BackboneWeights, name: s
     scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
     lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     first = [stylizer.run_step() for stylizer in (lean, full)]
-    # The first step's loss comes from equal colours: nothing but rounding may differ.
+    # The first step's loss comes from equal colors: nothing but rounding may differ.
     assert first[0].loss == pytest.approx(first[1].loss, rel=1e-5)
     for stylizer in (lean, full):
         run(stylizer)
@@ -97,7 +97,7 @@ def test_pruning_stays_within_its_bound_and_is_made_up_for(tiny_weights: Backbon
     assert 0.4 < float(left_out.double().mean()) < 0.6
     bound = pruned_image_error(left_out, views, [0, 1, 2], make_rasterizer("cpu", scene))
     for index in range(3):
-        images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (whole, pruned)]
+        images = [s.views.render(index, s.views.colors(index, s.sh_dc.detach())) for s in (whole, pruned)]
         reach = float(max(image.max() for image in images))
         difference = (images[0] - images[1]).abs()
         assert 0 < float(difference.max()) <= bound.largest * reach
@@ -137,7 +137,7 @@ def test_rendering_without_unseen_gaussians_is_bitwise_the_same(tiny_weights: Ba
     lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
     for index in range(3):
-        images = [s.views.render(index, s.views.colours(index, s.sh_dc.detach())) for s in (lean, full)]
+        images = [s.views.render(index, s.views.colors(index, s.sh_dc.detach())) for s in (lean, full)]
         assert torch.equal(*images)
 
 
@@ -180,31 +180,31 @@ def test_survey_finds_weights_regions_and_blind_views() -> None:
     assert 0 < found.regions[0].pixels < coverage.numel()
 
 
-def test_unseen_gaussians_follow_their_seen_neighbours() -> None:
+def test_unseen_gaussians_follow_their_seen_neighbors() -> None:
     means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.1, 0, 0], [50, 0, 0]])
     change = torch.tensor([[1.0, 0, 0], [0, 1, 0], [9, 9, 9], [9, 9, 9]])
-    found = neighbours_change(means, change, torch.tensor([3e-9, 1e-9, 0, 0], dtype=torch.float64))
+    found = neighbors_change(means, change, torch.tensor([3e-9, 1e-9, 0, 0], dtype=torch.float64))
     torch.testing.assert_close(found, torch.tensor([[0.75, 0.25, 0], [0.75, 0.25, 0]]))
-    assert neighbours_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
+    assert neighbors_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
 
 
-def test_unseen_gaussians_follow_the_same_neighbours_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unseen_gaussians_follow_the_same_neighbors_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(3)
     means, change = torch.randn(400, 3, generator=generator), torch.randn(400, 3, generator=generator)
     weights = torch.rand(400, generator=generator).double() * (torch.arange(400) % 4 > 0)
     seen = weights > 0
-    found = neighbours_change(means, change, weights)
+    found = neighbors_change(means, change, weights)
     distances, nearest = torch.cdist(means[~seen].double(), means[seen].double()).sort(dim=1)
-    assert bool((distances[:, :9].diff(dim=1) > 0).all())  # no ties: the neighbours are those
+    assert bool((distances[:, :9].diff(dim=1) > 0).all())  # no ties: the neighbors are those
     own = weights[seen][nearest[:, :8]]
     expected = (change[seen].double()[nearest[:, :8]] * own[..., None]).sum(1) / own.sum(1, keepdim=True)
     torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
     for part in (1, 7, 100):
         monkeypatch.setattr("sgsst_core.stylizing.unseen._CHUNK", part)
-        assert torch.equal(neighbours_change(means, change, weights), found)
+        assert torch.equal(neighbors_change(means, change, weights), found)
 
 
-def test_unseen_gaussians_keep_their_colour_in_paper(tiny_weights: BackboneWeights) -> None:
+def test_unseen_gaussians_keep_their_color_in_paper(tiny_weights: BackboneWeights) -> None:
     scene = behind(wall())
     cases: list[tuple[PresetName, bool]] = [("paper", False), ("standard", True)]
     for preset, moved in cases:

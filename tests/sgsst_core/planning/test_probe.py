@@ -60,7 +60,7 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     assert probe.raster.seconds > 0
     sizes = [build_raster_lists(scene, camera).nbytes for camera in cameras(3)]
     assert probe.raster.lists_bytes == sum(sizes) // 3
-    assert probe.raster.first_seconds > 0 < probe.raster.colours_seconds
+    assert probe.raster.first_seconds > 0 < probe.raster.colors_seconds
     assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
     assert probe.process_bytes > 10**7
 
@@ -116,7 +116,7 @@ def test_the_survey_counts_what_a_view_shows() -> None:
     scene, views = wall(), [*cameras(2), blind_camera()]
     rasterizer = make_rasterizer("reference", scene)
     ones = torch.ones(views[0].height, views[0].width, 3)
-    counts = [int((rasterizer.colour_gradient(ones, camera)[:, 0] > 0).sum()) for camera in views[:2]]
+    counts = [int((rasterizer.color_gradient(ones, camera)[:, 0] > 0).sum()) for camera in views[:2]]
     assert survey(scene, views, make_rasterizer("cpu", scene)).shown == sum(counts) / 2
     assert 0 < sum(counts) < 2 * len(scene)
 

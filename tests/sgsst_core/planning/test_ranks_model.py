@@ -82,7 +82,7 @@ def test_further_ranks_must_be_worth_it() -> None:
 
 
 def test_groups_take_views_side_by_side() -> None:
-    """Two views a step on two ranks: no halos, twice as fast but for the sum of colours."""
+    """Two views a step on two ranks: no halos, twice as fast but for the sum of colors."""
     phases = [(0, [work()]), (10, [work()])]
     found = choose_ranks(phases, 2, 2, FREE)
     assert found.speed_up == pytest.approx(2.0)

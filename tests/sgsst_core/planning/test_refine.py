@@ -56,7 +56,7 @@ def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
     for pixel in range(14 * 20):
         one = torch.zeros(14 * 20, 3, dtype=torch.float64)
         one[pixel] = 1
-        operator.append(reference.colour_gradient(one.reshape(14, 20, 3), view)[:, 0])
+        operator.append(reference.color_gradient(one.reshape(14, 20, 3), view)[:, 0])
     weights, flat = torch.stack(operator), gradient.reshape(-1, 3)
     whole, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
     assert torch.allclose(there_is, whole.sum(dim=1), atol=1e-12)
@@ -125,7 +125,7 @@ def test_where_the_budget_ends_those_that_disagree_most_go_first() -> None:
     assert size is None
 
 
-def test_what_hardly_shows_or_has_one_colour_or_is_close_is_not_cut() -> None:
+def test_what_hardly_shows_or_has_one_color_or_is_close_is_not_cut() -> None:
     prints = Footprints(cloud(5))
     prints.weights = torch.tensor([100.0, 1.0, 100.0, 100.0, 100.0], dtype=torch.float64)
     prints.reach = torch.tensor([0.1, 0.1, 1.9, 0.1, 0.1], dtype=torch.float64)

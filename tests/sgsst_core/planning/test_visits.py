@@ -15,8 +15,8 @@ from sgsst_core.planning.visits import Made
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 
-#: Lists take 5 s and fit, colours 0.5 s.
-LARGE = RasterCost(2.0, first_seconds=5.0, lists_bytes=10**8, colours_seconds=0.5)
+#: Lists take 5 s and fit, colors 0.5 s.
+LARGE = RasterCost(2.0, first_seconds=5.0, lists_bytes=10**8, colors_seconds=0.5)
 #: Of four views, the lists of one fit a quarter of 10 GB.
 HUGE = replace(LARGE, lists_bytes=10 * GIGABYTE // 4)
 
@@ -62,9 +62,9 @@ def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
     assert told[1].startswith("0% of the views'")
 
 
-def test_lists_and_colours_come_with_the_first_visit_where_they_fit() -> None:
+def test_lists_and_colors_come_with_the_first_visit_where_they_fit() -> None:
     """The survey's lists are cut down to the Gaussians that are rendered, for a quarter of what they cost."""
-    small, large = expected(replace(LARGE, first_seconds=0.0, colours_seconds=0.0)), expected(LARGE)
+    small, large = expected(replace(LARGE, first_seconds=0.0, colors_seconds=0.0)), expected(LARGE)
     assert large.first_visit - small.first_visit == pytest.approx(0.25 * 5 + 0.5)
     assert large.seconds == small.seconds
 
@@ -116,11 +116,11 @@ def test_maps_of_regions_come_with_the_first_visit() -> None:
     assert found[1].peak_bytes - found[0].peak_bytes == pytest.approx(4 * pixels * 16 / 3, abs=2)
 
 
-def test_kept_gaussians_are_rendered_and_not_optimised() -> None:
+def test_kept_gaussians_are_rendered_and_not_optimized() -> None:
     plain = probe()
     kept = torch.zeros(plain.scene.gaussians, dtype=torch.bool)
     kept[:10] = True
     settings = make_settings(steps_coarse=0, steps_sos=40)
     without, found = (decide(each, settings) for each in (plain, replace(plain, kept=kept)))
     assert torch.equal(found.seen, without.seen)
-    assert torch.equal(found.optimised, without.optimised & ~kept)
+    assert torch.equal(found.optimized, without.optimized & ~kept)

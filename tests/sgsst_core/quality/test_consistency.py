@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene
@@ -28,7 +28,7 @@ from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, look_at, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 #: A power of two, so that planes stay where they are when their world is moved by whole numbers.
 SPACING = 1 / 16
@@ -40,8 +40,8 @@ def lpips(vgg16_weights: object) -> Lpips:
     return Lpips("alex")
 
 
-def plane(half_width: float, half_height: float, depth: float, colour: Tensor | None = None) -> Scene:
-    """Opaque flat Gaussians on a rectangle around the z axis, in a smooth pattern or one colour [3].
+def plane(half_width: float, half_height: float, depth: float, color: Tensor | None = None) -> Scene:
+    """Opaque flat Gaussians on a rectangle around the z axis, in a smooth pattern or one color [3].
 
     Gaussians overlap, and the nearer hides the farther: a pixel shows the pattern as it is up to two deviations beside
     it, to the side of the plane that is nearer to the camera.
@@ -51,12 +51,10 @@ def plane(half_width: float, half_height: float, depth: float, colour: Tensor | 
     y, x = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
     means = torch.stack([x, y, torch.full_like(x, depth)], dim=1)
     pattern = torch.stack([torch.sin(1.6 * x), torch.sin(1.2 * y + 0.6 * x), torch.cos(x - 1.3 * y)], dim=1)
-    rgb = 0.5 + 0.4 * pattern if colour is None else colour.expand(len(x), 3)
+    rgb = 0.5 + 0.4 * pattern if color is None else color.expand(len(x), 3)
     scales = torch.tensor([SPACING, SPACING, SPACING / 100]).log().expand(len(x), 3)
     quats = torch.tensor([1.0, 0, 0, 0]).expand(len(x), 4)
-    return Scene(
-        means, quats, scales, torch.full_like(x, 8.0), (rgb - COLOUR_OFFSET) / SH_C0, torch.zeros(len(x), 0, 3)
-    )
+    return Scene(means, quats, scales, torch.full_like(x, 8.0), (rgb - COLOR_OFFSET) / SH_C0, torch.zeros(len(x), 0, 3))
 
 
 def joined(first: Scene, second: Scene) -> Scene:
@@ -77,8 +75,8 @@ def renders(scene: Scene, cameras: list[Camera], rasterizer: Rasterizer):
     """The scene's own pictures."""
 
     def image(index: int) -> Tensor:
-        rest = rest_colours(scene.sh_rest, scene.means, cameras[index])
-        return rasterizer.render(view_colours(scene.sh_dc, rest), cameras[index])
+        rest = rest_colors(scene.sh_rest, scene.means, cameras[index])
+        return rasterizer.render(view_colors(scene.sh_dc, rest), cameras[index])
 
     return image
 
@@ -96,12 +94,12 @@ def homography(camera: Camera, other: Camera) -> Tensor:
 
     relative = other.world_to_camera @ torch.linalg.inv(camera.world_to_camera)
     normal = camera.world_to_camera[:3, :3] @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    distance = DEPTH - camera.centre[2]
+    distance = DEPTH - camera.center[2]
     motion = relative[:3, :3] + torch.outer(relative[:3, 3], normal) / distance
     return intrinsics(other) @ motion @ torch.linalg.inv(intrinsics(camera))
 
 
-def pixel_centres(camera: Camera) -> Tensor:
+def pixel_centers(camera: Camera) -> Tensor:
     """[H, W, 3] homogeneous."""
     y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     return torch.stack([x + 0.5, y + 0.5, torch.ones(x.shape)], dim=-1).double()
@@ -122,13 +120,13 @@ def test_pixels_of_a_plane_move_by_its_homography(first: Camera, tolerance: floa
     depth = expected_depth(scene, first, make_rasterizer(name, scene))
     assert depth.known.all()
     x, y, z = project_pixels(depth.depth, 0, first, other)
-    expected = pixel_centres(first) @ homography(first, other).T
+    expected = pixel_centers(first) @ homography(first, other).T
     error = torch.stack([x, y], dim=-1) - expected[..., :2] / expected[..., 2:]
     assert float(error.abs().max()) < tolerance
     # The plane's own depth along the ray of each position in the other view.
     rays = torch.stack([(x - other.cx) / other.fx, (y - other.cy) / other.fy, torch.ones_like(x)], dim=-1)
     slope = (rays @ other.world_to_camera[:3, :3])[..., 2]
-    torch.testing.assert_close(z, (DEPTH - other.centre[2]) / slope, rtol=tolerance / 20, atol=0)
+    torch.testing.assert_close(z, (DEPTH - other.center[2]) / slope, rtol=tolerance / 20, atol=0)
 
 
 def test_warp_shows_the_plane_as_the_other_camera_would_see_it():
@@ -138,7 +136,7 @@ def test_warp_shows_the_plane_as_the_other_camera_would_see_it():
     picture = renders(scene, cameras, rasterizer)
     depths = [expected_depth(scene, c, rasterizer) for c in cameras]
     warped, valid = warp(picture(1), depths[1], cameras[1], depths[0], cameras[0])
-    positions = pixel_centres(cameras[0]) @ homography(*cameras).T
+    positions = pixel_centers(cameras[0]) @ homography(*cameras).T
     x, y = positions[..., 0] / positions[..., 2], positions[..., 1] / positions[..., 2]
     to_border = torch.stack([x - 0.5, 63.5 - x, y - 0.5, 47.5 - y]).amin(0)
     assert valid[to_border > 0.1].all()
@@ -169,10 +167,10 @@ def test_what_the_other_view_cannot_see_is_masked():
     depths = [expected_depth(scene, c, rasterizer) for c in cameras]
     warped, valid = warp(picture(1), depths[1], cameras[1], depths[0], cameras[0])
     # A point (X, Y, 4) of the plane is hidden from the camera at (c, 0, 0) where the ray meets the patch at z = 2.
-    wall = (pixel_centres(cameras[0])[..., :2] - torch.tensor([32.0, 24.0])) / 70 * DEPTH
+    wall = (pixel_centers(cameras[0])[..., :2] - torch.tensor([32.0, 24.0])) / 70 * DEPTH
 
-    def meets_patch(centre: float, half: float) -> Tensor:
-        return ((wall[..., 0] + centre).abs() < 2 * half) & (wall[..., 1].abs() < 2 * half)
+    def meets_patch(center: float, half: float) -> Tensor:
+        return ((wall[..., 0] + center).abs() < 2 * half) & (wall[..., 1].abs() < 2 * half)
 
     edge = 3 * SPACING
     hidden = meets_patch(1, 0.4 - edge) & ~meets_patch(0, 0.4 + edge)
@@ -197,15 +195,15 @@ def test_identical_cameras_give_zero(lpips):
     assert measure(scene, [camera((0.3, 0.2, 0))] * 2).compared == 1.0
 
 
-def test_inconsistent_colours_give_large_values_and_consistent_ones_small(lpips):
+def test_inconsistent_colors_give_large_values_and_consistent_ones_small(lpips):
     scene = plane(5, 4, DEPTH)
     cameras = ring(3)
     rasterizer = make_rasterizer("cpu", scene)
     same = measure(scene, cameras, lpips=lpips)
 
     def flickering(index: int) -> Tensor:
-        colours = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(index))
-        return rasterizer.render(colours, cameras[index])
+        colors = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(index))
+        return rasterizer.render(colors, cameras[index])
 
     different = consistency(flickering, cameras, rasterizer, scene, 1, lpips)
     assert same.rmse < 0.005

@@ -56,13 +56,13 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
 
 
 def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeights) -> None:
-    """After some steps it is what it was before them, and the colours are those of the steps."""
+    """After some steps it is what it was before them, and the colors are those of the steps."""
     stylizer = make(tiny_weights, kept_weights="half")
     twin = ExactTwin(stylizer)
     first = twin.gradient_error()
     for _ in range(3):
         stylizer.run_step()
-    colours = stylizer.sh_dc.clone()
+    colors = stylizer.sh_dc.clone()
     late = twin.gradient_error(start=True)
     assert (late.step, late.view, late.relative_error, late.cosine) == (
         0,
@@ -70,7 +70,7 @@ def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeigh
         first.relative_error,
         first.cosine,
     )
-    assert torch.equal(stylizer.sh_dc, colours)
+    assert torch.equal(stylizer.sh_dc, colors)
     assert twin.gradient_error().relative_error != first.relative_error
 
 

@@ -118,10 +118,10 @@ def test_a_scene_is_looked_at_in_parts_of_any_size(tmp_path: Path, monkeypatch: 
 def test_gaussians_close_to_cameras_are_those_of_all_distances(distance: float, far: float) -> None:
     generator = torch.Generator().manual_seed(0)
     means = (torch.randn((500, 3), generator=generator) + far).float()
-    centres = torch.cat([means[:40].double(), torch.randn((20, 3), generator=generator, dtype=torch.float64) + far])
-    centres[1] += torch.tensor([distance, 0.0, 0.0])  # just not closer, or just closer
-    expected = [int(((means.double() - centre).norm(dim=1) < distance).sum()) for centre in centres]
-    assert findings.closer(means, centres, distance) == expected
+    centers = torch.cat([means[:40].double(), torch.randn((20, 3), generator=generator, dtype=torch.float64) + far])
+    centers[1] += torch.tensor([distance, 0.0, 0.0])  # just not closer, or just closer
+    expected = [int(((means.double() - center).norm(dim=1) < distance).sum()) for center in centers]
+    assert findings.closer(means, centers, distance) == expected
     assert max(expected) > 0
 
 
@@ -168,7 +168,7 @@ def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_pat
     found = seen_by(tmp_path, scene, cameras())
     file = stored(tmp_path, scene)
     rasterizer = make_rasterizer("reference", file.scene)
-    weights: Any = sum(rasterizer.colour_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
+    weights: Any = sum(rasterizer.color_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
     unseen = the(found, "in no view")
     assert unseen.count == int((weights == 0).sum()) >= 10
     hardly = the(found, "hardly seen")
@@ -199,7 +199,7 @@ def test_extreme_lenses_and_sizes_are_told(tmp_path: Path) -> None:
 
 def test_cameras_inside_the_scene_are_told(tmp_path: Path) -> None:
     scene = wall()
-    scene.means[:4] = cameras()[1].centre.float() + 0.05
+    scene.means[:4] = cameras()[1].center.float() + 0.05
     finding = the(seen_by(tmp_path, scene, cameras()), "inside the scene")
     assert (finding.count, finding.worst) == (1, "'view_1': 4")
 
@@ -216,7 +216,7 @@ def test_a_view_with_too_many_intersections_is_told_not_raised(tmp_path: Path) -
 def test_extreme_styles_are_told() -> None:
     views = cameras()
     (flat,) = style_findings(torch.full((60, 60, 3), 0.4), views)
-    assert flat.what == "one colour throughout"
+    assert flat.what == "one color throughout"
     (tiny,) = style_findings(torch.rand(8, 9, 3), views)
     assert tiny.worst == "used at 9 x 8"
     (long,) = style_findings(torch.rand(1000, 50, 3), views)

@@ -24,13 +24,13 @@ from sgsst_core.loss.sos_reference import box_average_reference, features_refere
 from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
-from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbours
+from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbors
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
 from sgsst_core.scene.gaussians import Scene, sampled
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
@@ -43,17 +43,17 @@ def rotation(angle: float, axis: Tensor = AXIS) -> Tensor:
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-def posed(turned: Tensor, centre: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
-    """A camera of a rotation (world to camera) at a centre."""
+def posed(turned: Tensor, center: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
+    """A camera of a rotation (world to camera) at a center."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = turned
-    pose[:3, 3] = -turned @ torch.as_tensor(centre, dtype=torch.float64)
+    pose[:3, 3] = -turned @ torch.as_tensor(center, dtype=torch.float64)
     return Camera(name, width, 40, 55.0, 56.0, 31.0, 19.0, pose)
 
 
 def held_out_cameras(views: list[Camera], covered: Sequence[int]) -> list[Camera]:
-    """One camera between each two neighbours among the views of some indices."""
-    return [between(*pair) for pair in neighbours([views[index] for index in covered])]
+    """One camera between each two neighbors among the views of some indices."""
+    return [between(*pair) for pair in neighbors([views[index] for index in covered])]
 
 
 def angle_between(first: Camera, second: Camera) -> float:
@@ -101,7 +101,7 @@ def test_halfway_is_half_of_the_shortest_turn_and_of_the_way(first: float, secon
     found = between(posed(rotation(first), (1, -2, 3), "left"), posed(rotation(second), (2, 4, -5), "right", width=90))
     assert found.name == "left–right"
     torch.testing.assert_close(found.world_to_camera[:3, :3], rotation(middle), rtol=0, atol=1e-13)
-    torch.testing.assert_close(found.centre, torch.tensor([1.5, 1, -1], dtype=torch.float64), rtol=0, atol=1e-13)
+    torch.testing.assert_close(found.center, torch.tensor([1.5, 1, -1], dtype=torch.float64), rtol=0, atol=1e-13)
     assert (found.width, found.height, found.fx, found.fy, found.cx, found.cy) == (60, 40, 55.0, 56.0, 31.0, 19.0)
     assert found.world_to_camera[3].tolist() == [0, 0, 0, 1]
 
@@ -113,16 +113,16 @@ def test_opposite_cameras_have_one_of_their_two_middles_and_equal_ones_themselve
     turned = found.world_to_camera[:3, :3]
     torch.testing.assert_close(turned @ turned.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
     assert float(torch.linalg.det(turned)) == pytest.approx(1)
-    assert found.centre.tolist() == pytest.approx([1, 0, 0])
+    assert found.center.tolist() == pytest.approx([1, 0, 0])
     same = posed(rotation(2.0), (0.3, 0.2, 0.1))
     torch.testing.assert_close(between(same, same).world_to_camera, same.world_to_camera, rtol=0, atol=1e-14)
 
 
-def test_halfway_on_a_ring_looks_at_its_centre():
+def test_halfway_on_a_ring_looks_at_its_center():
     for found in held_out_cameras(ring(9), range(9)):
         direction = found.world_to_camera[2, :3]
-        torch.testing.assert_close(direction, -found.centre / found.centre.norm(), rtol=0, atol=1e-7)
-        assert float(found.centre.norm()) == pytest.approx(3 * math.cos(math.pi / 9))
+        torch.testing.assert_close(direction, -found.center / found.center.norm(), rtol=0, atol=1e-7)
+        assert float(found.center.norm()) == pytest.approx(3 * math.cos(math.pi / 9))
 
 
 def test_one_camera_between_each_and_the_next():
@@ -144,7 +144,7 @@ def test_no_camera_across_a_jump_or_a_wide_turn():
     assert held_out_cameras([cameras(1)[0], blind_camera()], [0, 1]) == []
     upright = cameras(4)
     lying = [
-        posed(rotation(math.pi / 2, torch.tensor([0.0, 0, 1])) @ c.world_to_camera[:3, :3], c.centre)
+        posed(rotation(math.pi / 2, torch.tensor([0.0, 0, 1])) @ c.world_to_camera[:3, :3], c.center)
         for c in upright[2:]
     ]
     assert names(held_out_cameras([*upright[:2], *lying], range(4))) == ["view_0–view_1", "a–a"]
@@ -239,13 +239,13 @@ def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, w
     views = cameras(6)
     measured = held_out(scene, views, network, coarsest=COARSEST, weighted=weighted)
     assert measured.views == [0, 1, 2, 3]
-    sh_dc = 4 * scene.sh_dc  # colours far outside 0..1
+    sh_dc = 4 * scene.sh_dc  # colors far outside 0..1
     reference = make_rasterizer("reference", scene, background=(0.2, 0.3, 0.4))
     painting = resize_area(style(), pyramid.style_size((96, 80), (48, 64)))
     expected: dict[int, float] = {0: 0.0, 1: 0.0}
     for first, second in itertools.pairwise(views[:5]):
         camera = between(first, second)
-        image = reference.render(view_colours(sh_dc, rest_colours(scene.sh_rest, scene.means, camera)), camera)
+        image = reference.render(view_colors(sh_dc, rest_colors(scene.sh_rest, scene.means, camera)), camera)
         assert float(image.max()) > 1.2
         coverage = reference.coverage(camera) if weighted else None
         for scale, value in gram_reference(tiny_weights, image.clamp(0, 1), painting, coverage).items():
@@ -259,11 +259,11 @@ def test_the_first_measurement_is_the_measure_of_the_others(network):
     first = measured.measure(scene.sh_dc)
     assert first.gram_relative == 1.0
     assert measured.measure(scene.sh_dc) == first
-    grey = measured.measure(torch.zeros_like(scene.sh_dc))
-    assert grey.gram_relative == pytest.approx(grey.gram[0] / first.gram[0])
-    assert abs(grey.gram_relative - 1) > 0.1
+    gray = measured.measure(torch.zeros_like(scene.sh_dc))
+    assert gray.gram_relative == pytest.approx(gray.gram[0] / first.gram[0])
+    assert abs(gray.gram_relative - 1) > 0.1
     resumed = held_out(scene, views, network, first=first.gram)
-    assert resumed.measure(torch.zeros_like(scene.sh_dc)) == grey
+    assert resumed.measure(torch.zeros_like(scene.sh_dc)) == gray
 
 
 def test_what_is_kept_changes_nothing_and_the_job_s_loss_is_left_alone(network, lpips):
@@ -289,7 +289,7 @@ def test_consistency_does_not_see_what_cannot_be_seen(network, lpips):
     assert seen.short.rmse != before.short.rmse
 
 
-def test_colours_that_depend_on_the_view_are_less_consistent(network, lpips):
+def test_colors_that_depend_on_the_view_are_less_consistent(network, lpips):
     views = cameras(10)
     plain = wall(sh_degree=1)
     smooth = torch.sin(plain.means @ torch.tensor([[1.5, 0.3, -1], [0.5, 1, 1], [0, 0, 0]]))
@@ -312,8 +312,8 @@ def test_a_view_inside_of_something_is_not_measured(network):
         for i, p in enumerate(positions)
     ]
     shell = ball(400)
-    centred = shell.means - torch.tensor([0.0, 0, 3])
-    shell = replace(shell, means=centred * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
+    centered = shell.means - torch.tensor([0.0, 0, 3])
+    shell = replace(shell, means=centered * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
     room = wall()
     both = Scene(*(torch.cat([getattr(room, f), getattr(shell, f)]) for f in Scene.__dataclass_fields__))
     empty, filled = held_out(room, views, network), held_out(both, views, network)

@@ -15,13 +15,13 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import resize_area
-from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgement, frechet_distance, saturated
+from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgment, frechet_distance, saturated
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import reference_rest_colours
+from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.stylizing.regions import JobStyles
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
@@ -39,7 +39,7 @@ def judge_of(lpips: Lpips, scene: Scene, views: list[Camera], picture: Tensor | 
     return Judge(lpips, style() if picture is None else picture, scene, CpuRasterizer(scene), views)
 
 
-def judged(judge: Judge, sh_dc: Tensor) -> Judgement:
+def judged(judge: Judge, sh_dc: Tensor) -> Judgment:
     found = judge.judge(sh_dc)
     assert found is not None
     return found
@@ -49,7 +49,7 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple
     """Style on black and on white, palette, content and features of one view, by loops over layers and positions."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
-    rest = reference_rest_colours(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
+    rest = reference_rest_colors(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
     coverage = rasterizer.coverage(camera).double()
     styles, palettes, contents, turns = [], [], [], []
     for behind in (0.0, 1.0):
@@ -145,9 +145,9 @@ def test_frechet_distance_of_known_distributions() -> None:
     assert frechet_distance((zero, 0.04 * eye), (zero, 0.01 * eye)) == pytest.approx(255 * 0.1 * 3**0.5)
 
 
-def test_colours_that_no_screen_shows_are_saturated() -> None:
-    colours = torch.tensor([[-0.01, 0.5, 0.5], [0.5, 0.5, 0.5], [0.2, 1.3, 0.4], [0.9, 0.1, 0.5]])
-    assert saturated((colours - 0.5) / SH_C0) == 0.5
+def test_colors_that_no_screen_shows_are_saturated() -> None:
+    colors = torch.tensor([[-0.01, 0.5, 0.5], [0.5, 0.5, 0.5], [0.2, 1.3, 0.4], [0.9, 0.1, 0.5]])
+    assert saturated((colors - 0.5) / SH_C0) == 0.5
 
 
 def regions_of(scene: Scene, left: Tensor, right: Tensor, *, keep: bool = False) -> JobStyles:
@@ -162,12 +162,12 @@ def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
     scene, views = wall(), cameras(2)
     dark, bright = torch.full((64, 64, 3), 0.1), torch.full((64, 64, 3), 0.9)
     right = (scene.means[:, 0] > 0)[:, None]
-    colours = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
+    colors = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
     found = [
-        judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colours)
+        judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors)
         for styles in (regions_of(scene, dark, bright), regions_of(scene, bright, dark))
     ]
-    assert found[0].palette < 60  # colours run into each other at the border
+    assert found[0].palette < 60  # colors run into each other at the border
     assert found[1].palette > 150
     assert found[0].content == found[1].content
 
@@ -176,10 +176,10 @@ def test_what_is_kept_has_no_style_to_be_judged_by(alex: Lpips) -> None:
     scene, views = wall(), cameras(2)
     bright = torch.full((64, 64, 3), 0.9)
     right = (scene.means[:, 0] > 0)[:, None]
-    colours = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
+    colors = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
     styles = regions_of(scene, bright, bright, keep=True)
-    assert judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colours).palette < 60
-    assert judged(judge_of(alex, scene, views, bright), colours).palette > 80
+    assert judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors).palette < 60
+    assert judged(judge_of(alex, scene, views, bright), colors).palette > 80
 
 
 def test_equal_pictures_are_judged_as_one(alex: Lpips) -> None:

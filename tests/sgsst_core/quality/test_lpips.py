@@ -148,7 +148,7 @@ def alexnet_directly(rgb: Array, tensors: dict[str, Array]) -> list[Array]:
 
 
 def upsampled(values: Array, size: tuple[int, ...]) -> Array:
-    """Bilinear upsampling with pixel centres at +0.5, the border continued."""
+    """Bilinear upsampling with pixel centers at +0.5, the border continued."""
 
     def matrix(cells: int, pixels: int) -> Array:
         positions = np.clip((np.arange(pixels) + 0.5) * cells / pixels - 0.5, 0, cells - 1)

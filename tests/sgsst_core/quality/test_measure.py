@@ -89,16 +89,16 @@ def test_what_nothing_pays_for_is_not_measured(tiny_weights: BackboneWeights) ->
 
 
 def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeights) -> None:
-    """It is measured after the first step, from the unstylized colours: as it would have been before."""
+    """It is measured after the first step, from the unstylized colors: as it would have been before."""
     before, late = make(tiny_weights), make(tiny_weights)
     Measurements(before)(before)
     measure = Measurements(late)
     assert not measure.due(0)
     late.run_step()
-    colours = late.stylized()
+    colors = late.stylized()
     assert measure.due(1)
     measure(late)
-    assert torch.equal(late.stylized(), colours)
+    assert torch.equal(late.stylized(), colors)
     assert [entry["step"] for entry in late.measured] == [0, 1]
     assert before.measured[0]["held_out"] == late.measured[0]["held_out"]
 
@@ -118,7 +118,7 @@ def test_a_job_that_ends_before_the_first_moment_has_its_start_and_its_end(tiny_
     assert [entry["step"] for entry in stylizer.measured] == [0, 2]
 
 
-def test_nothing_is_measured_without_a_share_and_colours_are_the_same(tiny_weights: BackboneWeights) -> None:
+def test_nothing_is_measured_without_a_share_and_colors_are_the_same(tiny_weights: BackboneWeights) -> None:
     nothing, everything, least = (
         make(tiny_weights, measure=0.0),
         make(tiny_weights),

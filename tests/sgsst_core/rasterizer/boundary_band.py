@@ -1,7 +1,7 @@
 """Comparing two rasterizers that may decide differently where a cut-off hangs by a thread.
 
 A contribution is skipped below ALPHA_MIN and a pixel ends at TRANSMITTANCE_MIN. Where a value lies within rounding of
-its cut, one rasterizer may keep what the other skips: a step of up to a few grey levels that is no error. Everywhere
+its cut, one rasterizer may keep what the other skips: a step of up to a few gray levels that is no error. Everywhere
 else the tolerance holds, and such steps are counted.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-#: A contribution just above ALPHA_MIN, or a crossing Gaussian at a transmittance of up to 1e-2, times a colour up to 2.
+#: A contribution just above ALPHA_MIN, or a crossing Gaussian at a transmittance of up to 1e-2, times a color up to 2.
 LARGEST_STEP = 2e-2
 
 

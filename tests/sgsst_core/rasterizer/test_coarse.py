@@ -19,7 +19,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, single, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, single, turned_pose
 
 #: Float32 moves a decision only within this relative distance of its cut.
 CLOSE = 2e-5
@@ -56,21 +56,21 @@ def upscaled(gradient: Tensor, view: Camera, scale: int) -> Tensor:
 @pytest.mark.parametrize("name", CASES)
 def test_agrees_with_the_average_of_the_reference(name: str) -> None:
     scene, view = CASES[name]()
-    colours = colours_of(scene)
+    colors = colors_of(scene)
     reference = ReferenceRasterizer(scene, background=BACKGROUND)
-    image, band = reference.render(colours, view), reference.near_cutoff(view, CLOSE)
+    image, band = reference.render(colors, view), reference.near_cutoff(view, CLOSE)
     coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
     for scale in SCALES:
         coarse = coarse.at(scale)
         close = downscale(band.double(), scale) > 0
-        actual = coarse.render(colours, view)
+        actual = coarse.render(colors, view)
         assert actual.dtype == torch.float32
         assert_close_outside_band(actual, downscale(image, scale), close, tolerance=3e-6, largest_share=0.01)
         pixels = coarse_pixels(view, scale)
         pixels[close] = 0
-        gradient = coarse.colour_gradient(pixels, view)
+        gradient = coarse.color_gradient(pixels, view)
         assert gradient.dtype == torch.float32
-        assert relative_error(gradient, reference.colour_gradient(upscaled(pixels.double(), view, scale), view)) < 1e-6
+        assert relative_error(gradient, reference.color_gradient(upscaled(pixels.double(), view, scale), view)) < 1e-6
         assert coarse.is_kept(view)
 
 
@@ -78,10 +78,10 @@ def test_agrees_with_the_average_of_the_reference(name: str) -> None:
 def test_gradient_is_the_transpose(scale: int) -> None:
     scene, view = cloud(seed=11), camera(107, 77)
     coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND), scale)
-    colours, pixels = colours_of(scene), coarse_pixels(view, scale)
-    black = coarse.render(torch.zeros_like(colours), view).double()
-    forward = (coarse.render(colours, view).double() - black) * pixels
-    backward = coarse.colour_gradient(pixels, view).double() * colours
+    colors, pixels = colors_of(scene), coarse_pixels(view, scale)
+    black = coarse.render(torch.zeros_like(colors), view).double()
+    forward = (coarse.render(colors, view).double() - black) * pixels
+    backward = coarse.color_gradient(pixels, view).double() * colors
     assert float(backward.sum()) == pytest.approx(float(forward.sum()), abs=1e-6 * float(forward.abs().sum()))
 
 
@@ -97,7 +97,7 @@ def test_what_fills_no_square_does_not_count(scale: int) -> None:
     image = coarse.render(torch.ones(1, 3), view)
     assert image.shape == (2, 3, 3)
     assert not image.any()
-    assert not coarse.colour_gradient(torch.ones(2, 3, 3), view).any()
+    assert not coarse.color_gradient(torch.ones(2, 3, 3), view).any()
     (operator,) = coarse._operators.kept.values()
     assert operator is not None
     assert len(operator.pieces.slots) == 0
@@ -105,21 +105,21 @@ def test_what_fills_no_square_does_not_count(scale: int) -> None:
 
 def test_small_views_have_the_scales_whose_squares_they_hold() -> None:
     scene, view = cloud(seed=12), camera(15, 17)
-    coarse, colours = CoarseRasterizer(CpuRasterizer(scene)), colours_of(scene)
-    assert [tuple(coarse.at(scale).render(colours, view).shape) for scale in (1, 2, 3)] == [
+    coarse, colors = CoarseRasterizer(CpuRasterizer(scene)), colors_of(scene)
+    assert [tuple(coarse.at(scale).render(colors, view).shape) for scale in (1, 2, 3)] == [
         (8, 7, 3),
         (4, 3, 3),
         (2, 1, 3),
     ]
     for use in (
-        lambda: coarse.at(4).render(colours, view),
-        lambda: coarse.at(4).colour_gradient(torch.zeros(1, 0, 3), view),
+        lambda: coarse.at(4).render(colors, view),
+        lambda: coarse.at(4).color_gradient(torch.zeros(1, 0, 3), view),
         lambda: coarse.at(4).operator_bytes(view),
     ):
         with pytest.raises(ValueError, match="view 'test': 15x17 pixels hold no square of 16 pixels a side"):
             use()
     with pytest.raises(ValueError, match="1x1 pixels hold no square of 2 pixels"):
-        coarse.render(colours, camera(1, 1))
+        coarse.render(colors, camera(1, 1))
 
 
 def test_arguments_are_checked_before_any_work() -> None:
@@ -130,13 +130,13 @@ def test_arguments_are_checked_before_any_work() -> None:
             coarse.at(scale)
     for rows in ((0, 0), (3, 2), (0, 23), (-1, 4)):
         with pytest.raises(ValueError, match="at scale 1 lies within 0 to 22"):
-            coarse.render(colours_of(scene), view, rows)
-    with pytest.raises(ValueError, match="colours of shape"):
+            coarse.render(colors_of(scene), view, rows)
+    with pytest.raises(ValueError, match="colors of shape"):
         coarse.render(torch.zeros(9, 3), view)
     with pytest.raises(
         ValueError, match=r"gradient of shape \(45, 70, 3\): scale 1 of view 'test' needs \(22, 35, 3\)"
     ):
-        coarse.colour_gradient(pixels_like(view), view)
+        coarse.color_gradient(pixels_like(view), view)
     assert coarse.kept_bytes == 0
 
 
@@ -149,10 +149,10 @@ def test_a_view_without_gaussians_is_background(scene: Scene) -> None:
     view = camera()
     coarse = CoarseRasterizer(CpuRasterizer(scene, background=(0.5, 0.25, 0.125)))
     for scale in SCALES:
-        image = coarse.at(scale).render(colours_of(scene), view)
+        image = coarse.at(scale).render(colors_of(scene), view)
         assert image.shape == (view.height >> scale, view.width >> scale, 3)
         assert torch.equal(image.flatten(0, 1).unique(dim=0), torch.tensor([[0.5, 0.25, 0.125]]))
-        gradient = coarse.at(scale).colour_gradient(coarse_pixels(view, scale), view)
+        gradient = coarse.at(scale).color_gradient(coarse_pixels(view, scale), view)
         assert not coarse.at(scale).coverage(view).any()
         assert gradient.shape == (len(scene), 3)
         assert not gradient.any()
@@ -164,9 +164,9 @@ def test_background_fills_what_is_not_covered() -> None:
     left = 1 - cpu.coverage(view)
     assert 0 < float(left.min()) < float(left.max()) == 1
     for scale in SCALES:
-        expected = CoarseRasterizer(black, scale).render(colours_of(scene), view)
+        expected = CoarseRasterizer(black, scale).render(colors_of(scene), view)
         expected = expected + downscale(left, scale)[..., None] * torch.tensor(BACKGROUND)
-        assert torch.allclose(CoarseRasterizer(cpu, scale).render(colours_of(scene), view), expected, atol=1e-6)
+        assert torch.allclose(CoarseRasterizer(cpu, scale).render(colors_of(scene), view), expected, atol=1e-6)
 
 
 def test_many_gaussians_in_a_pixel_lose_no_digits() -> None:
@@ -179,15 +179,15 @@ def test_many_gaussians_in_a_pixel_lose_no_digits() -> None:
         scales=torch.full((count, 3), -9.0),
         opacities=torch.full((count,), math.log(0.008 / 0.992)),
     )
-    colours, cpu = 1 + colours_of(scene), CpuRasterizer(scene)
-    expected = downscale(cpu.render(colours, view).double(), 4)
-    assert relative_error(CoarseRasterizer(cpu, 4).render(colours, view), expected) < 2e-7
+    colors, cpu = 1 + colors_of(scene), CpuRasterizer(scene)
+    expected = downscale(cpu.render(colors, view).double(), 4)
+    assert relative_error(CoarseRasterizer(cpu, 4).render(colors, view), expected) < 2e-7
 
 
 def test_what_does_not_fit_the_budget_is_recomputed() -> None:
     scene = cloud(800, seed=20)
     views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
-    colours, cpu = colours_of(scene), CpuRasterizer(scene, background=BACKGROUND)
+    colors, cpu = colors_of(scene), CpuRasterizer(scene, background=BACKGROUND)
     for scale in SCALES:
         pixels = coarse_pixels(views[0], scale)
         sizes = [CoarseRasterizer(cpu, scale).operator_bytes(view) for view in views]
@@ -195,11 +195,11 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
         coarse = CoarseRasterizer(cpu, scale, max_bytes=budget)
         for _ in range(2):
             for view in views:
-                image = downscale(cpu.render(colours, view), scale)
-                gradient = cpu.colour_gradient(upscaled(pixels, view, scale), view)
+                image = downscale(cpu.render(colors, view), scale)
+                gradient = cpu.color_gradient(upscaled(pixels, view, scale), view)
                 for one in (coarse, whole):
-                    assert torch.allclose(one.render(colours, view), image, atol=1e-6)
-                    assert relative_error(one.colour_gradient(pixels, view), gradient) < 1e-6
+                    assert torch.allclose(one.render(colors, view), image, atol=1e-6)
+                    assert relative_error(one.color_gradient(pixels, view), gradient) < 1e-6
         assert [coarse.is_kept(view) for view in views] == [True, True, False]
         assert coarse.kept_bytes == budget
         assert sum(o.nbytes for o in coarse._operators.kept.values() if o is not None) == budget
@@ -220,7 +220,7 @@ def test_operators_are_far_smaller_than_the_weights_at_full_size() -> None:
 def test_an_operator_belongs_to_a_camera_and_a_scale() -> None:
     scene, view = cloud(seed=14), camera()
     coarse = CoarseRasterizer(CpuRasterizer(scene), 2)
-    coarse.render(colours_of(scene), view)
+    coarse.render(colors_of(scene), view)
     assert coarse.is_kept(replace(view, name="another name"))
     assert not coarse.at(1).is_kept(view)
     assert not coarse.is_kept(replace(view, fx=view.fx * 1.01))
@@ -228,10 +228,10 @@ def test_an_operator_belongs_to_a_camera_and_a_scale() -> None:
 
 def test_scales_share_one_budget() -> None:
     scene, view = cloud(seed=14), camera()
-    cpu, colours = CpuRasterizer(scene), colours_of(scene)
+    cpu, colors = CpuRasterizer(scene), colors_of(scene)
     coarse = CoarseRasterizer(cpu, 2, max_bytes=CoarseRasterizer(cpu, 2).operator_bytes(view))
-    coarse.render(colours, view)
-    coarse.at(3).render(colours, view)
+    coarse.render(colors, view)
+    coarse.at(3).render(colors, view)
     assert coarse.at(2).is_kept(view)
     assert not coarse.at(3).is_kept(view)
 
@@ -241,13 +241,13 @@ def test_scales_share_one_budget() -> None:
 def test_bands_put_together_are_the_whole_view(scale: int, max_bytes: int | None) -> None:
     scene, view = cloud(seed=16), camera(107, 141)
     coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND), scale, max_bytes)
-    colours, pixels = colours_of(scene), coarse_pixels(view, scale)
+    colors, pixels = colors_of(scene), coarse_pixels(view, scale)
     height = view.height >> scale
     bands = [(0, 1), (1, height // 2), (height // 2, height)]
-    for method in (coarse.coverage, lambda *where: coarse.render(colours, *where)):
+    for method in (coarse.coverage, lambda *where: coarse.render(colors, *where)):
         assert torch.equal(torch.cat([method(view, band) for band in bands]), method(view))  # type: ignore[operator]
-    parts = [coarse.colour_gradient(pixels[slice(*band)], view, band) for band in bands]
-    assert relative_error(sum(parts), coarse.colour_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
+    parts = [coarse.color_gradient(pixels[slice(*band)], view, band) for band in bands]
+    assert relative_error(sum(parts), coarse.color_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
     assert torch.allclose(coarse.coverage(view), downscale(CpuRasterizer(scene).coverage(view), scale), atol=1e-6)
     coverage, weights = coarse.survey(view)
     assert torch.equal(coverage, coarse.coverage(view))
@@ -256,15 +256,15 @@ def test_bands_put_together_are_the_whole_view(scale: int, max_bytes: int | None
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     scene, view = cloud(2000, seed=13), camera(203, 125)
-    colours, before = colours_of(scene), torch.get_num_threads()
+    colors, before = colors_of(scene), torch.get_num_threads()
     results = []
     try:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
             coarse = CoarseRasterizer(CpuRasterizer(scene, background=BACKGROUND))
             for scale in SCALES:
-                image = coarse.at(scale).render(colours, view)
-                results.append((image, coarse.at(scale).colour_gradient(coarse_pixels(view, scale), view)))
+                image = coarse.at(scale).render(colors, view)
+                results.append((image, coarse.at(scale).color_gradient(coarse_pixels(view, scale), view)))
     finally:
         torch.set_num_threads(before)
     once, count = results[: len(SCALES)], len(SCALES)
@@ -275,13 +275,13 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 def test_python_threads_can_share_a_rasterizer() -> None:
     scene, view = cloud(500, seed=14), camera()
-    colours, pixels = colours_of(scene), coarse_pixels(view, 2)
+    colors, pixels = colors_of(scene), coarse_pixels(view, 2)
     alone = CoarseRasterizer(CpuRasterizer(scene), 2)
-    image, gradient = alone.render(colours, view), alone.colour_gradient(pixels, view)
+    image, gradient = alone.render(colors, view), alone.color_gradient(pixels, view)
     shared = CoarseRasterizer(CpuRasterizer(scene), 2)
     with ThreadPoolExecutor(4) as pool:
-        images = [pool.submit(shared.render, colours, view) for _ in range(8)]
-        gradients = [pool.submit(shared.colour_gradient, pixels, view) for _ in range(8)]
+        images = [pool.submit(shared.render, colors, view) for _ in range(8)]
+        gradients = [pool.submit(shared.color_gradient, pixels, view) for _ in range(8)]
     assert all(torch.equal(f.result(), image) for f in images)
     assert all(torch.equal(f.result(), gradient) for f in gradients)
     assert shared.kept_bytes == alone.kept_bytes

@@ -32,12 +32,12 @@ from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
-from sgsst_core.scene.spherical_harmonics import rest_colours, view_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,
-    colours_of,
+    colors_of,
     empty_scene,
     pixels_like,
     single,
@@ -105,19 +105,19 @@ def assert_agree(
 ) -> int:
     """Images within 1e-4, gradients within 1e-5, but where a cut-off flips; returns how many pixels flipped at most."""
     rows = (0, view.height) if rows is None else rows
-    colours, pixels = colours_of(scene), pixels_like(view)[rows[0] : rows[1]]
+    colors, pixels = colors_of(scene), pixels_like(view)[rows[0] : rows[1]]
     reference = ReferenceRasterizer(scene, background=background)
     band = reference.near_cutoff(view, CLOSE, rows)
     pixels[band] = 0
-    image, coverage = reference.render(colours, view, rows), reference.coverage(view, rows)
-    expected = reference.colour_gradient(pixels, view, rows)
+    image, coverage = reference.render(colors, view, rows), reference.coverage(view, rows)
+    expected = reference.color_gradient(pixels, view, rows)
     flipped = 0
     for name in names:
         fast = make_rasterizer(name, scene, background=background)
-        flips = assert_close_outside_band(fast.render(colours, view, rows), image, band, tolerance=1e-4)
+        flips = assert_close_outside_band(fast.render(colors, view, rows), image, band, tolerance=1e-4)
         flipped = max(flipped, flips)
         assert_close_outside_band(fast.coverage(view, rows), coverage, band, tolerance=1e-4)
-        actual = fast.colour_gradient(pixels, view, rows)
+        actual = fast.color_gradient(pixels, view, rows)
         assert actual.dtype == torch.float32
         assert relative_error(actual, expected) < 1e-5
         assert float((actual - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
@@ -126,7 +126,7 @@ def assert_agree(
 
 def test_reference_agrees_with_a_loop_over_pixels() -> None:
     scene, view = cloud(80, seed=10, log_scale=-1.5), camera(19, 17, focal=15.0)
-    colours, background = colours_of(scene).double(), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    colors, background = colors_of(scene).double(), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     splats = splat(scene, view)
     image = torch.empty(view.height, view.width, 3, dtype=torch.float64)
     for y in range(view.height):
@@ -143,10 +143,10 @@ def test_reference_agrees_with_a_loop_over_pixels() -> None:
                     continue
                 if left * (1 - alpha) <= TRANSMITTANCE_MIN:
                     break
-                total += left * alpha * colours[gaussian]
+                total += left * alpha * colors[gaussian]
                 left *= 1 - alpha
             image[y, x] = total + left * background
-    rendered = ReferenceRasterizer(scene, background=tuple(background.tolist())).render(colours, view)
+    rendered = ReferenceRasterizer(scene, background=tuple(background.tolist())).render(colors, view)
     assert torch.allclose(rendered, image, atol=1e-12)
 
 
@@ -154,17 +154,17 @@ def test_reference_agrees_with_a_loop_over_pixels() -> None:
 def test_gradient_is_the_transpose_and_agrees_with_differences(name: str) -> None:
     scene, view = cloud(seed=11), camera()
     rasterizer = make_rasterizer(name, scene, background=(0.3, 0.6, 0.9))
-    colours, pixels = colours_of(scene).double(), pixels_like(view).double()
-    black = rasterizer.render(torch.zeros_like(colours), view).double()
-    gradient = rasterizer.colour_gradient(pixels, view).double()
-    assert float((gradient * colours).sum()) == pytest.approx(
-        float(((rasterizer.render(colours, view).double() - black) * pixels).sum()), rel=1e-5, abs=1e-4
+    colors, pixels = colors_of(scene).double(), pixels_like(view).double()
+    black = rasterizer.render(torch.zeros_like(colors), view).double()
+    gradient = rasterizer.color_gradient(pixels, view).double()
+    assert float((gradient * colors).sum()) == pytest.approx(
+        float(((rasterizer.render(colors, view).double() - black) * pixels).sum()), rel=1e-5, abs=1e-4
     )
-    # The image is linear in the colours, so a difference over a step of 1 is exact but for rounding.
+    # The image is linear in the colors, so a difference over a step of 1 is exact but for rounding.
     for gaussian in gradient.abs().sum(1).topk(5).indices.tolist():
-        changed = colours.clone()
+        changed = colors.clone()
         changed[gaussian, 1] += 1
-        difference = rasterizer.render(changed, view).double() - rasterizer.render(colours, view).double()
+        difference = rasterizer.render(changed, view).double() - rasterizer.render(colors, view).double()
         assert float((difference * pixels).sum()) == pytest.approx(float(gradient[gaussian, 1]), rel=2e-4, abs=2e-4)
 
 
@@ -172,35 +172,35 @@ def test_gradient_is_the_transpose_and_agrees_with_differences(name: str) -> Non
 @pytest.mark.parametrize("cuts", [(0, 7, 45), (0, 16, 32, 45), (0, 1, 44, 45)])
 def test_bands_put_together_are_the_whole(name: str, cuts: tuple[int, ...]) -> None:
     scene, view = cloud(seed=12), camera()
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     bands = list(pairwise(cuts))
     whole, parts = (make_rasterizer(name, scene, background=(1, 1, 1)) for _ in range(2))
-    image = torch.cat([parts.render(colours, view, band) for band in bands])
+    image = torch.cat([parts.render(colors, view, band) for band in bands])
     coverage = torch.cat([parts.coverage(view, band) for band in bands])
-    gradient = torch.stack([parts.colour_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
+    gradient = torch.stack([parts.color_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
     if name == "reference":
-        assert torch.allclose(image, whole.render(colours, view), atol=1e-14)
+        assert torch.allclose(image, whole.render(colors, view), atol=1e-14)
     else:
-        assert torch.equal(image, whole.render(colours, view))
+        assert torch.equal(image, whole.render(colors, view))
         assert torch.equal(coverage, whole.coverage(view))
-    assert relative_error(gradient, whole.colour_gradient(pixels, view)) < 1e-6
+    assert relative_error(gradient, whole.color_gradient(pixels, view)) < 1e-6
     # and bands that the whole view's operator serves are the same
-    of_band = [rasterizer.colour_gradient(pixels[5:20], view, (5, 20)) for rasterizer in (whole, parts)]
+    of_band = [rasterizer.color_gradient(pixels[5:20], view, (5, 20)) for rasterizer in (whole, parts)]
     assert relative_error(*of_band) < 1e-6
-    assert torch.allclose(whole.render(colours, view, (5, 20)), image[5:20], atol=1e-14)
+    assert torch.allclose(whole.render(colors, view, (5, 20)), image[5:20], atol=1e-14)
 
 
 @pytest.mark.parametrize("name", FAST)
 def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     scene, view = cloud(2000, seed=13), camera(200, 120)
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     before = torch.get_num_threads()
     results = []
     try:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
             rasterizer = make_rasterizer(name, scene)
-            image, gradient = rasterizer.render(colours, view), rasterizer.colour_gradient(pixels, view)
+            image, gradient = rasterizer.render(colors, view), rasterizer.color_gradient(pixels, view)
             results.append((image, gradient, *rasterizer.survey(view)))
     finally:
         torch.set_num_threads(before)
@@ -210,12 +210,12 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
 @pytest.mark.parametrize("name", FAST)
 def test_python_threads_can_share_a_rasterizer(name: str) -> None:
     scene, view = cloud(500, seed=14), camera()
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     rasterizer = make_rasterizer(name, scene)
-    image, gradient = rasterizer.render(colours, view), rasterizer.colour_gradient(pixels, view)
+    image, gradient = rasterizer.render(colors, view), rasterizer.color_gradient(pixels, view)
     with ThreadPoolExecutor(4) as pool:
-        images = [pool.submit(rasterizer.render, colours, view) for _ in range(8)]
-        gradients = [pool.submit(rasterizer.colour_gradient, pixels, view) for _ in range(8)]
+        images = [pool.submit(rasterizer.render, colors, view) for _ in range(8)]
+        gradients = [pool.submit(rasterizer.color_gradient, pixels, view) for _ in range(8)]
     assert all(torch.equal(f.result(), image) for f in images)
     assert all(torch.equal(f.result(), gradient) for f in gradients)
 
@@ -223,15 +223,15 @@ def test_python_threads_can_share_a_rasterizer(name: str) -> None:
 @pytest.mark.parametrize("background", [BLACK, (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)])
 def test_background_fills_what_is_not_covered(background: tuple[float, float, float]) -> None:
     scene, view = cloud(100, seed=15), camera()
-    colours, filling = colours_of(scene), torch.tensor(background)
+    colors, filling = colors_of(scene), torch.tensor(background)
     for name in FAST:
         over = make_rasterizer(name, scene, background=background)
         coverage = over.coverage(view)
-        expected = make_rasterizer(name, scene).render(colours, view) + (1 - coverage)[..., None] * filling
-        assert torch.allclose(over.render(colours, view), expected, atol=1e-6)
+        expected = make_rasterizer(name, scene).render(colors, view) + (1 - coverage)[..., None] * filling
+        assert torch.allclose(over.render(colors, view), expected, atol=1e-6)
         assert 0 < float(coverage.max()) < 1
         assert float(coverage.min()) == 0
-        assert torch.equal(over.render(colours, view)[coverage == 0].unique(dim=0), filling[None])
+        assert torch.equal(over.render(colors, view)[coverage == 0].unique(dim=0), filling[None])
 
 
 @pytest.mark.parametrize("name", ["reference", *FAST])
@@ -242,12 +242,12 @@ def test_background_fills_what_is_not_covered(background: tuple[float, float, fl
 )
 def test_a_view_without_gaussians_is_background(name: str, scene: Scene) -> None:
     view, rasterizer = camera(), make_rasterizer(name, scene, background=(0.5, 0.25, 0.125))
-    image = rasterizer.render(colours_of(scene), view)
+    image = rasterizer.render(colors_of(scene), view)
     assert image[..., 0].eq(0.5).all()
     assert image[..., 2].eq(0.125).all()
     assert not rasterizer.coverage(view).any()
     assert not any(found.any() for found in rasterizer.survey(view))
-    gradient = rasterizer.colour_gradient(pixels_like(view), view)
+    gradient = rasterizer.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()
 
@@ -255,8 +255,8 @@ def test_a_view_without_gaussians_is_background(name: str, scene: Scene) -> None
 @pytest.mark.parametrize("name", ["reference", *FAST])
 def test_equal_depths_blend_in_the_order_of_the_file(name: str) -> None:
     scene = together([((0, 0, 4.0), 0.6, (0.5,) * 3, (1, 0, 0, 0))] * 2)
-    colours = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])
-    image = make_rasterizer(name, scene).render(colours, camera())
+    colors = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])
+    image = make_rasterizer(name, scene).render(colors, camera())
     assert bool((image[..., 0] >= image[..., 1]).all())
     assert float(image[..., 0].max()) == pytest.approx(0.6, abs=0.02)
     assert float(image[..., 1].max()) == pytest.approx(0.24, abs=0.02)
@@ -272,11 +272,11 @@ def test_a_gaussian_that_would_end_a_pixel_is_not_blended(name: str) -> None:
     assert float((make_rasterizer(name, scene).coverage(camera(20, 20)) - 0.99).abs().max()) < 1e-6
 
 
-def test_a_far_off_centre_keeps_its_digits() -> None:
+def test_a_far_off_center_keeps_its_digits() -> None:
     """A Gaussian of a billion pixels whose edge crosses the view: float32 offsets would be off by tens of pixels."""
     scene = single((-4e6, 0, 4.0), scales=(2e6, 1e-3, 1e-3), opacity=0.9)
     view = camera(64, 16, focal=1e3)
-    # the perspective is linearised at the frustum's edge, so what matters is agreement, not the picture
+    # the perspective is linearized at the frustum's edge, so what matters is agreement, not the picture
     assert_agree(FAST, scene, view, BLACK)
     assert float(CpuRasterizer(scene).coverage(view).max()) > 0
 
@@ -288,42 +288,42 @@ def test_far_off_worlds_render_alike() -> None:
     pose = view.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ offset
     moved, elsewhere = replace(scene, means=scene.means + offset.float()), replace(view, world_to_camera=pose)
-    image = CpuRasterizer(scene).render(colours_of(scene), view)
+    image = CpuRasterizer(scene).render(colors_of(scene), view)
     band = ReferenceRasterizer(scene).near_cutoff(view, 1e-4)
-    assert_close_outside_band(CpuRasterizer(moved).render(colours_of(scene), elsewhere), image, band, tolerance=1e-4)
+    assert_close_outside_band(CpuRasterizer(moved).render(colors_of(scene), elsewhere), image, band, tolerance=1e-4)
 
 
 def test_another_clamp_is_followed_everywhere() -> None:
     scene, view = replace(cloud(seed=17), opacities=torch.full((400,), 9.0)), camera()
-    colours = colours_of(scene)
+    colors = colors_of(scene)
     reference = ReferenceRasterizer(scene, alpha_max=0.999)
     band = reference.near_cutoff(view, CLOSE)
     for rasterizer in (CpuRasterizer(scene, alpha_max=0.999), CachedRasterizer(scene, alpha_max=0.999)):
-        image = rasterizer.render(colours, view)
-        assert_close_outside_band(image, reference.render(colours, view), band, tolerance=1e-4)
-        assert float((image - CpuRasterizer(scene).render(colours, view)).abs().max()) > 1e-3
+        image = rasterizer.render(colors, view)
+        assert_close_outside_band(image, reference.render(colors, view), band, tolerance=1e-4)
+        assert float((image - CpuRasterizer(scene).render(colors, view)).abs().max()) > 1e-3
 
 
 def test_kept_weights_equal_recomputed_ones() -> None:
     scene, view = cloud(1500, seed=18), camera(130, 70)
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     cpu, kept = CpuRasterizer(scene), CachedRasterizer(scene)
     assert not kept.is_kept(view)
-    assert torch.equal(kept.render(colours, view), cpu.render(colours, view))
+    assert torch.equal(kept.render(colors, view), cpu.render(colors, view))
     assert torch.equal(kept.coverage(view), cpu.coverage(view))
-    assert relative_error(kept.colour_gradient(pixels, view), cpu.colour_gradient(pixels, view)) < 1e-6
+    assert relative_error(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
     assert kept.is_kept(view)
     assert kept.is_kept(replace(view, name="another name"))
 
 
 def test_half_precision_weights_are_rounded_to_float16() -> None:
     scene, view = cloud(1500, seed=19), camera(130, 70)
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     full, half = CachedRasterizer(scene), CachedRasterizer(scene, precision="half")
-    image = full.render(colours, view)
+    image = full.render(colors, view)
     # each weight has a relative error of at most 2^-11, and all are positive
-    assert bool(((half.render(colours, view) - image).abs() <= 2**-11 * image + 1e-6).all())
-    assert relative_error(half.colour_gradient(pixels, view), full.colour_gradient(pixels, view)) < 5e-4
+    assert bool(((half.render(colors, view) - image).abs() <= 2**-11 * image + 1e-6).all())
+    assert relative_error(half.color_gradient(pixels, view), full.color_gradient(pixels, view)) < 5e-4
     assert half.kept_bytes < 0.65 * full.kept_bytes
     (one,), (two,) = full._kept.values(), half._kept.values()
     assert one is not None
@@ -336,14 +336,14 @@ def test_half_precision_weights_are_rounded_to_float16() -> None:
 def test_what_does_not_fit_the_budget_is_recomputed() -> None:
     scene = cloud(800, seed=20)
     views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
-    colours, pixels = colours_of(scene), pixels_like(views[0])
+    colors, pixels = colors_of(scene), pixels_like(views[0])
     sizes = [CachedRasterizer(scene).operator_bytes(view) for view in views]
     budget = sizes[0] + sizes[1]
     kept, cpu = CachedRasterizer(scene, max_bytes=budget), CpuRasterizer(scene)
     for _ in range(2):
         for view in views:
-            assert torch.equal(kept.render(colours, view), cpu.render(colours, view))
-            assert relative_error(kept.colour_gradient(pixels, view), cpu.colour_gradient(pixels, view)) < 1e-6
+            assert torch.equal(kept.render(colors, view), cpu.render(colors, view))
+            assert relative_error(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
     assert [kept.is_kept(view) for view in views] == [True, True, False]
     assert kept.kept_bytes == budget
     weights = [k.weights for k in kept._kept.values() if k is not None]
@@ -365,7 +365,7 @@ def test_lists_beyond_the_budget_are_held_one_at_a_time() -> None:
 def test_weights_and_lists_share_a_budget() -> None:
     scene = cloud(800, seed=20)
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
-    colours = colours_of(scene)
+    colors = colors_of(scene)
     weights = [CachedRasterizer(scene).operator_bytes(view) for view in views]
     lists = [CpuRasterizer(scene).lists(view).nbytes for view in views]
     cpu = CpuRasterizer(scene, max_list_bytes=sum(weights[:2]) + lists[2])
@@ -373,7 +373,7 @@ def test_weights_and_lists_share_a_budget() -> None:
     for view in views:
         cpu.lists(view)
     for view in views:
-        kept.render(colours, view)
+        kept.render(colors, view)
     assert [kept.is_kept(view) for view in views] == [True, True, False, False]
     assert [cpu.has_lists(view) for view in views] == [False, False, True, False]
     assert kept.kept_bytes + cpu._lists.kept_bytes <= sum(weights[:2]) + lists[2]
@@ -385,11 +385,11 @@ def test_arguments_are_checked_before_any_work() -> None:
         rasterizer = make_rasterizer(name, scene)
         for rows in ((0, 0), (5, 3), (-1, 4), (0, view.height + 1)):
             with pytest.raises(ValueError, match="band of view 'test' lies within 0 to 45"):
-                rasterizer.render(colours_of(scene), view, rows)
-        with pytest.raises(ValueError, match="colours of shape"):
+                rasterizer.render(colors_of(scene), view, rows)
+        with pytest.raises(ValueError, match="colors of shape"):
             rasterizer.render(torch.zeros(9, 3), view)
         with pytest.raises(ValueError, match="image gradient of shape"):
-            rasterizer.colour_gradient(torch.zeros(45, 70, 3), view, (0, 10))
+            rasterizer.color_gradient(torch.zeros(45, 70, 3), view, (0, 10))
 
 
 def test_unknown_rasterizers_and_devices_are_refused() -> None:
@@ -456,8 +456,8 @@ def test_a_real_scene_looks_like_its_photo(shared_data: Path) -> None:
     """Spherical harmonics, projection, order and blending together: 28 dB on average was measured after training."""
     scene = read_scene(shared_data / "scenes" / "snowmiku_plush" / "point_cloud.ply").scene
     view = read_cameras(shared_data / "scenes" / "snowmiku_plush" / "cameras.json")[0]
-    colours = view_colours(scene.sh_dc, rest_colours(scene.sh_rest, scene.means, view))
-    image = CpuRasterizer(scene).render(colours, view).clamp(0, 1)
+    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, view))
+    image = CpuRasterizer(scene).render(colors, view).clamp(0, 1)
     photo: Tensor = load_image(shared_data / "photos" / "snowmiku_plush" / "images" / f"{view.name}.jpg")
     assert photo.shape == image.shape
     psnr = -10 * math.log10(float((photo - image).square().mean()))

@@ -13,7 +13,7 @@ from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, pixels_like, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, pixels_like, turned_pose
 
 HAS_GSPLAT = importlib.util.find_spec("gsplat") is not None
 HAS_GPU = torch.cuda.is_available()
@@ -40,14 +40,14 @@ def test_cuda_agrees_with_the_reference(seed: int) -> None:
     cuda = CudaRasterizer(scene, background=background)
     reference = ReferenceRasterizer(scene, background=background, alpha_max=cuda.alpha_max)
     band = reference.near_cutoff(view, CLOSE)
-    colours, pixels = colours_of(scene), pixels_like(view)
-    image = cuda.render(colours, view).cpu()
-    assert_close_outside_band(image, reference.render(colours, view), band, tolerance=1e-4, largest_share=1e-2)
+    colors, pixels = colors_of(scene), pixels_like(view)
+    image = cuda.render(colors, view).cpu()
+    assert_close_outside_band(image, reference.render(colors, view), band, tolerance=1e-4, largest_share=1e-2)
     assert_close_outside_band(
         cuda.coverage(view).cpu(), reference.coverage(view), band, tolerance=1e-4, largest_share=1e-2
     )
     pixels[band] = 0
-    assert relative_error(cuda.colour_gradient(pixels, view).cpu(), reference.colour_gradient(pixels, view)) < 1e-4
+    assert relative_error(cuda.color_gradient(pixels, view).cpu(), reference.color_gradient(pixels, view)) < 1e-4
 
 
 @pytest.mark.gpu
@@ -55,13 +55,13 @@ def test_cuda_agrees_with_the_reference(seed: int) -> None:
 @needs_gsplat
 def test_bands_put_together_are_the_whole() -> None:
     scene, view = cloud(800, seed=3, log_scale=-1.0), camera(130, 75)
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     cuda = CudaRasterizer(scene)
     bands = [(0, 21), (21, 64), (64, 75)]
-    parts = torch.cat([cuda.render(colours, view, band) for band in bands])
-    assert torch.allclose(parts, cuda.render(colours, view), atol=1e-5)
-    gradient = torch.stack([cuda.colour_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
-    assert relative_error(gradient, cuda.colour_gradient(pixels, view)) < 1e-4
+    parts = torch.cat([cuda.render(colors, view, band) for band in bands])
+    assert torch.allclose(parts, cuda.render(colors, view), atol=1e-5)
+    gradient = torch.stack([cuda.color_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
+    assert relative_error(gradient, cuda.color_gradient(pixels, view)) < 1e-4
 
 
 @pytest.mark.skipif(HAS_GSPLAT, reason="gsplat is installed")

@@ -30,7 +30,7 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, turned_pose
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -90,13 +90,13 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera], one_thread: None)
     scene, view = case
     reference, fast = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
     band = reference.near_cutoff(view, CLOSE)
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     pixels[band] = 0
-    image, coverage = fast.render(colours, view).cpu(), fast.coverage(view).cpu()
-    assert_close_outside_band(image, reference.render(colours, view), band, tolerance=1e-5)
+    image, coverage = fast.render(colors, view).cpu(), fast.coverage(view).cpu()
+    assert_close_outside_band(image, reference.render(colors, view), band, tolerance=1e-5)
     assert_close_outside_band(coverage, reference.coverage(view), band, tolerance=1e-5)
-    gradient = fast.colour_gradient(pixels, view).cpu()
-    assert relative_error(gradient, reference.colour_gradient(pixels, view)) < 5e-6
+    gradient = fast.color_gradient(pixels, view).cpu()
+    assert relative_error(gradient, reference.color_gradient(pixels, view)) < 5e-6
 
 
 def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera], one_thread: None) -> None:
@@ -128,31 +128,31 @@ def test_lists_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
 
 def test_bands_put_together_are_the_same_bits() -> None:
     scene, view = cloud(120, seed=14), camera(40, 45)
-    rasterizer, colours, pixels = on_device(scene), colours_of(scene), pixels_like(view)
-    whole, bands = rasterizer.render(colours, view), [(0, 16), (16, 21), (21, 45)]
-    assert torch.equal(torch.cat([rasterizer.render(colours, view, rows) for rows in bands]), whole)
-    parts = [rasterizer.colour_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
-    assert relative_error(sum(parts), rasterizer.colour_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
+    rasterizer, colors, pixels = on_device(scene), colors_of(scene), pixels_like(view)
+    whole, bands = rasterizer.render(colors, view), [(0, 16), (16, 21), (21, 45)]
+    assert torch.equal(torch.cat([rasterizer.render(colors, view, rows) for rows in bands]), whole)
+    parts = [rasterizer.color_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
+    assert relative_error(sum(parts), rasterizer.color_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
 
 
 def test_gradient_is_the_transpose_and_repeats_to_the_bit() -> None:
     scene, view = cloud(120, seed=15), camera(40, 33)
-    rasterizer, colours, pixels = on_device(scene), colours_of(scene), pixels_like(view)
-    gradient = rasterizer.colour_gradient(pixels, view)
-    black = rasterizer.render(torch.zeros_like(colours), view).cpu().double()
-    image = rasterizer.render(colours, view).cpu().double() - black
-    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colours).sum()), rel=1e-5)
-    again = on_device(scene).colour_gradient(pixels, view)
+    rasterizer, colors, pixels = on_device(scene), colors_of(scene), pixels_like(view)
+    gradient = rasterizer.color_gradient(pixels, view)
+    black = rasterizer.render(torch.zeros_like(colors), view).cpu().double()
+    image = rasterizer.render(colors, view).cpu().double() - black
+    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colors).sum()), rel=1e-5)
+    again = on_device(scene).color_gradient(pixels, view)
     assert torch.equal(gradient, again)
 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
 def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
     rasterizer, view = on_device(scene), camera(20, 18)
-    assert torch.equal(rasterizer.render(colours_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert torch.equal(rasterizer.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not rasterizer.coverage(view).any()
     assert not any(found.any() for found in rasterizer.survey(view))
-    gradient = rasterizer.colour_gradient(pixels_like(view), view)
+    gradient = rasterizer.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()
 
@@ -163,8 +163,8 @@ def test_invalid_gaussians_are_left_out_as_by_the_reference() -> None:
     quats[3] = 0
     scales[5] = 800.0
     broken, view = replace(scene, quats=quats, scales=scales), camera(33, 20)
-    expected = ReferenceRasterizer(broken, background=BACKGROUND).render(colours_of(scene), view)
-    assert float((on_device(broken).render(colours_of(scene), view).cpu() - expected).abs().max()) < 1e-5
+    expected = ReferenceRasterizer(broken, background=BACKGROUND).render(colors_of(scene), view)
+    assert float((on_device(broken).render(colors_of(scene), view).cpu() - expected).abs().max()) < 1e-5
 
 
 def test_lists_beyond_the_budget_are_held_for_the_last_view_only() -> None:

@@ -27,7 +27,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colours_of, empty_scene, pixels_like, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, turned_pose
 from tests.small_scenes import ball, cameras, style
 
 pytest.importorskip("triton")
@@ -69,15 +69,15 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
     scene, view = case
     reference, anew = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
     band = reference.near_cutoff(view, CLOSE)
-    colours, pixels = colours_of(scene), pixels_like(view)
+    colors, pixels = colors_of(scene), pixels_like(view)
     pixels[band] = 0
-    image, coverage = reference.render(colours, view), reference.coverage(view)
-    gradient = reference.colour_gradient(pixels, view)
+    image, coverage = reference.render(colors, view), reference.coverage(view)
+    gradient = reference.color_gradient(pixels, view)
     for precision, error in ERRORS.items():
         kept = CachedRasterizer(scene, precision=precision, anew=anew)
-        assert_close_outside_band(kept.render(colours, view).cpu(), image, band, tolerance=2 * error + 1e-5)
+        assert_close_outside_band(kept.render(colors, view).cpu(), image, band, tolerance=2 * error + 1e-5)
         assert_close_outside_band(kept.coverage(view).cpu(), coverage, band, tolerance=1e-5)
-        assert relative_error(kept.colour_gradient(pixels, view).cpu(), gradient) < error + 5e-6
+        assert relative_error(kept.color_gradient(pixels, view).cpu(), gradient) < error + 5e-6
         assert kept.is_kept(view)
 
 
@@ -97,39 +97,39 @@ def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
 @pytest.mark.parametrize("precision", ERRORS)
 def test_gradient_is_the_transpose_and_repeats_to_the_bit(precision: Precision) -> None:
     scene, view = cloud(120, seed=15), camera(33, 20)
-    kept, colours, pixels = kept_on_device(scene, precision=precision), colours_of(scene), pixels_like(view)
-    gradient = kept.colour_gradient(pixels, view)
-    black = kept.render(torch.zeros_like(colours), view).cpu().double()
-    image = kept.render(colours, view).cpu().double() - black
-    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colours).sum()), rel=1e-5)
-    assert torch.equal(kept.colour_gradient(pixels, view), gradient)
-    assert torch.equal(kept_on_device(scene, precision=precision).colour_gradient(pixels, view), gradient)
+    kept, colors, pixels = kept_on_device(scene, precision=precision), colors_of(scene), pixels_like(view)
+    gradient = kept.color_gradient(pixels, view)
+    black = kept.render(torch.zeros_like(colors), view).cpu().double()
+    image = kept.render(colors, view).cpu().double() - black
+    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colors).sum()), rel=1e-5)
+    assert torch.equal(kept.color_gradient(pixels, view), gradient)
+    assert torch.equal(kept_on_device(scene, precision=precision).color_gradient(pixels, view), gradient)
 
 
 def test_bands_put_together_are_the_whole() -> None:
     scene, view = cloud(100, seed=14), camera(20, 35)
-    colours, pixels, anew = colours_of(scene), pixels_like(view), on_device(scene)
+    colors, pixels, anew = colors_of(scene), pixels_like(view), on_device(scene)
     whole, parts = (CachedRasterizer(scene, anew=anew) for _ in range(2))
     bands = [(0, 16), (16, 21), (21, 35)]
-    image, gradient = whole.render(colours, view), whole.colour_gradient(pixels, view)
+    image, gradient = whole.render(colors, view), whole.color_gradient(pixels, view)
     # A block that a band cuts may have fewer pieces, which are then added up in other groups.
-    together = torch.cat([parts.render(colours, view, rows) for rows in bands])
+    together = torch.cat([parts.render(colors, view, rows) for rows in bands])
     assert float((together - image).abs().max()) < 1e-6
     assert torch.equal(together[:16], image[:16])
     assert torch.equal(torch.cat([parts.coverage(view, rows) for rows in bands]), whole.coverage(view))
-    own = [parts.colour_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
+    own = [parts.color_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
     assert relative_error(torch.stack(own).sum(0), gradient) < 1e-6
     # and a band that the whole view's weights serve is the same
-    assert torch.equal(whole.render(colours, view, (16, 21)), image[16:21])
-    assert relative_error(whole.colour_gradient(pixels[16:21], view, (16, 21)), own[1]) < 1e-6
+    assert torch.equal(whole.render(colors, view, (16, 21)), image[16:21])
+    assert relative_error(whole.color_gradient(pixels[16:21], view, (16, 21)), own[1]) < 1e-6
 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
 def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
     kept, view = kept_on_device(scene), camera(20, 18)
-    assert torch.equal(kept.render(colours_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert torch.equal(kept.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not kept.coverage(view).any()
-    gradient = kept.colour_gradient(pixels_like(view), view)
+    gradient = kept.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()
     assert kept.kept_bytes == kept.operator_bytes(view)
@@ -138,7 +138,7 @@ def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
 def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() -> None:
     scene = cloud(100, seed=20)
     views = [camera(20, 17), camera(20, 17, pose=turned_pose(0.1)), camera(17, 20, pose=turned_pose(0.2))]
-    colours, pixels, anew = colours_of(scene), pixels_like(views[0]), on_device(scene)
+    colors, pixels, anew = colors_of(scene), pixels_like(views[0]), on_device(scene)
     for precision in ERRORS:
         sizes = [CachedRasterizer(scene, precision=precision, anew=anew).operator_bytes(view) for view in views[:2]]
         budget = sum(sizes)
@@ -147,13 +147,13 @@ def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() 
             kept.coverage(view)
         assert [kept.is_kept(view) for view in views] == [True, True, False]
         assert kept.kept_bytes == budget
-    assert torch.equal(kept.render(colours, views[2]), anew.render(colours, views[2]))
-    gradient = kept.colour_gradient(pixels_like(views[2]), views[2])
-    assert torch.equal(gradient, anew.colour_gradient(pixels_like(views[2]), views[2]))
+    assert torch.equal(kept.render(colors, views[2]), anew.render(colors, views[2]))
+    gradient = kept.color_gradient(pixels_like(views[2]), views[2])
+    assert torch.equal(gradient, anew.color_gradient(pixels_like(views[2]), views[2]))
     band = (3, 16)
     assert kept.operator_bytes(views[2], band) < kept.operator_bytes(views[2])
     alone = CachedRasterizer(scene, anew=anew)
-    alone.colour_gradient(pixels[3:16], views[0], band)
+    alone.color_gradient(pixels[3:16], views[0], band)
     assert alone.kept_bytes == alone.operator_bytes(views[0], band)
 
 
@@ -191,13 +191,13 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monkeypatch: pytest.MonkeyPatch) -> None:
     """The wait of the lists is for their length, that of the weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
-    kept, colours, pixels = kept_on_device(scene), colours_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
+    kept, colors, pixels = kept_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
     kept.anew.lists(view)
     with waits(monkeypatch) as found:
         kept.coverage(view)
     assert found == ["__int__"]
     with waits(monkeypatch) as found:
-        kept.colour_gradient(kept.render(colours, view) + pixels, view)
+        kept.color_gradient(kept.render(colors, view) + pixels, view)
     assert not found
 
 

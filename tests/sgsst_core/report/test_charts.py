@@ -8,13 +8,13 @@ from PIL import Image, ImageColor
 
 from sgsst_core.errors import OutputError
 from sgsst_core.report.charts import write_loss_chart
-from sgsst_core.report.palette import COLOURS, INK
+from sgsst_core.report.palette import COLORS, INK
 from tests.sgsst_core.report.sample import sample_report
 
 pytestmark = pytest.mark.filterwarnings("error")
 
 
-def colours_in(path: Path) -> set[tuple[int, ...]]:
+def colors_in(path: Path) -> set[tuple[int, ...]]:
     with Image.open(path) as image:
         assert image.format == "PNG"
         return {tuple(pixel) for pixel in np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0).tolist()}
@@ -25,17 +25,17 @@ def test_the_picture_has_a_line_for_each_scale_that_was_stepped_on(
     coarse: int, sos: int, scales: int, tmp_path: Path
 ) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(coarse, sos, scales))
-    found = colours_in(tmp_path / "c.png")
+    found = colors_in(tmp_path / "c.png")
     there = range(scales) if sos else [scales - 1]
-    for place, colour in enumerate(COLOURS):
-        assert (ImageColor.getrgb(colour) in found) == (place in there), f"scale {place}"
+    for place, color in enumerate(COLORS):
+        assert (ImageColor.getrgb(color) in found) == (place in there), f"scale {place}"
 
 
 def test_the_picture_of_no_step_has_axes_alone(tmp_path: Path) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(0, 0))
-    found = colours_in(tmp_path / "c.png")
+    found = colors_in(tmp_path / "c.png")
     assert ImageColor.getrgb(INK) in found
-    assert not found & {ImageColor.getrgb(colour) for colour in COLOURS}
+    assert not found & {ImageColor.getrgb(color) for color in COLORS}
 
 
 def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:

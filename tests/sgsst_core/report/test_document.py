@@ -208,7 +208,7 @@ def test_contact_sheet_shows_style_original_and_stylized(
         cell = torch.from_numpy(sheet[top : top + 330, left : left + 440]).permute(2, 0, 1)
         cells.append(torch.nn.functional.interpolate(cell[None], (48, 64), mode="area")[0].permute(1, 2, 0))
     dcs = (stylizer.views.scene.sh_dc, stylizer.sh_dc.detach())
-    renders = [stylizer.views.render(0, stylizer.views.colours(0, dc)).clamp(0, 1) for dc in dcs]
+    renders = [stylizer.views.render(0, stylizer.views.colors(0, dc)).clamp(0, 1) for dc in dcs]
     distances = [[float((cell - render).abs().mean()) for render in renders] for cell in cells]
     assert max(distances[0][0], distances[1][1]) < 0.02
     assert min(distances[0][1], distances[1][0]) > 2 * max(distances[0][0], distances[1][1])

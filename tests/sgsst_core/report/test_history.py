@@ -7,7 +7,7 @@ import numpy as np
 from sgsst_core.report.history import PLACES, running_mean, thinned
 
 
-def test_running_mean_is_geometric_and_centred() -> None:
+def test_running_mean_is_geometric_and_centered() -> None:
     values = [1.0, 10.0, 100.0, 1000.0, 10.0]
     np.testing.assert_allclose(running_mean(values, 3), [1, 10, 100, 100, 10])
     np.testing.assert_allclose(running_mean(values, 1), values)

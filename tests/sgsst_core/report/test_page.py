@@ -20,7 +20,7 @@ from sgsst_core.report.document import Sources, build_report
 from sgsst_core.report.figures import draw_figures
 from sgsst_core.report.history import PLACES
 from sgsst_core.report.page import render_page, write_page
-from sgsst_core.report.palette import COLOURS, GRID, INK, ON_DARK
+from sgsst_core.report.palette import COLORS, GRID, INK, ON_DARK
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -363,7 +363,7 @@ def test_what_the_result_is_judged_to_be_stands_beside_the_start() -> None:
     page = parsed_without_figures(report)
     place = page.cells.index("distance to the style")
     assert page.cells[place : place + 3] == ["distance to the style", "1.5", "0.625"]
-    place = page.cells.index("colours that no screen shows")
+    place = page.cells.index("colors that no screen shows")
     assert page.cells[place + 1 : place + 3] == ["2 %", "2 %"]
     report["held_out"]["judged"] = None
     assert "distance to the style" not in parsed_without_figures(report).text
@@ -446,10 +446,10 @@ def test_probes_that_no_axis_shows_are_not_drawn() -> None:
     assert panel_borders(figure.svg["steps"])[0][0] > 20, "there is no room left for the axis's name"
 
 
-def test_every_colour_of_a_figure_has_one_for_dark_screens() -> None:
-    page = parsed({**sample_report(1, 2, len(COLOURS)), "held_out": None, "approximations": None})
+def test_every_color_of_a_figure_has_one_for_dark_screens() -> None:
+    page = parsed({**sample_report(1, 2, len(COLORS)), "held_out": None, "approximations": None})
     used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
-    assert {colour[1:] for colour in (*COLOURS, INK, GRID)} <= used
+    assert {color[1:] for color in (*COLORS, INK, GRID)} <= used
     defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))
     assert used <= set(defined)
     assert defined == {printed[1:]: shown for printed, shown in ON_DARK.items()}

@@ -46,11 +46,11 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], count
     return corner + points * sides
 
 
-def ball(centre: tuple[float, float, float], radius: float, count: int = 800, seed: int = 0) -> Tensor:
+def ball(center: tuple[float, float, float], radius: float, count: int = 800, seed: int = 0) -> Tensor:
     """[count, 3] points on a sphere."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    return torch.tensor(centre, dtype=torch.float32) + radius * directions
+    return torch.tensor(center, dtype=torch.float32) + radius * directions
 
 
 def figure() -> Scene:

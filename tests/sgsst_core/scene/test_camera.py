@@ -66,7 +66,7 @@ def test_a_spread_subset_is_even_and_in_order(total: int, count: int) -> None:
     assert all(gap >= 1 for gap in gaps)
     if gaps:
         assert max(gaps) - min(gaps) <= 1
-        seam = chosen[0] + total - chosen[-1]  # in a ring the last and the first are neighbours
+        seam = chosen[0] + total - chosen[-1]  # in a ring the last and the first are neighbors
         assert min(gaps) - 1 <= seam <= max(gaps) + 1
 
 
@@ -83,7 +83,7 @@ def test_look_at_sees_its_target_in_the_middle_and_up_above() -> None:
     assert float(depths[0]) == pytest.approx(math.sqrt(34))
     assert float(pixels[1, 0]) == pytest.approx(150)
     assert float(pixels[1, 1]) < 100
-    assert torch.allclose(view.centre, position.double())
+    assert torch.allclose(view.center, position.double())
     assert float(torch.linalg.det(view.world_to_camera[:3, :3])) == pytest.approx(1)
     for wrong in (target - position, torch.zeros(3)):
         with pytest.raises(CameraError, match="own up direction"):

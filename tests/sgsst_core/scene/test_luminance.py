@@ -3,33 +3,33 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.scene.luminance import WEIGHTS, grey, grey_gradient, luminance, with_chroma_of
+from sgsst_core.scene.luminance import WEIGHTS, gray, gray_gradient, luminance, with_chroma_of
 
 
-def colours(count: int = 200, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+def colors(count: int = 200, dtype: torch.dtype = torch.float64) -> torch.Tensor:
     return torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
-def test_grey_has_the_luminance_and_no_colour() -> None:
-    found = grey(colours())
+def test_gray_has_the_luminance_and_no_color() -> None:
+    found = gray(colors())
     assert sum(WEIGHTS) == pytest.approx(1, abs=1e-15)
-    torch.testing.assert_close(found[:, 0], colours() @ torch.tensor(WEIGHTS, dtype=torch.float64))
+    torch.testing.assert_close(found[:, 0], colors() @ torch.tensor(WEIGHTS, dtype=torch.float64))
     assert torch.equal(found[:, 0], found[:, 1])
     assert torch.equal(found[:, 0], found[:, 2])
     torch.testing.assert_close(luminance(found), found[:, 0])
     assert found.is_contiguous()
 
 
-def test_the_gradient_of_grey_is_its_derivative() -> None:
-    values, sent = colours().requires_grad_(), colours(200).flip(0)
-    (wanted,) = torch.autograd.grad((grey(values) * sent).sum(), values)
-    torch.testing.assert_close(grey_gradient(sent), wanted)
+def test_the_gradient_of_gray_is_its_derivative() -> None:
+    values, sent = colors().requires_grad_(), colors(200).flip(0)
+    (wanted,) = torch.autograd.grad((gray(values) * sent).sum(), values)
+    torch.testing.assert_close(gray_gradient(sent), wanted)
 
 
 def test_chroma_is_taken_from_the_original() -> None:
-    original = 3 * colours(dtype=torch.float32)
+    original = 3 * colors(dtype=torch.float32)
     shift = torch.linspace(-5, 5, 200)[:, None]
-    noise = 1e-3 * colours(dtype=torch.float32).flip(0)
+    noise = 1e-3 * colors(dtype=torch.float32).flip(0)
     found = with_chroma_of(original + shift + noise, original)
     change = found.double() - original.double()
     largest = torch.maximum(found.abs(), original.abs()).amax()
@@ -38,7 +38,7 @@ def test_chroma_is_taken_from_the_original() -> None:
 
 
 def test_errors_of_many_steps_do_not_add_up() -> None:
-    original = colours(dtype=torch.float32)
+    original = colors(dtype=torch.float32)
     present = original
     for _ in range(2000):
         present = with_chroma_of(present + 1e-3, original)

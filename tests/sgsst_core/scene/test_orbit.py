@@ -37,7 +37,7 @@ def in_view(view: Camera, points: Tensor) -> Tensor:
 
 
 def elevation(view: Camera, middle: Tensor, up: Tensor) -> float:
-    offset = view.centre - middle
+    offset = view.center - middle
     return math.degrees(math.asin(float(offset @ up / offset.norm())))
 
 
@@ -53,7 +53,7 @@ def test_the_whole_object_fills_every_frame(
     assert len({view.name for view in views}) == 7
     middle = torch.tensor([5.0, -7.0, 2.0], dtype=torch.float64) * size
     axis = torch.tensor(up, dtype=torch.float64) / torch.tensor(up, dtype=torch.float64).norm()
-    distances = torch.stack([(view.centre - middle).norm() for view in views])
+    distances = torch.stack([(view.center - middle).norm() for view in views])
     assert torch.allclose(distances, distances[0].expand(7), rtol=0.02)
     for view in views:
         assert view.fx == view.fy
@@ -110,7 +110,7 @@ def test_turning_the_scene_turns_the_cameras_and_enlarging_it_moves_them_away() 
     size = 3 * find_subject(scene).size
     for old, new in zip(before, after, strict=True):
         assert (new.width, new.height) == (old.width, old.height)
-        assert float((3 * matrix @ old.centre + shift - new.centre).norm()) < 0.01 * size
+        assert float((3 * matrix @ old.center + shift - new.center).norm()) < 0.01 * size
         turned = old.world_to_camera[:3, :3] @ matrix.T
         assert torch.allclose(turned, new.world_to_camera[:3, :3], atol=0.02)
         assert new.fx == pytest.approx(old.fx, rel=0.02)
@@ -119,7 +119,7 @@ def test_turning_the_scene_turns_the_cameras_and_enlarging_it_moves_them_away() 
 def test_the_first_camera_looks_at_the_broad_side() -> None:
     scene = scene_of(box((-1, -1, -0.2), (1, 1, 0.2), 3000))
     turned = moved(scene, Rotation.from_euler("y", 37, degrees=True))
-    offset = orbit(turned, 4)[0].centre
+    offset = orbit(turned, 4)[0].center
     broad = torch.from_numpy(Rotation.from_euler("y", 37, degrees=True).apply([0, 0, 1]))
     assert abs(float(offset @ broad) / float(offset.norm())) > 0.97
 
@@ -130,7 +130,7 @@ def test_a_radius_is_obeyed() -> None:
     for radius in (2.5, 40.0):
         views = orbit(scene, 5, radius=radius)
         for view in views:
-            assert float((view.centre - middle).norm()) == pytest.approx(radius)
+            assert float((view.center - middle).norm()) == pytest.approx(radius)
             assert bool(in_view(view, scene.means).all())
     for view in orbit(scene, 5, radius=0.05):  # inside: some of it is behind the camera
         assert bool(torch.isfinite(view.world_to_camera).all())

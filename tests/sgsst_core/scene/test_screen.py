@@ -1,4 +1,4 @@
-"""Colours brought back to what screens show."""
+"""Colors brought back to what screens show."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from sgsst_core.scene.luminance import with_chroma_of
 from sgsst_core.scene.screen import LARGEST, on_screen, on_screen_by_luminance
 
 COEFFICIENT = st.floats(-1e6, 1e6, width=32)
-COLOUR = st.tuples(COEFFICIENT, COEFFICIENT, COEFFICIENT)
+COLOR = st.tuples(COEFFICIENT, COEFFICIENT, COEFFICIENT)
 HIGHEST = 0.5 / SH_C0
 #: Of float32 coefficients below 2 in magnitude, twice.
 ROUNDING = 2.0**-22
 
 
-def colours(sh_dc: torch.Tensor) -> torch.Tensor:
+def colors(sh_dc: torch.Tensor) -> torch.Tensor:
     return 0.5 + SH_C0 * sh_dc.double()
 
 
 def test_the_bound_is_the_last_float32_inside() -> None:
     bound = torch.tensor([LARGEST])
     beyond = torch.nextafter(bound, torch.tensor([torch.inf]))
-    assert float(colours(bound)) <= 1
-    assert float(colours(-bound)) >= 0
-    assert float(colours(beyond)) > 1
-    assert float(colours(-beyond)) < 0
+    assert float(colors(bound)) <= 1
+    assert float(colors(-bound)) >= 0
+    assert float(colors(beyond)) > 1
+    assert float(colors(-beyond)) < 0
 
 
-@given(st.lists(COLOUR, min_size=1, max_size=8))
+@given(st.lists(COLOR, min_size=1, max_size=8))
 def test_each_channel_is_cut_off_by_itself(rows: list[tuple[float, float, float]]) -> None:
     sh_dc = torch.tensor(rows, dtype=torch.float32)
     found = on_screen(sh_dc)
-    shown = colours(found)
+    shown = colors(found)
     assert float(shown.min()) >= 0
     assert float(shown.max()) <= 1
-    inside = ((colours(sh_dc) >= 0) & (colours(sh_dc) <= 1)).all(dim=1)
+    inside = ((colors(sh_dc) >= 0) & (colors(sh_dc) <= 1)).all(dim=1)
     assert torch.equal(found[inside], sh_dc[inside])
-    assert torch.allclose(shown, colours(sh_dc).clamp(0, 1), atol=1e-7)
+    assert torch.allclose(shown, colors(sh_dc).clamp(0, 1), atol=1e-7)
 
 
-@given(st.lists(COLOUR, min_size=1, max_size=8))
-def test_along_grey_no_further_than_needed(rows: list[tuple[float, float, float]]) -> None:
+@given(st.lists(COLOR, min_size=1, max_size=8))
+def test_along_gray_no_further_than_needed(rows: list[tuple[float, float, float]]) -> None:
     sh_dc = torch.tensor(rows, dtype=torch.float32).double()
     found = on_screen_by_luminance(sh_dc)
     shift = found - sh_dc
@@ -65,7 +65,7 @@ def test_chroma_survives_float32() -> None:
     original = torch.rand((1000, 3), generator=generator) * 2 - 1
     moved = original + 6 * torch.randn((1000, 1), generator=generator)
     found = with_chroma_of(on_screen_by_luminance(moved), original)
-    shown = colours(found)
+    shown = colors(found)
     assert float(shown.min()) >= 0
     assert float(shown.max()) <= 1
     change = (found - original).double()

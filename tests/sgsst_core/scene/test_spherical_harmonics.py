@@ -15,11 +15,11 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import (
     basis,
-    kernel_rest_colours,
-    reference_rest_colours,
-    rest_colours,
-    view_colours,
-    view_colours_gradient,
+    kernel_rest_colors,
+    reference_rest_colors,
+    rest_colors,
+    view_colors,
+    view_colors_gradient,
     view_directions,
 )
 from sgsst_core.scene.stored_harmonics import held
@@ -81,26 +81,26 @@ def test_basis_has_the_signs_and_the_order_of_3dgs_files() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_rest_colours_of_a_degree_use_only_its_coefficients(degree: int) -> None:
+def test_rest_colors_of_a_degree_use_only_its_coefficients(degree: int) -> None:
     scene, view = cloud(50, degree=3), camera(pose=turned_pose())
     count = (degree + 1) ** 2 - 1
-    alone = rest_colours(held(scene.sh_rest)[:, :count], scene.means, view)
-    assert torch.equal(rest_colours(scene.sh_rest, scene.means, view, degree=degree), alone)
-    values = basis(view_directions(scene.means, view.centre), degree)
+    alone = rest_colors(held(scene.sh_rest)[:, :count], scene.means, view)
+    assert torch.equal(rest_colors(scene.sh_rest, scene.means, view, degree=degree), alone)
+    values = basis(view_directions(scene.means, view.center), degree)
     expected = (values[:, :, None] * held(scene.sh_rest)[:, :count].double()).sum(1)
     assert alone.dtype == torch.float32
     assert torch.allclose(alone.double(), expected, atol=1e-6)
     assert degree > 0 or not alone.any()
 
 
-def test_a_world_moved_far_away_keeps_its_colours() -> None:
+def test_a_world_moved_far_away_keeps_its_colors() -> None:
     scene, view = cloud(50, degree=3), camera(pose=turned_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that moving it by 1e6 is exact
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     moved_pose = view.world_to_camera.clone()
     moved_pose[:3, 3] -= moved_pose[:3, :3] @ offset
-    moved = rest_colours(scene.sh_rest, scene.means + offset.float(), replace(view, world_to_camera=moved_pose))
-    assert torch.allclose(moved, rest_colours(scene.sh_rest, scene.means, view), atol=1e-5)
+    moved = rest_colors(scene.sh_rest, scene.means + offset.float(), replace(view, world_to_camera=moved_pose))
+    assert torch.allclose(moved, rest_colors(scene.sh_rest, scene.means, view), atol=1e-5)
 
 
 def test_directions_of_extreme_length_are_unit_or_zero() -> None:
@@ -118,7 +118,7 @@ def far_from_the_origin() -> tuple[Scene, Camera]:
     return replace(scene, means=(scene.means.double() + offset).float()), replace(view, world_to_camera=pose)
 
 
-def at_the_centre() -> tuple[Scene, Camera]:
+def at_the_center() -> tuple[Scene, Camera]:
     """Also so near to it, and so far, that squares would vanish or overflow."""
     scene = cloud(5, degree=3)
     means = torch.tensor([[0.0, 0, 0], [1e-38, 0, 0], [1e38, 1e38, 0], [0, 1e-45, -1e-45], [0, 0, -2.0]])
@@ -135,7 +135,7 @@ def huge_coefficients() -> tuple[Scene, Camera]:
 KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "ordinary": lambda: (cloud(300, degree=3), camera(pose=turned_pose())),
     "camera far from the origin": far_from_the_origin,
-    "a Gaussian at the centre": at_the_centre,
+    "a Gaussian at the center": at_the_center,
     "huge coefficients": huge_coefficients,
     "no Gaussian": lambda: (cloud(0, degree=3), camera()),
 }
@@ -150,10 +150,10 @@ def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
     whole = held(scene.sh_rest)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     count = (degree + 1) ** 2 - 1
-    exact = reference_rest_colours(whole.double(), scene.means, view, degree)
+    exact = reference_rest_colors(whole.double(), scene.means, view, degree)
     sizes = whole[:, :count].abs().double().sum(1)
     for sh_rest in (whole, whole[:, :count]):
-        found = kernel_rest_colours(sh_rest.to(device), scene.means.to(device), view, degree)
+        found = kernel_rest_colors(sh_rest.to(device), scene.means.to(device), view, degree)
         assert found.dtype == torch.float32
         assert bool(((found.cpu().double() - exact).abs() <= 1e-6 * sizes).all())
 
@@ -164,56 +164,56 @@ def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: in
     scene, view = KERNEL_CASES[name]()
     whole = held(scene.sh_rest)
     count = (degree + 1) ** 2 - 1
-    exact = reference_rest_colours(whole.double(), scene.means, view, degree)
+    exact = reference_rest_colors(whole.double(), scene.means, view, degree)
     sizes = whole[:, :count].abs().double().sum(1)
     for sh_rest in (whole, whole[:, :count]):
-        found = rest_colours(sh_rest, scene.means, view, degree=degree)
+        found = rest_colors(sh_rest, scene.means, view, degree=degree)
         assert found.dtype == torch.float32
         assert bool(((found.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
-def test_colours_on_a_gpu_are_those_of_the_kernel() -> None:
+def test_colors_on_a_gpu_are_those_of_the_kernel() -> None:
     scene, view = cloud(300, degree=3), camera(pose=turned_pose())
     sh_rest, means = held(scene.sh_rest).cuda(), scene.means.cuda()
-    found = rest_colours(sh_rest, means, view)
-    assert torch.equal(found, kernel_rest_colours(sh_rest, means, view, 3))
-    assert torch.allclose(found.cpu(), rest_colours(scene.sh_rest, scene.means, view), atol=1e-5)
-    assert not rest_colours(sh_rest, means, view, degree=0).any()
+    found = rest_colors(sh_rest, means, view)
+    assert torch.equal(found, kernel_rest_colors(sh_rest, means, view, 3))
+    assert torch.allclose(found.cpu(), rest_colors(scene.sh_rest, scene.means, view), atol=1e-5)
+    assert not rest_colors(sh_rest, means, view, degree=0).any()
 
 
-def test_colours_are_clamped_and_the_gradient_follows() -> None:
+def test_colors_are_clamped_and_the_gradient_follows() -> None:
     generator = torch.Generator().manual_seed(0)
     sh_dc = 3 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
     rest = torch.randn(40, 3, generator=generator, dtype=torch.float64)
     sh_dc.requires_grad_()
-    colours = view_colours(sh_dc, rest)
-    assert float(colours.detach().min()) == 0
-    assert float(colours.detach().max()) > 1
-    assert torch.autograd.gradcheck(lambda dc: view_colours(dc, rest), (sh_dc,))
+    colors = view_colors(sh_dc, rest)
+    assert float(colors.detach().min()) == 0
+    assert float(colors.detach().max()) > 1
+    assert torch.autograd.gradcheck(lambda dc: view_colors(dc, rest), (sh_dc,))
     gradient = torch.randn(40, 3, generator=generator, dtype=torch.float64)
-    (expected,) = torch.autograd.grad(colours, sh_dc, gradient)
-    assert torch.allclose(view_colours_gradient(gradient, colours.detach()), expected, atol=1e-15)
+    (expected,) = torch.autograd.grad(colors, sh_dc, gradient)
+    assert torch.allclose(view_colors_gradient(gradient, colors.detach()), expected, atol=1e-15)
 
 
-def test_revived_colours_only_come_back() -> None:
-    """Where the clamp holds a colour at 0, a gradient that would raise it passes, one that would lower it does not."""
-    colours = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
+def test_revived_colors_only_come_back() -> None:
+    """Where the clamp holds a color at 0, a gradient that would raise it passes, one that would lower it does not."""
+    colors = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
     gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
-    found = view_colours_gradient(gradient, colours, revive=True)
+    found = view_colors_gradient(gradient, colors, revive=True)
     torch.testing.assert_close(found, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
 
 
-def test_dark_colours_come_back_when_revived() -> None:
+def test_dark_colors_come_back_when_revived() -> None:
     """Descent on |c - 0.6|^2 from far below 0: stuck without, at its target with."""
     ends = []
     for revive in (False, True):
         sh_dc = torch.full((1, 3), -4.0)
         for _ in range(400):
-            colours = view_colours(sh_dc, torch.zeros(1, 3))
-            sh_dc -= view_colours_gradient(2 * (colours - 0.6), colours, revive=revive)
-        ends.append(view_colours(sh_dc, torch.zeros(1, 3)))
+            colors = view_colors(sh_dc, torch.zeros(1, 3))
+            sh_dc -= view_colors_gradient(2 * (colors - 0.6), colors, revive=revive)
+        ends.append(view_colors(sh_dc, torch.zeros(1, 3)))
     assert bool((ends[0] == 0).all())
     torch.testing.assert_close(ends[1], torch.full((1, 3), 0.6), rtol=1e-4, atol=0)
 
@@ -221,8 +221,8 @@ def test_dark_colours_come_back_when_revived() -> None:
 def test_impossible_coefficients_are_refused() -> None:
     scene, view = cloud(5, degree=1), camera()
     with pytest.raises(ValueError, match="4 coefficients"):
-        rest_colours(torch.zeros(5, 4, 3), scene.means, view)
+        rest_colors(torch.zeros(5, 4, 3), scene.means, view)
     with pytest.raises(ValueError, match="degree 2 asked"):
-        rest_colours(scene.sh_rest, scene.means, view, degree=2)
+        rest_colors(scene.sh_rest, scene.means, view, degree=2)
     with pytest.raises(ValueError, match="degree 4"):
         basis(torch.zeros(1, 3), 4)

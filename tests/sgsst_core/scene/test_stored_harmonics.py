@@ -22,7 +22,7 @@ from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import RowFile, StoredHarmonics, held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import fingerprint
@@ -97,13 +97,13 @@ def test_any_layout_gives_the_bits_of_the_scene_in_memory(
         assert torch.equal(getattr(stored, name), getattr(plain, name))
     assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
     for used in range(degree + 1):
-        colours = [rest_colours(scene.sh_rest, scene.means, view, degree=used) for scene in (stored, plain)]
-        assert torch.equal(*colours)
+        colors = [rest_colors(scene.sh_rest, scene.means, view, degree=used) for scene in (stored, plain)]
+        assert torch.equal(*colors)
     rows = torch.tensor([bool(mask >> i & 1) for i in range(count)])
     some = [scene.subset(rows) for scene in (stored, plain)]
     assert isinstance(some[0].sh_rest, StoredHarmonics)
     assert torch.equal(held(some[0].sh_rest), held(some[1].sh_rest))
-    assert torch.equal(*(rest_colours(scene.sh_rest, scene.means, view) for scene in some))
+    assert torch.equal(*(rest_colors(scene.sh_rest, scene.means, view) for scene in some))
     every_second = torch.arange(0, int(rows.sum()), 2)
     assert torch.equal(*(held(scene.subset(every_second).sh_rest) for scene in some))
     jumbled = torch.arange(count).flip(0).repeat(2)
@@ -210,7 +210,7 @@ def test_a_file_that_changes_meanwhile_is_an_error_and_no_signal(tmp_path: Path,
     else:
         path.write_bytes(data + b"\0")
     with pytest.raises(SceneError, match="was changed after it was read"):
-        rest_colours(scene.sh_rest, scene.means, camera())
+        rest_colors(scene.sh_rest, scene.means, camera())
 
 
 def test_a_file_that_is_replaced_or_deleted_stays_readable(tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ _PEAK = textwrap.dedent("""
     from pathlib import Path
     import torch
     from sgsst_core.files.ply import read_scene, write_stylized
-    from sgsst_core.scene.spherical_harmonics import rest_colours
+    from sgsst_core.scene.spherical_harmonics import rest_colors
     from tests.sgsst_core.splat_scenes import camera
 
     def anonymous(what):
@@ -268,12 +268,12 @@ _PEAK = textwrap.dedent("""
 
     folder, path = Path(sys.argv[1]), Path(sys.argv[1]) / "large.ply"
     small = read_scene(folder / "scene.ply", held_bytes=0).scene  # everything is imported and compiled
-    rest_colours(small.sh_rest, small.means, camera())
+    rest_colors(small.sh_rest, small.means, camera())
     before = anonymous("RssAnon")
     file = read_scene(path, held_bytes=0)
     seen = torch.arange(len(file.scene)) % 10 > 0
     shown = file.scene.subset(seen).without_zero_bands()
-    colours = rest_colours(shown.sh_rest, shown.means, camera())
+    colors = rest_colors(shown.sh_rest, shown.means, camera())
     Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
     write_stylized(file, folder / "out.ply", file.scene.sh_dc + 1)
     print((anonymous("RssAnon") - before) // len(file.scene), (anonymous("VmHWM") - anonymous("VmRSS")))
@@ -282,7 +282,7 @@ _PEAK = textwrap.dedent("""
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is looked for in Linux's /proc")
 def test_memory_holds_neither_the_harmonics_nor_the_result(tmp_path: Path) -> None:
-    """A Gaussian takes 56 bytes, in the subset once more, its colour 12 and its row 4; its harmonics would take 180."""
+    """A Gaussian takes 56 bytes, in the subset once more, its color 12 and its row 4; its harmonics would take 180."""
     write_scene(tmp_path / "scene.ply", cloud(10, degree=3))
     count, one = 300_000, cloud(3000, degree=3)
     write_scene(tmp_path / "large.ply", one.subset(torch.arange(3000).repeat(count // 3000)))
@@ -290,4 +290,4 @@ def test_memory_holds_neither_the_harmonics_nor_the_result(tmp_path: Path) -> No
     found = subprocess.run(run, capture_output=True, text=True, check=True, cwd=Path(ply.__file__).parents[2]).stdout
     held_bytes, writing = map(int, found.split())
     assert held_bytes < 236  # what a scene in memory takes without its subset
-    assert writing < 40 << 20  # one block of rows, and what compares its colours: the file has 74 MB
+    assert writing < 40 << 20  # one block of rows, and what compares its colors: the file has 74 MB

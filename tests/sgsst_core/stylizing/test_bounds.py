@@ -1,4 +1,4 @@
-"""Colours kept within what screens show, through whole jobs."""
+"""Colors kept within what screens show, through whole jobs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.screen import LARGEST
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimiser import LARGEST_GRADIENT, ColourOptimiser
+from sgsst_core.stylizing.optimizer import LARGEST_GRADIENT, ColorOptimizer
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, cameras, style, wall
 
@@ -30,7 +30,7 @@ def make(weights: BackboneWeights, scene: Scene, regions: Regions | None = None,
 
 
 def bright_wall() -> Scene:
-    """Reaches beyond the views, with many colours that no screen shows."""
+    """Reaches beyond the views, with many colors that no screen shows."""
     scene = wall(60, 40, sh_degree=1)
     scene.sh_dc.mul_(2)
     return scene
@@ -48,7 +48,7 @@ def bright_wall() -> Scene:
     ids=str,
 )
 @pytest.mark.parametrize("make_scene", [bright_wall, ball])
-def test_no_colour_that_changes_leaves_what_screens_show(
+def test_no_color_that_changes_leaves_what_screens_show(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
 ) -> None:
     scene = make_scene()
@@ -67,7 +67,7 @@ def test_no_colour_that_changes_leaves_what_screens_show(
 
 def test_luminance_alone_keeps_chroma_within_the_bounds(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
-    stylizer = make(tiny_weights, scene, bounded=True, keep_colours="luminance")
+    stylizer = make(tiny_weights, scene, bounded=True, keep_colors="luminance")
     run(stylizer)
     found = stylizer.stylized()
     change = (found - scene.sh_dc).double()
@@ -75,7 +75,7 @@ def test_luminance_alone_keeps_chroma_within_the_bounds(tiny_weights: BackboneWe
     fits = scene.sh_dc.amax(dim=1) - scene.sh_dc.amin(dim=1) < 2 * LARGEST * (1 - 1e-5)
     assert bool(fits.any())
     assert saturated(found[fits]) == 0
-    assert bool((~fits).any()), "a colour that no luminance brings into the bounds belongs to this test"
+    assert bool((~fits).any()), "a color that no luminance brings into the bounds belongs to this test"
 
 
 def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeights) -> None:
@@ -92,7 +92,7 @@ def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeight
 
 
 def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) -> None:
-    """Rendering what no view sees changes nothing, to the bit, although its colours begin beyond the bounds."""
+    """Rendering what no view sees changes nothing, to the bit, although its colors begin beyond the bounds."""
     lean, full = (
         make(tiny_weights, bright_wall(), bounded=True, kept_weights="none", keep=keep) for keep in ((), ("unseen",))
     )
@@ -103,29 +103,29 @@ def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) ->
 
 def adam(start: Tensor, gradients: list[Tensor], rate: float) -> Tensor:
     """Projected Adam (Kingma and Ba 2015, algorithm 1) in float64, by its definition."""
-    colours, first, second = start.double(), torch.zeros(start.shape).double(), torch.zeros(start.shape).double()
+    colors, first, second = start.double(), torch.zeros(start.shape).double(), torch.zeros(start.shape).double()
     for step, gradient in enumerate(gradients, start=1):
         first = 0.9 * first + 0.1 * gradient.double()
         second = 0.999 * second + 0.001 * gradient.double().square()
-        colours = colours - rate * (first / (1 - 0.9**step)) / ((second / (1 - 0.999**step)).sqrt() + 1e-15)
-        colours = ((0.5 + SH_C0 * colours).clamp(0, 1) - 0.5) / SH_C0
-    return colours
+        colors = colors - rate * (first / (1 - 0.9**step)) / ((second / (1 - 0.999**step)).sqrt() + 1e-15)
+        colors = ((0.5 + SH_C0 * colors).clamp(0, 1) - 0.5) / SH_C0
+    return colors
 
 
 def test_steps_are_those_of_projected_adam() -> None:
     generator = torch.Generator().manual_seed(3)
     start = torch.randn((200, 3), generator=generator)
     gradients = [torch.randn((200, 3), generator=generator) + 0.5 for _ in range(20)]
-    colours = start.clone()
-    optimiser = ColourOptimiser(colours, bounded=True)
+    colors = start.clone()
+    optimizer = ColorOptimizer(colors, bounded=True)
     for gradient in gradients:
-        optimiser.update(gradient, 0.3)
+        optimizer.update(gradient, 0.3)
     expected = adam(start, gradients, 0.3)
     assert float((expected.abs() > LARGEST - 1e-6).double().mean()) > 0.1
-    torch.testing.assert_close(colours.detach().double(), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(colors.detach().double(), expected, rtol=0, atol=1e-5)
 
 
 def test_a_step_that_is_not_made_brings_nothing_back() -> None:
-    colours = torch.full((4, 3), 5.0)
-    ColourOptimiser(colours, bounded=True).update(torch.full((4, 3), 10 * LARGEST_GRADIENT), 0.1)
-    assert bool((colours == 5).all())
+    colors = torch.full((4, 3), 5.0)
+    ColorOptimizer(colors, bounded=True).update(torch.full((4, 3), 10 * LARGEST_GRADIENT), 0.1)
+    assert bool((colors == 5).all())

@@ -63,7 +63,7 @@ def kept(state: StylizerState) -> Checkpoint:
     looked = Survey(torch.rand(5, dtype=torch.float64), [0, 2], [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)], 1 / 3)
     plan = Plan(
         survey=looked,
-        optimised=seen,
+        optimized=seen,
         seen=seen,
         covered=(0, 2),
         weighted=True,
@@ -307,7 +307,7 @@ def test_fingerprint_tells_jobs_apart() -> None:
     assert len({base, *others}) == len(others) + 1
 
 
-@pytest.mark.parametrize("factor", ["EVEN_COLOUR_SCALE", "EVEN_PIXEL_SCALE"])
+@pytest.mark.parametrize("factor", ["EVEN_COLOR_SCALE", "EVEN_PIXEL_SCALE"])
 @pytest.mark.parametrize(("scale", "same"), [("even", False), ("paper", True)])
 def test_a_job_does_not_go_on_under_other_factors(
     scale: str, same: bool, factor: str, monkeypatch: pytest.MonkeyPatch

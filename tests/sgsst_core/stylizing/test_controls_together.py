@@ -52,9 +52,9 @@ def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_we
     assert torch.equal(regions.refined(made).labels, regions.labels[parents_of(made.pieces)])
 
 
-@pytest.mark.parametrize("colours", ["no", "luminance"])
-def test_all_at_once(tiny_weights: BackboneWeights, colours: str) -> None:
-    values = {"refine": 2.0, "keep_colours": colours, "scales": (1.0, 0.5), "warm_start": True}
+@pytest.mark.parametrize("colors", ["no", "luminance"])
+def test_all_at_once(tiny_weights: BackboneWeights, colors: str) -> None:
+    values = {"refine": 2.0, "keep_colors": colors, "scales": (1.0, 0.5), "warm_start": True}
     stylizer = job(tiny_weights, **values)
     before = stylizer.scene.sh_dc.clone()
     found = stylized(stylizer)
@@ -64,7 +64,7 @@ def test_all_at_once(tiny_weights: BackboneWeights, colours: str) -> None:
     assert torch.equal(found[kept], before[kept])
     assert not torch.equal(found[~kept], before[~kept])
     assert bool(found.isfinite().all())
-    if colours == "luminance":
+    if colors == "luminance":
         change = found.double() - before.double()
         assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
         assert float(luminance(change).abs().max()) > 0.01

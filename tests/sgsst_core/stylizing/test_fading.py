@@ -1,4 +1,4 @@
-"""Jobs whose spherical harmonics fade: what is optimised is what is written."""
+"""Jobs whose spherical harmonics fade: what is optimized is what is written."""
 
 from __future__ import annotations
 
@@ -52,22 +52,22 @@ def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeigh
 
 @pytest.mark.parametrize("held_bytes", [0, None])
 @pytest.mark.parametrize("fade", [0.4, 1.0])
-def test_the_picture_of_the_result_is_what_was_optimised(
+def test_the_picture_of_the_result_is_what_was_optimized(
     tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, fade: float
 ) -> None:
     write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
     source = read_scene(tmp_path / "scene.ply", held_bytes=held_bytes)
     assert isinstance(source.scene.sh_rest, StoredHarmonics) == (held_bytes == 0)
     settings = make_settings(steps_coarse=0, steps_sos=2, sh_fade=fade)
-    colours = stylize(source.scene, cameras(), style(), settings, weights=tiny_weights)
-    write_stylized(source, tmp_path / "out.ply", colours, sh_fade=fade)
+    colors = stylize(source.scene, cameras(), style(), settings, weights=tiny_weights)
+    write_stylized(source, tmp_path / "out.ply", colors, sh_fade=fade)
     result = read_scene(tmp_path / "out.ply").scene
     stylizer = Stylizer.planned(source.scene, cameras(), style(), settings, weights=tiny_weights)
-    stylizer.set_colours(colours)
+    stylizer.set_colors(colors)
     again = Stylizer.planned(result, cameras(), style(), make_settings(warm_start=False), weights=tiny_weights)
     for index in range(3):
         pictures = [
-            each.views.render(index, each.views.colours(index, each.sh_dc.detach())) for each in (stylizer, again)
+            each.views.render(index, each.views.colors(index, each.sh_dc.detach())) for each in (stylizer, again)
         ]
         assert torch.equal(*pictures)
 

@@ -54,7 +54,7 @@ def make(
     some = looked.total_blend_weights > 0
     plan = Plan(
         survey=looked,
-        optimised=some,
+        optimized=some,
         seen=some,
         covered=tuple(looked.covered),
         weighted=scan,
@@ -93,10 +93,10 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
 
 
 @pytest.mark.slow
-def test_a_colour_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
+def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One graph serves every colour, and nothing is waited for or copied because of it."""
+    """One graph serves every color, and nothing is waited for or copied because of it."""
     leave_out_kernels(monkeypatch)
     options: dict[str, Any] = {"scan": True, "rasterizer": "triton", "steps_coarse": 0, "steps_sos": 8}
     plain, graphs = (make(tiny_weights, graphs=graphs, surround="random", **options) for graphs in (False, True))

@@ -102,7 +102,7 @@ def test_keeping_is_left_to_the_caller() -> None:
     scene, view = wall(), VIEWS[0]
     kept, cpu = CachedRasterizer(scene, at_first_use=False), CpuRasterizer(scene)
     pixels = torch.ones(view.height, view.width, 3)
-    assert torch.equal(kept.colour_gradient(pixels, view), cpu.colour_gradient(pixels, view))
+    assert torch.equal(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view))
     assert (kept.is_kept(view), kept.kept_bytes) == (False, 0)
     assert kept.keep(view)
     assert kept.is_kept(view, (3, 9))
@@ -116,13 +116,13 @@ def test_lent_weights_are_those_that_are_kept() -> None:
     pixels = torch.ones(view.height, view.width, 3)
     keeper.keep(view)
     with lender.lending(view):
-        assert torch.equal(lender.colour_gradient(pixels, view), keeper.colour_gradient(pixels, view))
-    anew = CpuRasterizer(scene).colour_gradient(pixels, view)
-    assert torch.equal(lender.colour_gradient(pixels, view), anew)
+        assert torch.equal(lender.color_gradient(pixels, view), keeper.color_gradient(pixels, view))
+    anew = CpuRasterizer(scene).color_gradient(pixels, view)
+    assert torch.equal(lender.color_gradient(pixels, view), anew)
     assert lender.kept_bytes == 0
     small = CachedRasterizer(scene, at_first_use=False, precision="half", max_bytes=10)
     with small.lending(view):
-        assert torch.equal(small.colour_gradient(pixels, view), anew)
+        assert torch.equal(small.color_gradient(pixels, view), anew)
     with keeper.lending(view):
         pass
     assert keeper.is_kept(view)

@@ -1,4 +1,4 @@
-"""The style's colours once more behind the last step, where the loss has no statistics that would hold them."""
+"""The style's colors once more behind the last step, where the loss has no statistics that would hold them."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ def told(plan: Plan) -> bool:
 def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights)
     run(stylizer)
-    optimised = stylizer.sh_dc.detach().clone()
-    rows = stylizer.plan.optimised
+    optimized = stylizer.sh_dc.detach().clone()
+    rows = stylizer.plan.optimized
     assert rows.any()
     found = stylizer.stylized()
     weights = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
-    wanted = warm_start(optimised, weights, stylizer.style)
+    wanted = warm_start(optimized, weights, stylizer.style)
     assert torch.equal(found[rows], wanted[rows[stylizer.plan.seen]])
-    assert float((wanted - optimised).abs().mean()) > 0.01
-    assert torch.equal(stylizer.sh_dc, optimised)
+    assert float((wanted - optimized).abs().mean()) > 0.01
+    assert torch.equal(stylizer.sh_dc, optimized)
     assert torch.equal(stylizer.shown(), found[stylizer.plan.seen])
     assert told(stylizer.plan)
 
@@ -74,7 +74,7 @@ def test_other_results_are_what_steps_have_found(tiny_weights: BackboneWeights, 
     steps = values.pop("steps", None)
     stylizer = make(tiny_weights, **values)
     run(stylizer, Callbacks(stop=lambda: steps == stylizer.step))
-    rows = stylizer.plan.optimised
+    rows = stylizer.plan.optimized
     assert torch.equal(stylizer.stylized()[rows], stylizer.sh_dc.detach()[rows[stylizer.plan.seen]])
     assert torch.equal(stylizer.shown(), stylizer.sh_dc)
     assert told(stylizer.plan) == (steps == 0)
@@ -92,9 +92,9 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) ->
     assert torch.equal(again.stylized(), whole.stylized())
 
 
-def test_each_region_has_the_colours_of_its_own_style_and_kept_ones_their_bits(tiny_weights: BackboneWeights) -> None:
+def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
-    dark, bright = (StyleMixture.of(torch.full((40, 40, 3), grey)) for grey in (0.2, 0.7))
+    dark, bright = (StyleMixture.of(torch.full((40, 40, 3), gray)) for gray in (0.2, 0.7))
     labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
     labels[scene.means[:, 1] > 1] = 2
     regions = Regions(
@@ -105,16 +105,16 @@ def test_each_region_has_the_colours_of_its_own_style_and_kept_ones_their_bits(t
     run(stylizer)
     found = stylizer.stylized()
     assert torch.equal(found[labels == 2].view(torch.int32), scene.sh_dc[labels == 2].view(torch.int32))
-    for place, grey in enumerate((0.2, 0.7)):
-        own = 0.5 + SH_C0 * found[(labels == place) & stylizer.plan.optimised]
-        assert float((own - grey).abs().max()) < 1e-3
+    for place, gray in enumerate((0.2, 0.7)):
+        own = 0.5 + SH_C0 * found[(labels == place) & stylizer.plan.optimized]
+        assert float((own - gray).abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeights, bounded: bool) -> None:
-    stylizer = make(tiny_weights, keep_colours="luminance", warm_start=True, bounded=bounded, unseen="keep")
+    stylizer = make(tiny_weights, keep_colors="luminance", warm_start=True, bounded=bounded, unseen="keep")
     run(stylizer)
-    rows, before = stylizer.plan.optimised, stylizer.scene.sh_dc
+    rows, before = stylizer.plan.optimized, stylizer.scene.sh_dc
     found = stylizer.stylized()
     change = (found - before)[rows].double()
     assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
@@ -124,7 +124,7 @@ def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeig
 
 
 def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
-    """Loss and pictures are of the colours in the file; the error of bfloat16 is that of one and the same colours."""
+    """Loss and pictures are of the colors in the file; the error of bfloat16 is that of one and the same colors."""
     stylizer = in_bfloat16(tiny_weights)
     run(stylizer)
     measure = Measurements(stylizer)
@@ -136,13 +136,13 @@ def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_
     exact = make(tiny_weights)
     run(exact)
     after = Measurements(exact).evaluate()[0].total
-    optimised = exact.evaluate(exact.evaluation_views)[0].total
-    with exact.with_colours(exact.stylized()):
-        assert exact.evaluate(exact.evaluation_views)[0].total == after != optimised
+    optimized = exact.evaluate(exact.evaluation_views)[0].total
+    with exact.with_colors(exact.stylized()):
+        assert exact.evaluate(exact.evaluation_views)[0].total == after != optimized
     other = make(tiny_weights, warm_start=False)
     sheets = []
-    for colours in (exact.stylized(), exact.scene.sh_dc.index_put((exact.plan.seen,), exact.sh_dc.detach())):
-        other.set_colours(colours)
+    for colors in (exact.stylized(), exact.scene.sh_dc.index_put((exact.plan.seen,), exact.sh_dc.detach())):
+        other.set_colors(colors)
         write_contact_sheet(tmp_path / "other.jpg", other)
         sheets.append((tmp_path / "other.jpg").read_bytes())
     write_contact_sheet(tmp_path / "sheet.jpg", exact)

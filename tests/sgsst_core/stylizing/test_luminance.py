@@ -1,4 +1,4 @@
-"""Colours that change in luminance alone, through whole jobs."""
+"""Colors that change in luminance alone, through whole jobs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.constants import COLOUR_OFFSET, SH_C0
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
@@ -22,7 +22,7 @@ from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimiser import ColourOptimiser
+from sgsst_core.stylizing.optimizer import ColorOptimizer
 from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import luminance_start
@@ -36,7 +36,7 @@ ROUNDING = 2**-22
 
 
 def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) -> Stylizer:
-    chosen: dict[str, Any] = {"coarsest_side": 24, "keep_colours": "luminance"} | values
+    chosen: dict[str, Any] = {"coarsest_side": 24, "keep_colors": "luminance"} | values
     settings = make_settings(steps_coarse=2, steps_sos=steps, early_stop=False, **chosen)
     return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
 
@@ -68,7 +68,7 @@ def test_every_gaussian_keeps_its_chroma(
 ) -> None:
     scene = make_scene()
     stylizer = make(tiny_weights, scene, **values)
-    assert any(line.item == "colours" for line in stylizer.plan.decisions)
+    assert any(line.item == "colors" for line in stylizer.plan.decisions)
     before = stylizer.sh_dc.detach().clone()
     run(stylizer)
     found = stylizer.stylized()
@@ -82,24 +82,24 @@ def test_every_gaussian_keeps_its_chroma(
 def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: BackboneWeights) -> None:
     """dE/d(what is added to all three channels of a Gaussian), by autograd through definitions in float64."""
     scene, view = wall(), cameras(1)[0]
-    settings = make_settings(keep_colours="luminance", coarsest_side=24, steps_coarse=0, revive=False)
+    settings = make_settings(keep_colors="luminance", coarsest_side=24, steps_coarse=0, revive=False)
     stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
     found, _ = stylizer.gradient(0, range(stylizer.scale_count(0)))
 
     rasterizer = ReferenceRasterizer(scene)
-    colours = (COLOUR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
-    image = rasterizer.render(colours, view)
+    colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
+    image = rasterizer.render(colors, view)
     size = (view.height, view.width)
     (painting,) = stylizer.style.pictures
     used = resize_area(painting, style_size((painting.shape[0], painting.shape[1]), size))
     _, pixels = sos_reference(stylizer.weights, image, used, image, coarsest=24)
-    exact = rasterizer.colour_gradient(pixels, view) * SH_C0 * (colours > 0)
-    assert stylizer.weights.grey
+    exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)
+    assert stylizer.weights.gray
     assert relative_error(found.sum(1).double(), exact.sum(1)[stylizer.plan.seen]) < 1e-4
 
 
 def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> None:
-    weights = replace(tiny_weights, grey=True)
+    weights = replace(tiny_weights, gray=True)
     image, content, painting = picture(129, 161, seed=1), picture(129, 161, seed=2), picture(100, 120, seed=3)
     painting = resize_area(painting, style_size((100, 120), (129, 161)))
     coverage = (picture(129, 161, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
@@ -113,8 +113,8 @@ def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> Non
         assert relative_error(found.image_gradient, gradient) < 1e-9
 
 
-def test_colours_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: BackboneWeights) -> None:
-    network = FeatureNetwork(replace(tiny_weights, grey=True), dtype=torch.float64)
+def test_colors_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: BackboneWeights) -> None:
+    network = FeatureNetwork(replace(tiny_weights, gray=True), dtype=torch.float64)
     image = picture(40, 48, seed=1)
     other = image + torch.tensor([0.587, -0.299, 0.0], dtype=torch.float64) * picture(40, 48, seed=5)[..., :1]
     first, second = (network.forward(each, keep=False).features for each in (image, other))
@@ -124,13 +124,13 @@ def test_colours_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: Backb
 
 def test_the_style_takes_the_scenes_luminance() -> None:
     generator = torch.Generator().manual_seed(1)
-    colours = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
+    colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
-    settings = make_settings(keep_colours="luminance")
+    settings = make_settings(keep_colors="luminance")
     painting = StyleMixture.of(0.5 + 0.1 * picture(64, 64, seed=2).float())
-    (found,) = prepared_style(painting, settings, (colours - 0.5) / SH_C0, weights).pictures
+    (found,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).pictures
     assert torch.equal(found[..., 0], found[..., 1])
-    share, values = weights / weights.sum(), luminance(colours.double())
+    share, values = weights / weights.sum(), luminance(colors.double())
     mean = float((share * values).sum())
     assert float(found.double().mean()) == pytest.approx(mean, abs=1e-5)
     assert float(found[..., 0].double().std(correction=0)) == pytest.approx(
@@ -140,19 +140,19 @@ def test_the_style_takes_the_scenes_luminance() -> None:
 
 def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
     """A dark picture and a bright one stay dark and bright: the mixture has the scene's mean and deviation."""
-    colours = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
+    colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
     dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
     mixture = StyleMixture.weighted([dark.float(), bright.float()], [3, 1])
     ones = torch.ones(5000, dtype=torch.float64)
-    found = prepared_style(mixture, make_settings(keep_colours="luminance"), (colours - 0.5) / SH_C0, ones)
+    found = prepared_style(mixture, make_settings(keep_colors="luminance"), (colors - 0.5) / SH_C0, ones)
     first, second = (luminance(each.double()) for each in found.pictures)
     assert float(first.mean()) < float(second.mean())
-    values = luminance(colours.double())
+    values = luminance(colors.double())
     mean = 0.75 * first.mean() + 0.25 * second.mean()
     second_moment = 0.75 * first.square().mean() + 0.25 * second.square().mean()
     torch.testing.assert_close(mean, values.mean(), atol=1e-5, rtol=0)
     torch.testing.assert_close((second_moment - mean**2).sqrt(), values.std(correction=0), atol=0, rtol=1e-3)
-    start = luminance_start((colours - 0.5) / SH_C0, ones, mixture)
+    start = luminance_start((colors - 0.5) / SH_C0, ones, mixture)
     # Some are as dark as a picture can be.
     wanted = 0.75 * luminance(dark).mean() + 0.25 * luminance(bright).mean()
     torch.testing.assert_close(luminance(0.5 + SH_C0 * start.double()).mean(), wanted, atol=5e-3, rtol=0)
@@ -160,16 +160,16 @@ def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
 def test_flat_styles_and_scenes_are_finite(value: float) -> None:
-    settings = make_settings(keep_colours="luminance")
+    settings = make_settings(keep_colors="luminance")
     flat, some = torch.full((5, 4, 3), value), 0.3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     ones = torch.ones(20, dtype=torch.float64)
-    for scene_colours, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):
-        (found,) = prepared_style(StyleMixture.of(painting), settings, scene_colours, ones).pictures
+    for scene_colors, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):
+        (found,) = prepared_style(StyleMixture.of(painting), settings, scene_colors, ones).pictures
         assert bool(found.isfinite().all())
-        wanted = luminance((0.5 + SH_C0 * scene_colours).clamp(0, 1)).mean()
+        wanted = luminance((0.5 + SH_C0 * scene_colors).clamp(0, 1)).mean()
         torch.testing.assert_close(found.mean(), wanted, atol=1e-4, rtol=0)
-        start = luminance_start(scene_colours, ones, painting)
-        assert chroma_off(start, replace(wall(), sh_dc=scene_colours)) < ROUNDING
+        start = luminance_start(scene_colors, ones, painting)
+        assert chroma_off(start, replace(wall(), sh_dc=scene_colors)) < ROUNDING
         brightness = luminance(0.5 + SH_C0 * start.double())
         assert -1e-6 <= float(brightness.min()) <= float(brightness.max()) <= 1 + 1e-6
 
@@ -188,16 +188,16 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, tm
 
 def test_where_no_step_can_be_made_nothing_changes() -> None:
     original = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
-    colours = original + 0.7 * torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
-    before = colours.clone()
-    optimiser = ColourOptimiser(colours, chroma_of=original)
-    optimiser.update(torch.full((50, 3), 1e20), 0.1)
-    assert torch.equal(colours.detach(), before)
-    optimiser.update(torch.ones(50, 3), 0.1)
-    assert not torch.equal(colours.detach(), before)
+    colors = original + 0.7 * torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
+    before = colors.clone()
+    optimizer = ColorOptimizer(colors, chroma_of=original)
+    optimizer.update(torch.full((50, 3), 1e20), 0.1)
+    assert torch.equal(colors.detach(), before)
+    optimizer.update(torch.ones(50, 3), 0.1)
+    assert not torch.equal(colors.detach(), before)
 
 
-def test_a_run_that_diverges_keeps_its_colours(tiny_weights: BackboneWeights) -> None:
+def test_a_run_that_diverges_keeps_its_colors(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, wall())
     stylizer.run_step()
     with torch.no_grad():

@@ -25,7 +25,7 @@ def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data,
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = cameras_of(folder, scene, 12)
     style = load_image(shared_data / "styles" / "starry_night.jpg")
-    # from the scene's own colours, and with nothing else behind it in a step than where the loss is judged
+    # from the scene's own colors, and with nothing else behind it in a step than where the loss is judged
     settings = make_settings(
         steps_coarse=10,
         steps_sos=50,
@@ -41,7 +41,7 @@ def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data,
 
     before = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, held_out)]
     assert run(training) == "finished"
-    held_out.set_colours(training.stylized())
+    held_out.set_colors(training.stylized())
     after = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, held_out)]
     for first, last, bound in zip(before, after, (0.5, 0.75), strict=True):
         assert set(first) == {0, 1}

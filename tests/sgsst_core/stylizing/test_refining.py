@@ -128,7 +128,7 @@ def test_a_stylizer_goes_on_with_the_refined_scene(tiny_weights: BackboneWeights
     parents, change = parents_of(made.pieces), stylizer.stylized() - stylizer.scene.sh_dc
     cut = int((piece_counts(made.pieces) > 1).nonzero()[0])
     children = change[parents == cut]
-    assert float(children.std(dim=0).max()) > 0.01, "children have colours of their own"
+    assert float(children.std(dim=0).max()) > 0.01, "children have colors of their own"
 
 
 def test_somebody_who_waits_is_shown_how_far_it_is(tiny_weights: BackboneWeights) -> None:

@@ -1,4 +1,4 @@
-"""Regions of a scene in the optimiser: what is kept, what changes, and by which style."""
+"""Regions of a scene in the optimizer: what is kept, what changes, and by which style."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.regions import RegionMaps, neighbours_change_by_region
+from sgsst_core.stylizing.regions import RegionMaps, neighbors_change_by_region
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.pictures import relative_error
 from tests.small_scenes import ball, cameras, style, wall
@@ -81,9 +81,9 @@ def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
     "values",
     [
         {"warm_start": True, "revive": True},
-        {"unseen": "neighbours", "views_per_step": 2, "background": (1.0, 0.5, 0.0)},
+        {"unseen": "neighbors", "views_per_step": 2, "background": (1.0, 0.5, 0.0)},
         {"keep": ("unseen",), "surround": "random"},
-        {"kept_weights": "half", "keep_colours": "match", "style_loss": "mixed"},
+        {"kept_weights": "half", "keep_colors": "match", "style_loss": "mixed"},
     ],
 )
 @pytest.mark.parametrize("kept", ["rest", "right"])
@@ -97,9 +97,9 @@ def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str
     bits, before = stylizer.stylized().view(torch.int32), scene.sh_dc.view(torch.int32)
     assert torch.equal(bits[regions.kept], before[regions.kept])
     changed = (bits != before).any(dim=1)
-    assert bool(changed[stylizer.plan.optimised].all())
+    assert bool(changed[stylizer.plan.optimized].all())
     assert bool(changed[~regions.kept].all()) == (values.get("unseen") != "keep")
-    assert not bool((stylizer.plan.optimised & regions.kept).any())
+    assert not bool((stylizer.plan.optimized & regions.kept).any())
 
 
 def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> None:
@@ -152,16 +152,16 @@ def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights
     assert left < 0.4 < 0.6 < right
 
 
-def test_colours_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeights) -> None:
+def test_colors_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.2), torch.full((40, 40, 3), 0.7)
     regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, warm_start=True)
-    seen = stylizer.plan.optimised
-    colours = 0.5 + 0.28209479 * stylizer.transferred()
-    for place, grey in enumerate((0.2, 0.7)):
+    seen = stylizer.plan.optimized
+    colors = 0.5 + 0.28209479 * stylizer.transferred()
+    for place, gray in enumerate((0.2, 0.7)):
         torch.testing.assert_close(
-            colours[regions.labels[stylizer.plan.seen] == place].mean(), torch.tensor(grey), atol=1e-3, rtol=0
+            colors[regions.labels[stylizer.plan.seen] == place].mean(), torch.tensor(gray), atol=1e-3, rtol=0
         )
     assert bool(seen.any())
 
@@ -189,11 +189,11 @@ def test_unseen_gaussians_follow_their_own_region() -> None:
     weights = torch.tensor([1.0, 1, 0, 0, 0]).double()
     labels = torch.tensor([0, 1, 0, 1, 2], dtype=torch.uint8)
     regions = Regions((Region("rest"), Region("a"), Region("b", keep=True)), labels)
-    found = neighbours_change_by_region(means, change, weights, regions)
+    found = neighbors_change_by_region(means, change, weights, regions)
     assert found[2:, 0].tolist() == [1.0, 2.0, 0.0]
     without = replace(regions, labels=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8))
-    found = neighbours_change_by_region(means, change, weights, without)
-    assert found[2, 0] == 1.5  # nothing of its region is optimised
+    found = neighbors_change_by_region(means, change, weights, without)
+    assert found[2, 0] == 1.5  # nothing of its region is optimized
 
 
 def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
@@ -246,7 +246,7 @@ def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: Back
     stylizer = make(tiny_weights, scene, halves(scene))
     view = stylizer.views.target(0, [0])
     targets = stylizer.style_targets(stylizer.views.cameras[0])
-    image = stylizer.views.render(0, stylizer.views.colours(0, stylizer.sh_dc.detach()))
+    image = stylizer.views.render(0, stylizer.views.colors(0, stylizer.sh_dc.detach()))
     bare = ViewTarget(view.content_image, view.content, view.coverage, view.share)
     with pytest.raises(ValueError, match="not prepared for the regions"):
         stylizer.loss.evaluate(image, targets, bare, [0])

@@ -1,4 +1,4 @@
-"""The optimiser loop, on scenes so small that a step is quick."""
+"""The optimizer loop, on scenes so small that a step is quick."""
 
 from __future__ import annotations
 
@@ -149,13 +149,13 @@ def test_learning_rate_falls_exponentially_to_its_end(
 ) -> None:
     stylizer = make(tiny_weights, scene, steps_sos=5, learning_rate=0.1, learning_rate_end=0.001)
     rates = []
-    update = stylizer._optimiser.update
+    update = stylizer._optimizer.update
 
     def noted(gradient: Tensor, learning_rate: float) -> Tensor:
         rates.append(learning_rate)
         return update(gradient, learning_rate)
 
-    monkeypatch.setattr(stylizer._optimiser, "update", noted)
+    monkeypatch.setattr(stylizer._optimizer, "update", noted)
     while stylizer.step < stylizer.total:
         stylizer.run_step()
     assert rates == pytest.approx([0.1, 0.1**1.5, 0.01, 0.1**2.5, 0.001])
@@ -170,7 +170,7 @@ def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
     before = stylizer.evaluate([0, 1, 2])[0].total
     run(stylizer)
     assert stylizer.evaluate([0, 1, 2])[0].total < 0.5 * before
-    left_out.set_colours(stylizer.stylized())
+    left_out.set_colors(stylizer.stylized())
     assert left_out.evaluate([0])[0].total < 0.6 * start
 
 
@@ -241,12 +241,12 @@ def test_the_style_is_taken_for_no_views_price(
     assert all(now.seconds_left < 1000 for now in seen)
 
 
-def test_a_result_is_made_once_for_the_same_colours(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_a_result_is_made_once_for_the_same_colors(tiny_weights: BackboneWeights, scene: Scene) -> None:
     stylizer = make(tiny_weights, scene)
     first = stylizer.stylized()
     assert stylizer.stylized() is first
     kept = stylizer.sh_dc.clone()
-    with stylizer.with_colours(scene.sh_dc + 1):
+    with stylizer.with_colors(scene.sh_dc + 1):
         assert torch.equal(stylizer.stylized()[stylizer.plan.seen], scene.sh_dc[stylizer.plan.seen] + 1)
     assert stylizer.stylized() is first
     assert torch.equal(stylizer.sh_dc, kept)
@@ -360,11 +360,11 @@ def test_larger_views_are_brought_down_to_the_limit() -> None:
 def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene: Scene) -> None:
     before = scene.sh_dc.clone()
     settings = make_settings(steps_sos=2)
-    colours = stylize(scene, cameras(2), style(), settings, weights=tiny_weights)
+    colors = stylize(scene, cameras(2), style(), settings, weights=tiny_weights)
     assert torch.equal(scene.sh_dc, before)
-    assert colours.shape == before.shape
-    assert not torch.equal(colours, before)
-    assert not colours.requires_grad
+    assert colors.shape == before.shape
+    assert not torch.equal(colors, before)
+    assert not colors.requires_grad
 
 
 class ClockEvent:

@@ -1,4 +1,4 @@
-"""What lies behind an object in a step: the same colour for the same seed, step and view, and nothing else changes."""
+"""What lies behind an object in a step: the same color for the same seed, step and view, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_ch
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.surround import Colour, drawn_colour, put_behind
+from sgsst_core.stylizing.surround import Color, drawn_color, put_behind
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-COLOUR: Colour = (0.2, 0.9, 0.4)
+COLOR: Color = (0.2, 0.9, 0.4)
 
 
 def make(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) -> Stylizer:
@@ -31,24 +31,24 @@ def make(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) 
     return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
 
 
-# --- which colour --------------------------------------------------------------------------------------------------
+# --- which color --------------------------------------------------------------------------------------------------
 
 
-def test_a_colour_follows_from_seed_step_and_view_alone() -> None:
+def test_a_color_follows_from_seed_step_and_view_alone() -> None:
     """One of them is written down: it must be the same on every machine and with every version."""
     picture_ = style()
-    assert drawn_colour("random", 5, 7, 11, picture_) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
-    colours = {
-        numbers: drawn_colour("random", *numbers, picture_)
+    assert drawn_color("random", 5, 7, 11, picture_) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
+    colors = {
+        numbers: drawn_color("random", *numbers, picture_)
         for numbers in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (2**63 - 1, 10**6, 300), (0, 11, 1), (0, 1, 11))
     }
-    assert len(set(colours.values())) == len(colours)
-    assert all(drawn_colour("random", *numbers, picture_) == colour for numbers, colour in colours.items())
-    assert drawn_colour("background", 0, 0, 0, picture_) is None
+    assert len(set(colors.values())) == len(colors)
+    assert all(drawn_color("random", *numbers, picture_) == color for numbers, color in colors.items())
+    assert drawn_color("background", 0, 0, 0, picture_) is None
 
 
-def test_random_colours_are_uniform() -> None:
-    drawn = torch.tensor([drawn_colour("random", 7, step, 2, style()) for step in range(4000)])
+def test_random_colors_are_uniform() -> None:
+    drawn = torch.tensor([drawn_color("random", 7, step, 2, style()) for step in range(4000)])
     assert 0 <= float(drawn.min()) < 0.01
     assert 0.99 < float(drawn.max()) < 1
     # Standard errors are 0.0046 of the means and about 0.0013 of the covariances.
@@ -56,10 +56,10 @@ def test_random_colours_are_uniform() -> None:
     torch.testing.assert_close(torch.cov(drawn.T), torch.eye(3) / 12, rtol=0, atol=0.006)
 
 
-def test_colours_of_the_palette_are_those_of_the_styles_pixels() -> None:
+def test_colors_of_the_palette_are_those_of_the_styles_pixels() -> None:
     picture_ = torch.tensor([[[0.1, 0.2, 0.3], [0.9, 0.5, 0.0], [0.9, 0.5, 0.0]], [[1.0, 1.0, 1.0]] * 3])
-    drawn = [drawn_colour("palette", 0, step, 0, picture_) for step in range(3000)]
-    shares = {colour: drawn.count(colour) / len(drawn) for colour in set(drawn)}
+    drawn = [drawn_color("palette", 0, step, 0, picture_) for step in range(3000)]
+    shares = {color: drawn.count(color) / len(drawn) for color in set(drawn)}
     expected = {tuple(pixel.tolist()): 1 / 6 for pixel in picture_.reshape(-1, 3)}
     expected |= {tuple(picture_[0, 1].tolist()): 2 / 6, (1.0, 1.0, 1.0): 3 / 6}
     assert shares == pytest.approx(expected, abs=0.03)
@@ -69,19 +69,17 @@ def test_colours_of_the_palette_are_those_of_the_styles_pixels() -> None:
 
 
 @pytest.mark.parametrize("scale", [0, 2])
-def test_another_colour_behind_is_what_is_rendered_with_it(scale: int) -> None:
+def test_another_color_behind_is_what_is_rendered_with_it(scale: int) -> None:
     scene, camera, present = ball(), cameras(1)[0], (0.7, 0.0, 0.3)
-    colours = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    over, expected = (
-        ReferenceRasterizer(scene, background=colour).render(colours, camera) for colour in (present, COLOUR)
-    )
+    colors = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    over, expected = (ReferenceRasterizer(scene, background=color).render(colors, camera) for color in (present, COLOR))
     coverage = ReferenceRasterizer(scene).coverage(camera)
-    found = put_behind(downscale(over, scale), downscale(coverage, scale), COLOUR, present)
+    found = put_behind(downscale(over, scale), downscale(coverage, scale), COLOR, present)
     torch.testing.assert_close(found, downscale(expected, scale), rtol=0, atol=1e-12)
-    assert put_behind(over.float(), coverage.float(), COLOUR, present).dtype == torch.float32
+    assert put_behind(over.float(), coverage.float(), COLOR, present).dtype == torch.float32
 
 
-def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Colour | None) -> tuple[Any, Any]:
+def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Color | None) -> tuple[Any, Any]:
     target, targets = stylizer.views.target(index, scales, behind), stylizer.style_targets(stylizer.views.cameras[0])
     return stylizer._gradient(index, targets, target, scales, behind)
 
@@ -94,12 +92,12 @@ def test_a_steps_gradient_is_that_of_a_job_with_this_background(
     """Content included, whether or not images of it are kept."""
     keep = () if kept == "kept" else ("content",)
     drawn = make(tiny_weights, ball(), surround="random", background=(0.1, 0.1, 0.5), keep=keep)
-    fixed = make(tiny_weights, ball(), surround="background", background=COLOUR)
+    fixed = make(tiny_weights, ball(), surround="background", background=COLOR)
     with torch.no_grad():
         drawn.sh_dc += 0.3
         fixed.sh_dc.copy_(drawn.sh_dc)
     for _ in range(2):
-        found, loss = drawn_gradient(drawn, 1, scales, COLOUR)
+        found, loss = drawn_gradient(drawn, 1, scales, COLOR)
         expected, exact = drawn_gradient(fixed, 1, scales, None)
         assert loss.loss == pytest.approx(exact.loss, rel=1e-5)
         assert loss.terms[scales[-1]]["content"] == pytest.approx(exact.terms[scales[-1]]["content"], rel=1e-3)
@@ -107,20 +105,20 @@ def test_a_steps_gradient_is_that_of_a_job_with_this_background(
         assert relative_error(found, expected) < 1e-4
 
 
-def test_photos_have_the_colour_where_no_gaussian_is(tiny_weights: BackboneWeights) -> None:
+def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeights) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(surround="random", steps_sos=2)
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
     coverage = stylizer.views.coverage(0)[0][..., None]
-    content = coverage * photo + (1 - coverage) * torch.tensor(COLOUR)
+    content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
     expected = stylizer.loss.view_target(content, coverage[..., 0]).content[0]
-    found = stylizer.views.target(0, [0], COLOUR).content[0]
+    found = stylizer.views.target(0, [0], COLOR).content[0]
     for tile, features in expected.items():
         torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)
 
 
 def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
-    """Loss before and after, on the colour of the settings, whatever was behind in steps."""
+    """Loss before and after, on the color of the settings, whatever was behind in steps."""
     values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
     drawn, fixed = (make(tiny_weights, ball(), surround=kind, **values) for kind in ("palette", "background"))
     assert drawn.start() == fixed.start()
@@ -170,7 +168,7 @@ def test_the_paper_is_the_papers_for_scans_too(tiny_weights: BackboneWeights) ->
     assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.plan.seen])
 
 
-def test_losses_with_different_colours_behind_do_not_end_a_run_early(
+def test_losses_with_different_colors_behind_do_not_end_a_run_early(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A target is compared with the loss on the background, once in a round."""

@@ -1,4 +1,4 @@
-"""Colours that start as the style's: with its distribution, or with its mean and covariance alone."""
+"""Colors that start as the style's: with its distribution, or with its mean and covariance alone."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from tests.sgsst_core.pictures import picture
 Start = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-def moments(colours: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted mean and covariance, written out once more."""
     share = weights / weights.sum()
-    mean = (colours * share[:, None]).sum(0)
+    mean = (colors * share[:, None]).sum(0)
     covariance = torch.zeros(3, 3, dtype=torch.float64)
     for i in range(3):
         for j in range(3):
-            covariance[i, j] = (share * (colours[:, i] - mean[i]) * (colours[:, j] - mean[j])).sum()
+            covariance[i, j] = (share * (colors[:, i] - mean[i]) * (colors[:, j] - mean[j])).sum()
     return mean, covariance
 
 
-def colours_of(sh_dc: Tensor) -> Tensor:
+def colors_of(sh_dc: Tensor) -> Tensor:
     return 0.5 + SH_C0 * sh_dc.double()
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
 def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
     generator = torch.Generator().manual_seed(0)
-    # a style of little contrast in the middle of the range, so that no colour is clamped
+    # a style of little contrast in the middle of the range, so that no color is clamped
     style = 0.45 + 0.1 * picture(40, 50, seed=3).float()
     sh_dc = torch.randn(500, 3, generator=generator) @ torch.tensor([[1.0, 0.5, 0], [0, 1, 0.3], [0, 0, 0.2]])
     weights = scale * torch.rand(500, generator=generator, dtype=torch.float64) ** 4
-    found = moments(colours_of(with_moments(sh_dc, weights, style)), weights)
+    found = moments(colors_of(with_moments(sh_dc, weights, style)), weights)
     pixels = style.reshape(-1, 3).double()
     wanted = moments(pixels, torch.ones(len(pixels), dtype=torch.float64))
     torch.testing.assert_close(found[0], wanted[0], rtol=1e-5, atol=1e-6)
@@ -46,23 +46,23 @@ def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
 
 
 @pytest.mark.parametrize("start", [with_moments, warm_start])
-def test_colours_that_match_already_stay(start: Start) -> None:
+def test_colors_that_match_already_stay(start: Start) -> None:
     style = picture(30, 30, seed=2).float()
     sh_dc = (style.reshape(-1, 3) - 0.5) / SH_C0
     found = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), style)
     if start is with_moments:
         torch.testing.assert_close(found, sh_dc, rtol=1e-4, atol=1e-4)
     else:
-        torch.testing.assert_close(colours_of(found), colours_of(sh_dc), rtol=0, atol=0.06)
+        torch.testing.assert_close(colors_of(found), colors_of(sh_dc), rtol=0, atol=0.06)
 
 
-def test_a_dark_scene_gets_both_colours_of_a_bright_style() -> None:
+def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
     """Mean and covariance alone end in the brighter one for most of what should have been the darker one."""
     style = torch.full((30, 30, 3), 0.9)
     style[:10] = torch.tensor([0.1, 0.2, 0.6])
     generator = torch.Generator().manual_seed(4)
     sh_dc = (0.2 * torch.rand(3000, 1, generator=generator) ** 4 - 0.5).expand(-1, 3) / SH_C0
-    found = colours_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), style))
+    found = colors_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), style))
     blue = (found - style[0, 0]).norm(dim=1) < 0.1
     white = (found - style[-1, 0]).norm(dim=1) < 0.1
     assert float(blue.double().mean()) == pytest.approx(1 / 3, abs=0.02)
@@ -70,31 +70,31 @@ def test_a_dark_scene_gets_both_colours_of_a_bright_style() -> None:
 
 
 def test_pictures_of_a_style_count_by_their_weights() -> None:
-    """Were they of any size: colours are as frequent as in the mixture."""
+    """Were they of any size: colors are as frequent as in the mixture."""
     pictures = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
     mixture = StyleMixture.weighted(pictures, [3.0, 1.0])
     sh_dc = torch.randn(4000, 3, generator=torch.Generator().manual_seed(5))
-    found = colours_of(warm_start(sh_dc, torch.ones(4000, dtype=torch.float64), mixture))
+    found = colors_of(warm_start(sh_dc, torch.ones(4000, dtype=torch.float64), mixture))
     assert float((found < 0.5).all(dim=1).double().mean()) == pytest.approx(0.75, abs=0.02)
 
 
 @pytest.mark.parametrize("start", [with_moments, warm_start])
-@pytest.mark.parametrize("case", ["grey scene", "one colour", "one Gaussian", "style of one colour", "black style"])
-def test_flat_scenes_and_styles_give_finite_colours_in_range(case: str, start: Start) -> None:
+@pytest.mark.parametrize("case", ["gray scene", "one color", "one Gaussian", "style of one color", "black style"])
+def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: Start) -> None:
     generator = torch.Generator().manual_seed(1)
     style = picture(30, 30, seed=2).float()
     sh_dc = torch.randn(50, 3, generator=generator)
-    if case == "grey scene":
+    if case == "gray scene":
         sh_dc = sh_dc[:, :1].expand(-1, 3).contiguous()
-    elif case == "one colour":
+    elif case == "one color":
         sh_dc = torch.full((50, 3), 0.3)
     elif case == "one Gaussian":
         sh_dc = sh_dc[:1]
-    elif case == "style of one colour":
+    elif case == "style of one color":
         style = torch.full((10, 10, 3), 0.25)
     else:
         style = torch.zeros((10, 10, 3))
-    found = colours_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), style))
+    found = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), style))
     assert bool(found.isfinite().all())
     assert -1e-6 <= float(found.min()) <= float(found.max()) <= 1 + 1e-6
     expected = style.reshape(-1, 3).double().mean(0)

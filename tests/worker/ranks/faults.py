@@ -26,7 +26,7 @@ from worker.workplace import OpenWorkplace
 Place = Literal[
     "render",
     "loss",
-    "optimiser",
+    "optimizer",
     "all_gather_rows",
     "reduce_scatter_rows",
     "all_reduce",
@@ -149,7 +149,7 @@ def _fired(request: StylizeRequest) -> Path:
 def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.loss.sos import SosLoss
     from sgsst_core.stylizing import checkpoint
-    from sgsst_core.stylizing.optimiser import ColourOptimiser
+    from sgsst_core.stylizing.optimizer import ColorOptimizer
     from sgsst_core.stylizing.views import Views
     from worker.ranks.process_group import ProcessGroupCollectives
 
@@ -157,7 +157,7 @@ def _places() -> dict[str, tuple[Any, str]]:
     return {
         "render": (Views, "render"),
         "loss": (SosLoss, "evaluate"),
-        "optimiser": (ColourOptimiser, "update"),
+        "optimizer": (ColorOptimizer, "update"),
         "checkpoint": (checkpoint, "_write"),
         **{name: (ProcessGroupCollectives, name) for name in exchanges},
     }

@@ -1,4 +1,4 @@
-"""Jobs on real ranks that are killed, stopped, cut off and cancelled: the result is that of an undisturbed run."""
+"""Jobs on real ranks that are killed, stopped, cut off and canceled: the result is that of an undisturbed run."""
 
 from __future__ import annotations
 

@@ -20,11 +20,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("scene", "values"),
     [
-        pytest.param(wall(sh_degree=1), {"keep_colours": "luminance"}, id="luminance"),
+        pytest.param(wall(sh_degree=1), {"keep_colors": "luminance"}, id="luminance"),
         pytest.param(wall(sh_degree=2), {"sh_fade": 0.3}, id="fading"),
         pytest.param(wall(), {"scales": (1.0, 0.5)}, id="scales"),
         pytest.param(wall(), {"scales": (0.0, 1.0), "style_loss": "mixed"}, id="one-scale"),
-        pytest.param(ball(), {"keep_colours": "luminance", "surround": "palette"}, id="luminance-of-a-scan"),
+        pytest.param(ball(), {"keep_colors": "luminance", "surround": "palette"}, id="luminance-of-a-scan"),
     ],
 )
 def test_ranks_end_where_one_rank_ends(scene: Scene, values: dict[str, Any]) -> None:
@@ -34,5 +34,5 @@ def test_ranks_end_where_one_rank_ends(scene: Scene, values: dict[str, Any]) -> 
         found = on_ranks(ranks, stylize, scene, 3, values)
         for result in found:
             assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
-            assert relative_error(result["colours"], expected["colours"]) < 1e-3
-            assert torch.equal(result["colours"], found[0]["colours"])
+            assert relative_error(result["colors"], expected["colors"]) < 1e-3
+            assert torch.equal(result["colors"], found[0]["colors"])

@@ -32,7 +32,7 @@ from tests.worker.ranks.spawn import on_ranks
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-#: Largest relative error of the colour gradient against one rank's.
+#: Largest relative error of the color gradient against one rank's.
 BOUNDS = {torch.float32: 1e-5, torch.float64: 1e-9}
 
 
@@ -47,7 +47,7 @@ def gradient(
     style_loss: StyleLossName = "sos",
     regions: Regions | None = None,
 ) -> tuple[Tensor, float, list[bool]]:
-    """Colour gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
+    """Color gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
     weights = comparing_pixels(tiny_weights())
     network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
     loss = SosLoss(
@@ -74,12 +74,12 @@ def gradient(
     scales = range(loss.scale_count(camera.height, camera.width))
     target = views.target(0, scales)
     targets = styles.targets(loss, (camera.height, camera.width))
-    colours = views.colours(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
-    result = loss.evaluate(views.render(0, colours), targets, target, scales)
+    colors = views.colors(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
+    result = loss.evaluate(views.render(0, colors), targets, target, scales)
     assert result.image_gradient is not None
     assert target.share is not None
     kept = loss.tiling.kept([tile.outer.pixels for tiles in target.share.tiles.values() for tile in tiles])
-    return views.gradient(0, result.image_gradient, colours), result.loss, kept
+    return views.gradient(0, result.image_gradient, colors), result.loss, kept
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
@@ -160,7 +160,7 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
     stopped = run(stylizer)
     return {
         "stopped": stopped,
-        "colours": stylizer.stylized(),
+        "colors": stylizer.stylized(),
         "losses": [record.loss for record in stylizer.history],
         "views": [record.view for record in stylizer.history],
         "after": stylizer.evaluate(stylizer.evaluation_views),
@@ -178,14 +178,14 @@ def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(sce
     values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.01}
     alone = stylize(ALONE, scene, 3, values)
     first, second = on_ranks(2, stylize, scene, 3, values)
-    assert torch.equal(first["colours"], second["colours"])
+    assert torch.equal(first["colors"], second["colors"])
     assert first["losses"] == second["losses"]
     assert first["losses"] == pytest.approx(alone["losses"], rel=1e-5)
-    assert relative_error(first["colours"], alone["colours"]) < 1e-5
+    assert relative_error(first["colors"], alone["colors"]) < 1e-5
     assert first["views"] == alone["views"]
     assert "ranks" in first["plan"]
     again = on_ranks(2, stylize, scene, 3, values)[0]
-    assert torch.equal(again["colours"], first["colours"])
+    assert torch.equal(again["colors"], first["colors"])
     assert again["losses"] == first["losses"]
 
 
@@ -207,18 +207,18 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
     for result in found:
         assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
         assert result["views"] == expected["views"]
-        assert torch.equal(result["colours"], found[0]["colours"])
+        assert torch.equal(result["colors"], found[0]["colors"])
     assert expected["losses"] != stylize(ALONE, scene, 5, {**values, "views_per_step": 1})["losses"]
 
 
-def test_ranks_draw_the_same_colours_behind_a_scan() -> None:
+def test_ranks_draw_the_same_colors_behind_a_scan() -> None:
     """One rank's, whatever the groups in which views are taken."""
     values = {"steps_coarse": 2, "steps_sos": 3, "views_per_step": 2, "learning_rate": 0.01, "surround": "palette"}
     expected = stylize(ALONE, ball(), 3, values)
     for ranks in (2, 3):
         for result in on_ranks(ranks, stylize, ball(), 3, values):
             assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
-            assert relative_error(result["colours"], expected["colours"]) < 1e-3
+            assert relative_error(result["colors"], expected["colors"]) < 1e-3
     assert expected["losses"] != stylize(ALONE, ball(), 3, {**values, "surround": "random"})["losses"]
 
 
@@ -257,12 +257,12 @@ def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[st
     if collectives.rank == 1:
         stylizer.network.forward = slowly  # type: ignore[method-assign]
     before = stylizer.gradient(0, [0])[0]
-    colours = stylizer.sh_dc.detach().clone()
+    colors = stylizer.sh_dc.detach().clone()
     for _ in range(8):
         stylizer.run_step()
     speeds = stylizer.loss.speeds
     with torch.no_grad():
-        stylizer.sh_dc.copy_(colours)
+        stylizer.sh_dc.copy_(colors)
     return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}
 
 

@@ -36,9 +36,9 @@ def test_an_error_of_the_job_is_raised_at_once() -> None:
 
 
 def test_ranks_that_drifted_are_tried_again() -> None:
-    failure = raised(RanksDriftedError("Rank 1 has other colours."))
+    failure = raised(RanksDriftedError("Rank 1 has other colors."))
     assert failure.kind == "loss"
-    assert decide([failed(failure, 5)]) == TryAgain("Worker 0 on here failed: Rank 1 has other colours, after step 5.")
+    assert decide([failed(failure, 5)]) == TryAgain("Worker 0 on here failed: Rank 1 has other colors, after step 5.")
 
 
 @pytest.mark.parametrize("progressed", [True, False])

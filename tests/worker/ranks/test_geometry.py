@@ -20,7 +20,7 @@ from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
-from sgsst_core.scene.spherical_harmonics import rest_colours
+from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
@@ -89,12 +89,12 @@ def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path
             read_shared_scene(path, ALONE)
 
 
-def shared_colours(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
-    """Of a scene whose harmonics stay in the file: whether they do on a rank, what they are, and a view's colours."""
+def shared_colors(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
+    """Of a scene whose harmonics stay in the file: whether they do on a rank, what they are, and a view's colors."""
     with patch.object(ply, "HELD_BYTES", 0):
         scene = read_shared_scene(path, collectives, drop_invalid=drop)[0].scene
     stored = isinstance(scene.sh_rest, StoredHarmonics)
-    return stored, held(scene.sh_rest), rest_colours(scene.sh_rest, scene.means, orbit(scene, 1)[0])
+    return stored, held(scene.sh_rest), rest_colors(scene.sh_rest, scene.means, orbit(scene, 1)[0])
 
 
 @linux
@@ -105,11 +105,11 @@ def test_harmonics_in_the_file_are_read_there_by_every_rank(tmp_path: Path, drop
         scene.opacities[7] = float("nan")
     write_scene(tmp_path / "scene.ply", scene)
     plain = read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene
-    colours = rest_colours(plain.sh_rest, plain.means, orbit(plain, 1)[0])
-    for stored, values, own in on_ranks(2, shared_colours, tmp_path / "scene.ply", drop):
+    colors = rest_colors(plain.sh_rest, plain.means, orbit(plain, 1)[0])
+    for stored, values, own in on_ranks(2, shared_colors, tmp_path / "scene.ply", drop):
         assert stored
         assert torch.equal(values, held(plain.sh_rest))
-        assert torch.equal(own, colours)
+        assert torch.equal(own, colors)
 
 
 def refused(collectives: Collectives, path: Path) -> str:

@@ -62,7 +62,7 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
-    Fault(0, "optimiser", 10, "SIGKILL").write(request)
+    Fault(0, "optimizer", 10, "SIGKILL").write(request)
     given_back: list[str] = []
     happened: list[str] = []
     ranks_alive: list[int] = []

@@ -101,7 +101,7 @@ def test_statistics_are_merged_as_if_all_positions_were_on_one_rank(empty: int |
 def test_nothing_at_all_stays_nothing() -> None:
     for statistics in on_ranks(2, merge_nothing):
         assert statistics.empty
-        assert not statistics.centred.any()
+        assert not statistics.centered.any()
 
 
 def merge_nothing(collectives: Collectives) -> LayerStatistics:
@@ -165,7 +165,7 @@ def drift(collectives: Collectives) -> str:
 
 def test_ranks_that_drift_apart_are_found() -> None:
     for message in on_ranks(2, drift):
-        assert message.startswith("Step 50: the ranks' colours are no longer the same.")
+        assert message.startswith("Step 50: the ranks' colors are no longer the same.")
 
 
 def leave_out(collectives: Collectives) -> str | int:

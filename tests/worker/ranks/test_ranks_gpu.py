@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
 
 
 def gradient(collectives: Collectives, name: str) -> Tensor:
-    """Colour gradient [n, 3] of one view at two scales, as a step computes it on this machine's devices."""
+    """Color gradient [n, 3] of one view at two scales, as a step computes it on this machine's devices."""
     scene = wall(sh_degree=1) if name == "wall" else ball()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, keep=("ranks",))
     stylizer = Stylizer.planned(
@@ -77,7 +77,7 @@ def merge_beside_other_work(rank: int, size: int, address: str, folder: str) -> 
             for _ in range(20):
                 torch.randn(64, 64, dtype=torch.float64, device=f"cuda:{rank}")
         merged = [wait() for wait in waiting]
-        found = [(parts[0].count, parts[0].mean, parts[0].centred, numbers) for parts, numbers in merged]
+        found = [(parts[0].count, parts[0].mean, parts[0].centered, numbers) for parts, numbers in merged]
         torch.save([[value.cpu() for value in values] for values in found], Path(folder) / f"{rank}.pt")
         link = probe_link(collectives, torch.device("cuda"))
         assert 1e8 < link.bandwidth < 1e13
@@ -99,7 +99,7 @@ def test_statistics_are_merged_beside_other_work(tmp_path: Path) -> None:
         expected = layer_statistics_reference(torch.cat([features(10 * turn), features(10 * turn + 1)]))
         for value, same in zip(own, other, strict=True):
             assert torch.equal(value, same)
-        for value, reference in zip(own, (expected.count, expected.mean, expected.centred), strict=False):
+        for value, reference in zip(own, (expected.count, expected.mean, expected.centered), strict=False):
             assert relative_error(value, reference) < 1e-12
         assert float(own[3]) == 2 * turn + 1
 

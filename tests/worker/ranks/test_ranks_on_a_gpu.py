@@ -24,7 +24,7 @@ STEPS = 4
 
 
 def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int], str]:
-    """Colours, losses and waits of a few steps of one view in two scales; the rasterizer."""
+    """Colors, losses and waits of a few steps of one view in two scales; the rasterizer."""
     settings = make_settings(steps_coarse=0, steps_sos=STEPS, coarsest_side=16, keep=("ranks",), rebalance=False)
     stylizer = Stylizer.planned(
         ball(60), cameras(1, 48, 32), style(), settings, weights=tiny_weights(), collectives=collectives

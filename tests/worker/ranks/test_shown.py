@@ -43,16 +43,16 @@ def pixels(camera: Camera, seed: int) -> Tensor:
 
 
 def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
-    """Colour gradients [N, 3] of two visits, of which all values travel, or those of shown Gaussians alone."""
+    """Color gradients [N, 3] of two visits, of which all values travel, or those of shown Gaussians alone."""
     found: dict[str, Any] = {}
     for name, memory in (("whole", 0), ("shown", 1 << 30)):
         views = make_views(collectives, scene, camera, memory)
-        colours = views.colours(0, scene.sh_dc)
+        colors = views.colors(0, scene.sh_dc)
         sent = [dict(collectives.sent)]
         found[name] = []
         for visit in range(2):
             own = pixels(camera, 10 * visit + collectives.rank)
-            found[name].append(views.gradient(0, own, colours))
+            found[name].append(views.gradient(0, own, colors))
             sent.append(dict(collectives.sent))
         found[f"bytes {name}"] = [
             {kind: after[kind] - before[kind] for kind in after} for before, after in itertools.pairwise(sent)
@@ -63,7 +63,7 @@ def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[st
 def shown_of(scene: Scene, camera: Camera) -> Tensor:
     """[N] bool."""
     ones = torch.ones(camera.height, camera.width, 3)
-    return make_rasterizer("cpu", scene).colour_gradient(ones, camera)[:, 0] > 0
+    return make_rasterizer("cpu", scene).color_gradient(ones, camera)[:, 0] > 0
 
 
 def upper(scene: Scene) -> Scene:

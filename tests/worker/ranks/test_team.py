@@ -21,10 +21,10 @@ def plan(ranks: int) -> Plan:
 
 
 def drift(collectives: Collectives) -> list[str]:
-    """What is said after a step of the same colours, and after two of others."""
+    """What is said after a step of the same colors, and after two of others."""
     team = Team(plan(2), make_settings(), collectives)
-    colours, other = torch.zeros(3, 3), torch.full((3, 3), 1e-6 * collectives.rank)
-    team.check_drift(DRIFT_STEPS, colours)
+    colors, other = torch.zeros(3, 3), torch.full((3, 3), 1e-6 * collectives.rank)
+    team.check_drift(DRIFT_STEPS, colors)
     team.check_drift(DRIFT_STEPS + 1, other)  # nobody looks
     with pytest.raises(RanksDriftedError) as raised:
         team.check_drift(2 * DRIFT_STEPS, other)
@@ -33,7 +33,7 @@ def drift(collectives: Collectives) -> list[str]:
 
 def test_drift_is_found_on_every_rank() -> None:
     for said in on_ranks(2, drift):
-        assert said[0].startswith(f"Step {2 * DRIFT_STEPS}: the ranks' colours are no longer the same.")
+        assert said[0].startswith(f"Step {2 * DRIFT_STEPS}: the ranks' colors are no longer the same.")
 
 
 def speeds(collectives: Collectives, slower: float, rebalance: bool) -> list[tuple[float, ...] | None]:

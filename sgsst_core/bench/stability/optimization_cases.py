@@ -1,4 +1,4 @@
-"""Hard cases of the optimiser: gradients of all sizes, steps that are too large or too many, colours out of range."""
+"""Hard cases of the optimizer: gradients of all sizes, steps that are too large or too many, colors out of range."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.bench.stability.case import Case, CaseResult, compare_losses, texture, vgg16
-from sgsst_core.constants import ALPHA_MIN, COLOUR_OFFSET, SH_C0, TRANSMITTANCE_MIN
+from sgsst_core.constants import ALPHA_MIN, COLOR_OFFSET, SH_C0, TRANSMITTANCE_MIN
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
@@ -22,12 +22,12 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimiser import ADAM_EPS
+from sgsst_core.stylizing.optimizer import ADAM_EPS
 from sgsst_core.stylizing.stylizer import Stylizer
 
 _END = "loss and gradient of the last picture, relative to float64"
 _SIDE = 16
-#: A Gaussian with less total blend weight than this moves no pixel of any view by a grey level.
+#: A Gaussian with less total blend weight than this moves no pixel of any view by a gray level.
 HARDLY_SEEN = 1.0 / 255.0
 
 
@@ -39,16 +39,16 @@ def cases() -> list[Case]:
         ("learning rate 100 times too large", _END, _large_steps),
         ("content weighs 1e-8 of style", _END, partial(_unbalanced, 1e-4)),
         ("content weighs 1e8 times style", _END, partial(_unbalanced, 1e12)),
-        ("colours of 1e3 and -1e3", _END, _far_colours),
-        ("colours beyond what float32 can optimise", "steps taken", _diverged),
+        ("colors of 1e3 and -1e3", _END, _far_colors),
+        ("colors beyond what float32 can optimize", "steps taken", _diverged),
         ("100,000 steps", "rise of the loss above its lowest", _many_steps),
         ("stopped and resumed in the middle", "values against an uninterrupted run", _resumed),
     ]
-    return [Case(name, "stiff optimisation", measure, measured) for name, measure, measured in found]
+    return [Case(name, "stiff optimization", measure, measured) for name, measure, measured in found]
 
 
 class _OnShallowLayers(Stylizer):
-    """The optimiser as it is, on two style layers: what is strained is not the network, and steps are quick."""
+    """The optimizer as it is, on two style layers: what is strained is not the network, and steps are quick."""
 
     def _network(self, weights: BackboneWeights) -> FeatureNetwork:
         return FeatureNetwork(weights, STYLE_LAYERS[:2])
@@ -91,21 +91,21 @@ def _style() -> Tensor:
 
 
 def _last_picture(stylizer: Stylizer) -> Tensor:
-    return stylizer.views.render(0, stylizer.views.colours(0, stylizer.sh_dc.detach()))
+    return stylizer.views.render(0, stylizer.views.colors(0, stylizer.sh_dc.detach()))
 
 
 def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
-        return CaseResult(math.inf, 0.0, "colours are not finite")
+        return CaseResult(math.inf, 0.0, "colors are not finite")
     content = stylizer.views.content(0)
     result = compare_losses(_last_picture(stylizer), _style(), content)
     return CaseResult(result.error, result.bound, note)
 
 
 def _outside(stylizer: Stylizer, rows: Tensor) -> float:
-    """How far the colours of some rows ([n] bool) lie outside 0..1 at most."""
-    colours = COLOUR_OFFSET + SH_C0 * stylizer.sh_dc.detach()[rows]
-    return float(torch.maximum(colours - 1, -colours).amax()) if len(colours) else 0.0
+    """How far the colors of some rows ([n] bool) lie outside 0..1 at most."""
+    colors = COLOR_OFFSET + SH_C0 * stylizer.sh_dc.detach()[rows]
+    return float(torch.maximum(colors - 1, -colors).amax()) if len(colors) else 0.0
 
 
 def _weights(full: bool) -> CaseResult:
@@ -120,7 +120,7 @@ def _weights(full: bool) -> CaseResult:
         return CaseResult(math.inf, 0.0, "a weight below what the cut-offs allow")
     return _at_the_end(
         stylizer,
-        f"total weights {float(total.min()):.1e} to {float(total.max()):.1e}; after {stylizer.step} steps colours lie "
+        f"total weights {float(total.min()):.1e} to {float(total.max()):.1e}; after {stylizer.step} steps colors lie "
         f"up to {_outside(stylizer, well):.1f} outside 0..1 where the weight is above 1, and up to "
         f"{_outside(stylizer, hardly):.1f} where it is below 1/255 ({int(hardly.sum())} of {len(total)})",
     )
@@ -147,12 +147,12 @@ def _large_steps(full: bool) -> CaseResult:
         _walls((2.0, 5)), 1000 if full else 100, learning_rate=5.0, learning_rate_end=1.0, content_weight=0
     )
     run(stylizer)
-    colours = COLOUR_OFFSET + SH_C0 * stylizer.sh_dc.detach()
-    stuck = float((colours <= 0).float().mean())
+    colors = COLOR_OFFSET + SH_C0 * stylizer.sh_dc.detach()
+    stuck = float((colors <= 0).float().mean())
     losses = [record.loss for record in stylizer.history]
     return _at_the_end(
         stylizer,
-        f"loss {losses[-1] / losses[0]:.2g} of the first; colours up to {float(colours.max()):.0f}; {stuck:.0%} of the "
+        f"loss {losses[-1] / losses[0]:.2g} of the first; colors up to {float(colors.max()):.0f}; {stuck:.0%} of the "
         "values are negative: black, and without gradient for good",
     )
 
@@ -161,16 +161,16 @@ def _unbalanced(weight: float, full: bool) -> CaseResult:
     return compare_losses(texture(32, 40, 1), texture(32, 40, 2), texture(32, 40, 3), content_weight=weight)
 
 
-def _far_colours(full: bool) -> CaseResult:
+def _far_colors(full: bool) -> CaseResult:
     stylizer = _stylizer(_walls((2.0, 5)), 4, shallow=False)
     with torch.no_grad():
         stylizer.sh_dc.mul_(1e3 / SH_C0)
     run(stylizer)
-    return _at_the_end(stylizer, f"colours up to {float(_last_picture(stylizer).max()):.0f}")
+    return _at_the_end(stylizer, f"colors up to {float(_last_picture(stylizer).max()):.0f}")
 
 
 def _diverged(full: bool) -> CaseResult:
-    """An error instead of NaN in the result; the colours stay what they were."""
+    """An error instead of NaN in the result; the colors stay what they were."""
     stylizer = _stylizer(_walls((2.0, 5)), 3, shallow=False)
     with torch.no_grad():
         stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)
@@ -189,7 +189,7 @@ def _many_steps(full: bool) -> CaseResult:
     stylizer = _stylizer(_walls((2.0, 5), (1.0, 5)), steps, learning_rate=2.5e-3, early_stop=False)
     run(stylizer)
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
-        return CaseResult(math.inf, 0.0, "colours are not finite")
+        return CaseResult(math.inf, 0.0, "colors are not finite")
     window = max(stylizer.total // 50, 1)
     losses = torch.tensor([record.loss for record in stylizer.history], dtype=torch.float64)
     levels = losses.view(-1, window).mean(1)

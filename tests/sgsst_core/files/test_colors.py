@@ -1,4 +1,4 @@
-"""Colours alone as float16: what they lose is bounded."""
+"""Colors alone as float16: what they lose is bounded."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import OutputError
-from sgsst_core.files import colours
-from sgsst_core.files.colours import write_colours
+from sgsst_core.files import colors
+from sgsst_core.files.colors import write_colors
 
 
-def test_colours_come_back_within_their_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(colours, "_BLOCK_ROWS", 100)
+def test_colors_come_back_within_their_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(colors, "_BLOCK_ROWS", 100)
     generator = torch.Generator().manual_seed(1)
     size = torch.rand(1003, 3, generator=generator) * 14 - 9  # from 1e-9 to 1e5
     sh_dc = torch.randn(1003, 3, generator=generator).sign() * 10.0**size
     sh_dc[0] = torch.tensor([1e30, -65520.0, 65519.0])
-    path = tmp_path / "colours.f16"
-    write_colours(path, sh_dc)
+    path = tmp_path / "colors.f16"
+    write_colors(path, sh_dc)
     assert path.stat().st_size == 6 * 1003
     found = np.fromfile(path, "<f2").reshape(-1, 3).astype(np.float64)
     exact = sh_dc.double().clamp(-65504, 65504).numpy()
@@ -29,15 +29,15 @@ def test_colours_come_back_within_their_bound(tmp_path: Path, monkeypatch: pytes
     assert found[0].tolist() == [65504, -65504, 65504]
 
 
-def test_colours_between_black_and_white_keep_their_grey_level(tmp_path: Path) -> None:
+def test_colors_between_black_and_white_keep_their_gray_level(tmp_path: Path) -> None:
     levels = torch.linspace(0, 1, 3 * 10_001, dtype=torch.float64).reshape(-1, 3)
-    write_colours(tmp_path / "c", ((levels - 0.5) / SH_C0).float())
+    write_colors(tmp_path / "c", ((levels - 0.5) / SH_C0).float())
     found = 0.5 + SH_C0 * np.fromfile(tmp_path / "c", "<f2").astype(np.float64).reshape(-1, 3)
     assert 255 * np.abs(found - levels.numpy()).max() < 0.04
 
 
 def test_a_scene_without_gaussians_and_a_place_without_a_folder(tmp_path: Path) -> None:
-    write_colours(tmp_path / "c", torch.zeros(0, 3))
+    write_colors(tmp_path / "c", torch.zeros(0, 3))
     assert (tmp_path / "c").read_bytes() == b""
     with pytest.raises(OutputError):
-        write_colours(tmp_path / "c" / "d", torch.zeros(1, 3))
+        write_colors(tmp_path / "c" / "d", torch.zeros(1, 3))

@@ -1,4 +1,4 @@
-"""Colours that get the distribution of others: against a plain transport without samples, and on what is degenerate."""
+"""Colors that get the distribution of others: against a plain transport without samples, and on what is degenerate."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.stylizing import colour_transport
-from sgsst_core.stylizing.colour_transport import _drawn, _rounds, _through, _through_compiled, _turns, transported
+from sgsst_core.stylizing import color_transport
+from sgsst_core.stylizing.color_transport import _drawn, _rounds, _through, _through_compiled, _turns, transported
 
 Array = NDArray[np.float64]
 
 
-def colours(count: int, seed: int) -> Tensor:
-    """Two heaps of colours, one of them long and thin."""
+def colors(count: int, seed: int) -> Tensor:
+    """Two heaps of colors, one of them long and thin."""
     generator = torch.Generator().manual_seed(seed)
     heap = 0.2 + 0.05 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     long = 0.7 + 0.2 * torch.randn(count, 1, generator=generator, dtype=torch.float64) * torch.tensor([0.6, 0.3, -0.7])
@@ -28,7 +28,7 @@ def weights(count: int, seed: int) -> Tensor:
 
 
 def plain(moved: Array, weight: Array, wanted: Array) -> Array:
-    """The same with all colours and without knots: each value becomes the one at its own share of the weight."""
+    """The same with all colors and without knots: each value becomes the one at its own share of the weight."""
     moved = moved.copy()
     for axes in (turn.numpy() for turn in _turns()):
         turned, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
@@ -54,7 +54,7 @@ def distance(first: Tensor, second: Tensor) -> float:
 
 def test_turns_are_turns_and_all_differ() -> None:
     turns = list(_turns())
-    assert len(turns) == colour_transport.ROUNDS
+    assert len(turns) == color_transport.ROUNDS
     for turn in turns:
         torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
         assert torch.linalg.det(turn) == pytest.approx(1)
@@ -63,32 +63,32 @@ def test_turns_are_turns_and_all_differ() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
-def test_weighted_colours_get_the_distribution_that_is_wanted(scale: float) -> None:
-    own, count, wanted = colours(4000, 0), scale * weights(4000, 1), 1 - colours(3000, 2)
+def test_weighted_colors_get_the_distribution_that_is_wanted(scale: float) -> None:
+    own, count, wanted = colors(4000, 0), scale * weights(4000, 1), 1 - colors(3000, 2)
     found = transported(own, count, wanted)
     assert distance(own[_drawn(count)], wanted) > 0.1
     assert distance(found[_drawn(count)], wanted) < 0.01
 
 
 def test_samples_and_knots_are_near_a_transport_without_them() -> None:
-    own, count, wanted = colours(3000, 3), weights(3000, 4), 1 - colours(2000, 5)
+    own, count, wanted = colors(3000, 3), weights(3000, 4), 1 - colors(2000, 5)
     expected = torch.from_numpy(plain(own.numpy(), count.numpy(), wanted.numpy()))
     error = (transported(own, count, wanted) - expected).norm(dim=1)
-    seen = count > 0.01  # what hardly counts lies anywhere between its neighbours
+    seen = count > 0.01  # what hardly counts lies anywhere between its neighbors
     assert float(error[seen].median()) < 0.01
     assert float(error[seen].quantile(0.95)) < 0.06
     assert float((own - expected).norm(dim=1).median()) > 0.2
 
 
 def test_a_distribution_that_is_there_already_stays() -> None:
-    own = colours(5000, 6)
+    own = colors(5000, 6)
     error = (transported(own, torch.ones(5000, dtype=torch.float64), own) - own).norm(dim=1)
     assert float(error.mean()) < 1e-3
     assert float(error.max()) < 0.06, "of the outermost ones, between which there is nothing"
 
 
-def test_equal_colours_stay_equal_and_what_has_no_weight_changes_nothing() -> None:
-    own, count, wanted = colours(500, 7), weights(500, 8), colours(500, 9)
+def test_equal_colors_stay_equal_and_what_has_no_weight_changes_nothing() -> None:
+    own, count, wanted = colors(500, 7), weights(500, 8), colors(500, 9)
     more = torch.cat([own, own[:100], 5 - own])
     less = torch.cat([count, torch.zeros(600, dtype=torch.float64)])
     found = transported(more, less, wanted)
@@ -97,8 +97,8 @@ def test_equal_colours_stay_equal_and_what_has_no_weight_changes_nothing() -> No
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e30])
-def test_colours_of_any_size_end_near_the_wanted_ones(size: float) -> None:
-    own, wanted = size * (colours(800, 10) - 0.5), colours(900, 11)
+def test_colors_of_any_size_end_near_the_wanted_ones(size: float) -> None:
+    own, wanted = size * (colors(800, 10) - 0.5), colors(900, 11)
     found = transported(own, torch.ones(800, dtype=torch.float64), wanted)
     assert bool(found.isfinite().all())
     assert float(found.min()) > -0.3
@@ -106,8 +106,8 @@ def test_colours_of_any_size_end_near_the_wanted_ones(size: float) -> None:
     torch.testing.assert_close(found.mean(0), wanted.mean(0), rtol=0, atol=0.05)
 
 
-def test_one_colour_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
-    wanted = colours(1000, 12)
+def test_one_color_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
+    wanted = colors(1000, 12)
     own = torch.full((100_000, 3), 0.1, dtype=torch.float64)
     own += 1e-9 * torch.randn(own.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = transported(own, torch.ones(len(own), dtype=torch.float64), wanted)
@@ -117,7 +117,7 @@ def test_one_colour_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
 
 @pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])
 def test_the_compiled_kernel_does_what_tensors_do(case: str) -> None:
-    own, count, wanted = colours(3000, 13), weights(3000, 14), colours(700, 15)
+    own, count, wanted = colors(3000, 13), weights(3000, 14), colors(700, 15)
     if case == "far":  # most knots in one of the cells
         own[::100] *= 50
     if case == "flat":

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.stylizing.optimiser import ADAM_EPS, ColourOptimiser
+from sgsst_core.stylizing.optimizer import ADAM_EPS, ColorOptimizer
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
@@ -30,39 +30,39 @@ def rate(step: int) -> float:
 
 def test_steps_are_those_of_pytorchs_class() -> None:
     start = torch.randn((90, 3), generator=torch.Generator().manual_seed(2)).to(DEVICE)
-    colours, theirs = start.clone(), start.clone().requires_grad_()
-    optimiser = ColourOptimiser(colours)
+    colors, theirs = start.clone(), start.clone().requires_grad_()
+    optimizer = ColorOptimizer(colors)
     adam = torch.optim.Adam([theirs], lr=1.0, eps=ADAM_EPS, fused=DEVICE == "cuda")
     for step, gradient in enumerate(gradients()):
         adam.param_groups[0]["lr"] = rate(step)
         theirs.grad = gradient
         adam.step()
-        optimiser.update(gradient, rate(step))
-        assert torch.equal(colours.detach(), theirs.detach()), step
-    first, second = optimiser.moments()
+        optimizer.update(gradient, rate(step))
+        assert torch.equal(colors.detach(), theirs.detach()), step
+    first, second = optimizer.moments()
     assert torch.equal(first, adam.state[theirs]["exp_avg"].cpu())
     assert torch.equal(second, adam.state[theirs]["exp_avg_sq"].cpu())
 
 
 def test_loaded_moments_go_on_to_the_bit() -> None:
     start = torch.randn((90, 3), generator=torch.Generator().manual_seed(2)).to(DEVICE)
-    whole = ColourOptimiser(colours := start.clone())
+    whole = ColorOptimizer(colors := start.clone())
     for step, gradient in enumerate(gradients()):
         if step == STEPS // 2:
-            again = ColourOptimiser(half := colours.detach().clone())
+            again = ColorOptimizer(half := colors.detach().clone())
             again.load_moments(step, *whole.moments())
         whole.update(gradient, rate(step))
         if step >= STEPS // 2:
             again.update(gradient, rate(step))
-    assert torch.equal(half.detach(), colours.detach())
+    assert torch.equal(half.detach(), colors.detach())
 
 
 def test_a_step_does_not_load_pytorchs_compiler() -> None:
-    """It takes two seconds and 140 MB of every process that optimises."""
+    """It takes two seconds and 140 MB of every process that optimizes."""
     code = (
         "import sys, torch\n"
-        "from sgsst_core.stylizing.optimiser import ColourOptimiser\n"
-        "ColourOptimiser(torch.zeros(4, 3)).update(torch.ones(4, 3), 0.1)\n"
+        "from sgsst_core.stylizing.optimizer import ColorOptimizer\n"
+        "ColorOptimizer(torch.zeros(4, 3)).update(torch.ones(4, 3), 0.1)\n"
         "sys.exit('torch._dynamo' in sys.modules)\n"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

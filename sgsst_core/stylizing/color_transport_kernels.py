@@ -1,4 +1,4 @@
-"""Compiled kernel of `colour_transport` on CPUs: all rounds in one pass over the colours, on all cores."""
+"""Compiled kernel of `color_transport` on CPUs: all rounds in one pass over the colors, on all cores."""
 
 # The types of compiled functions are those of their arguments.
 # mypy: disable-error-code="no-untyped-def"
@@ -10,7 +10,7 @@ import numpy as np
 
 from sgsst_core.compiled import compiled
 
-#: Colours that go through one round after another together: they and a round's maps stay in a core's nearest caches.
+#: Colors that go through one round after another together: they and a round's maps stay in a core's nearest caches.
 _TOGETHER = 512
 
 
@@ -33,8 +33,8 @@ def _map(values, places, knots, targets, slopes):
 
 
 @compiled(parallel=True)
-def through(colours, axes, knots, targets):
-    """Colours [n, 3] float64 after all rounds, in place.
+def through(colors, axes, knots, targets):
+    """Colors [n, 3] float64 after all rounds, in place.
 
     Args:
         axes: [r, 3, 3], as columns.
@@ -43,9 +43,9 @@ def through(colours, axes, knots, targets):
     """
     slopes = np.zeros_like(knots)
     slopes[..., :-1] = (targets[..., 1:] - targets[..., :-1]) / (knots[..., 1:] - knots[..., :-1])
-    parts = (len(colours) + _TOGETHER - 1) // _TOGETHER
+    parts = (len(colors) + _TOGETHER - 1) // _TOGETHER
     for part in numba.prange(parts):
-        some = colours[part * _TOGETHER : (part + 1) * _TOGETHER]
+        some = colors[part * _TOGETHER : (part + 1) * _TOGETHER]
         along, places = np.empty((3, len(some))), np.empty(len(some), dtype=np.int64)
         for r in range(len(axes)):
             turn = axes[r]

@@ -1,4 +1,4 @@
-"""Hard cases of the optimiser: gradients of all sizes, steps too large or too many, resuming."""
+"""Hard cases of the optimizer: gradients of all sizes, steps too large or too many, resuming."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sgsst_core.bench.stability import Case
-from sgsst_core.bench.stability import optimisation_cases as optimisation
+from sgsst_core.bench.stability import optimization_cases as optimization
 from sgsst_core.errors import DivergedError
 from tests.stability.hard_cases import check
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 LONG = ("100,000 steps", "total weights from 1e-6 to 1e2 in one scene")
 CASES = [
     pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.name in LONG else [])
-    for case in optimisation.cases()
+    for case in optimization.cases()
 ]
 
 
@@ -27,9 +27,9 @@ def test_stays_within_its_bound(case: Case) -> None:
 
 
 def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
-    """Why their colours run away: Adam's steps know no size."""
-    stylizer = optimisation._stylizer(
-        optimisation._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05, bounded=False
+    """Why their colors run away: Adam's steps know no size."""
+    stylizer = optimization._stylizer(
+        optimization._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05, bounded=False
     )
     weights = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
     before = stylizer.sh_dc.detach().clone()
@@ -39,12 +39,12 @@ def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
     assert change[weights < 1e-2].tolist() == pytest.approx([0.05] * int((weights < 1e-2).sum()), rel=1e-3)
 
 
-def test_a_diverged_run_says_what_to_do_and_keeps_its_colours() -> None:
-    stylizer = optimisation._stylizer(optimisation._walls((2.0, 5)), 3)
+def test_a_diverged_run_says_what_to_do_and_keeps_its_colors() -> None:
+    stylizer = optimization._stylizer(optimization._walls((2.0, 5)), 3)
     with torch.no_grad():
         stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)
     before = stylizer.state()
-    with pytest.raises(DivergedError, match=r"Step 1: the colour gradient has grown to .* --learning-rate than 0.2,"):
+    with pytest.raises(DivergedError, match=r"Step 1: the color gradient has grown to .* --learning-rate than 0.2,"):
         stylizer.run_step()
     assert torch.equal(stylizer.sh_dc.detach(), before.sh_dc)
     assert stylizer.step == 0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Of degree 0, what a coefficient adds to a colour.
+#: Of degree 0, what a coefficient adds to a color.
 SH_C0 = 0.28209479177387814
 
 #: A quarter of a step from the end: what 0 and 255 of 255 stand for, since full and no opacity have no finite logit.
@@ -57,7 +57,7 @@ def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.
 def without_largest(quats: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Index [n] of the largest part of quaternions [n, 4], and the other three [n, 3] with that one made positive.
 
-    Quaternions are normalised; one of length 0 becomes that of no rotation, if its first part is the real one.
+    Quaternions are normalized; one of length 0 becomes that of no rotation, if its first part is the real one.
     """
     values = quats.astype(np.float64)
     largest = np.abs(values).argmax(axis=1)

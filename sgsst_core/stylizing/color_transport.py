@@ -1,9 +1,9 @@
-"""Colours with the distribution of other colours: which one becomes which, by transport along one axis after another.
+"""Colors with the distribution of other colors: which one becomes which, by transport along one axis after another.
 
 Along one axis the optimal transport is known: the smallest value becomes the smallest one wanted, the median the
 median. Done along three axes that are at right angles, then along three others, and so on, the distributions come
-together (Pitié, Kokaram and Dahyot, "Automated colour grading using colour distribution transfer", 2007). It is a map
-of colours, so that equal ones stay equal, and nearly one into the wanted colours' hull, so that nothing is cut off:
+together (Pitié, Kokaram and Dahyot, "Automated color grading using color distribution transfer", 2007). It is a map
+of colors, so that equal ones stay equal, and nearly one into the wanted colors' hull, so that nothing is cut off:
 a dark scene gets the bright style's dark strokes too, where its mean and spread alone would end in white.
 """
 
@@ -16,16 +16,16 @@ import torch
 from torch import Tensor
 
 from sgsst_core.compiled import kernel_threads
-from sgsst_core.stylizing import colour_transport_kernels
+from sgsst_core.stylizing import color_transport_kernels
 
 #: Sets of axes. The distance that is left falls to that of the samples within so many.
 ROUNDS = 16
-#: Colours of each side that distributions are taken from, at most, and values by which one axis is told (a power of 2).
+#: Colors of each side that distributions are taken from, at most, and values by which one axis is told (a power of 2).
 _SAMPLES = 1 << 16
 _KNOTS = 1 << 9
 #: Values that are nearer to each other than this are one: a flat scene must not be pulled apart by its rounding.
 _APART = 1e-6
-#: What colours are brought to first: beyond it their order counts for nothing, and turning them would lose digits.
+#: What colors are brought to first: beyond it their order counts for nothing, and turning them would lose digits.
 _FARTHEST = 10.0
 #: Root of x^4 = x + 4, from which, with the square root of 2, turns spread evenly: Alexa, "Super-Fibonacci Spirals:
 #: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
@@ -35,18 +35,18 @@ _PSI = 1.533751168755204288118041
 _Map = tuple[Tensor, Tensor]
 
 
-def transported(colours: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
-    """Colours with the distribution of others.
+def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
+    """Colors with the distribution of others.
 
     Args:
-        colours: [N, 3] float64, finite.
+        colors: [N, 3] float64, finite.
         weights: [N] float64, how much each counts; none negative, at least one positive.
         wanted: [M, 3] float64 in 0..1, at least one, each of which counts alike.
 
     Returns:
         [N, 3] float64.
     """
-    begun = colours.clamp(-_FARTHEST, _FARTHEST)
+    begun = colors.clamp(-_FARTHEST, _FARTHEST)
     rounds = _rounds(begun[_drawn(weights)], wanted)
     return _through(begun, rounds) if begun.is_cuda else _through_compiled(begun, rounds)
 
@@ -62,16 +62,16 @@ def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
     return found
 
 
-def _through(colours: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """Colours [n, 3] after some rounds."""
+def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
+    """Colors [n, 3] after some rounds."""
     for axes, maps in rounds:
-        along = zip((colours @ axes).unbind(1), maps, strict=True)
-        colours = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
-    return colours
+        along = zip((colors @ axes).unbind(1), maps, strict=True)
+        colors = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
+    return colors
 
 
-def _through_compiled(colours: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """`_through` on CPUs, for many colours."""
+def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
+    """`_through` on CPUs, for many colors."""
     knots = torch.full((len(rounds), 3, _KNOTS), math.inf, dtype=torch.float64)
     targets = torch.empty_like(knots)
     for number, (_, maps) in enumerate(rounds):
@@ -80,14 +80,14 @@ def _through_compiled(colours: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]
             targets[number, axis] = become[-1]
             targets[number, axis, : len(become)] = become
     axes = torch.stack([axes.contiguous() for axes, _ in rounds])
-    moved = colours.clone(memory_format=torch.contiguous_format)
+    moved = colors.clone(memory_format=torch.contiguous_format)
     with kernel_threads():
-        colour_transport_kernels.through(*(part.numpy() for part in (moved, axes, knots, targets)))
+        color_transport_kernels.through(*(part.numpy() for part in (moved, axes, knots, targets)))
     return moved
 
 
 def _drawn(weights: Tensor) -> Tensor:
-    """Places [_SAMPLES] of colours, each as often as it counts: at equal steps of the running sum."""
+    """Places [_SAMPLES] of colors, each as often as it counts: at equal steps of the running sum."""
     running = weights.cumsum(0)
     steps = (torch.arange(_SAMPLES, dtype=running.dtype, device=running.device) + 0.5) * (running[-1] / _SAMPLES)
     return torch.searchsorted(running, steps).clamp_max(len(weights) - 1)

@@ -1,4 +1,4 @@
-"""Colours alone, for who has the rest of a scene already: 6 bytes a Gaussian."""
+"""Colors alone, for who has the rest of a scene already: 6 bytes a Gaussian."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _MOST = 65504.0
 _BLOCK_ROWS = 1 << 20
 
 
-def write_colours(path: Path, sh_dc: Tensor) -> None:
+def write_colors(path: Path, sh_dc: Tensor) -> None:
     """Write f_dc_0..2 of each Gaussian, in their order, as little-endian float16: N x 3, nothing else.
 
     A value is rounded to the nearest, by 2^-11 of itself at most, or by 2^-25 where it is smaller than 2^-14; in the
-    colour that is less than 0.04 of a grey level of 255 for every colour between black and white. What is beyond
+    color that is less than 0.04 of a gray level of 255 for every color between black and white. What is beyond
     +-65504 becomes +-65504. The file appears whole or not at all.
 
     Args:
