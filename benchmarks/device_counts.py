@@ -46,10 +46,10 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     with pretend_cuda() as counts:
         weights = comparing_pixels(tiny_weights("vgg19"))  # as `even` has them
-        plan, workshop = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
+        plan, planning_context = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
         plan = replace(plan, precision=precision)  # however fast this processor computes it
-        kept = workshop if plan.precision == workshop.network.precision else None
-        stylizer = Stylizer(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, workshop=kept)
+        kept = planning_context if plan.precision == planning_context.network.precision else None
+        stylizer = Stylizer(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=kept)
         steps = []
         for _ in range(2):
             counts.clear()

@@ -23,7 +23,7 @@ import torch
 from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.bench.quality import held_out_views
+from sgsst_core.bench.quality import novel_view_names
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene
@@ -36,7 +36,7 @@ from sgsst_core.scene.gaussians import Scene
 
 #: Views on the sheet.
 SHOWN = 3
-COLUMNS = ("style", "palette", "sliced", "content", "features", "swing", "saturated", "seconds")
+COLUMNS = ("style", "palette", "sliced", "content", "features", "background_sensitivity", "saturated", "seconds")
 #: Directions of color, and quantiles along each, that distributions are compared by.
 DIRECTIONS, QUANTILES = 64, 1024
 
@@ -83,9 +83,9 @@ def main() -> None:
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
     """Of all views between those of a job."""
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
-    held_out = held_out_views(stylizer)
-    views = [held_out.cameras[index] for index in held_out.views]
-    return Judge(Lpips(), style, scene, held_out.rasterizer, views, stylizer.settings.background)
+    novel_views = novel_view_names(stylizer)
+    views = [novel_views.cameras[index] for index in novel_views.views]
+    return Judge(Lpips(), style, scene, novel_views.rasterizer, views, stylizer.settings.background)
 
 
 def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:

@@ -313,7 +313,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
     moments, style = passes.style()
     kept = dict.fromkeys(("content", "lists", "colors"), 1.0) if everything_kept else kept_shares(job, loss, coarse)
     missing = {name: 1 - share for name, share in kept.items()}
-    anew = [*forward, *render(job), *passes.scaled()]
+    uncached = [*forward, *render(job), *passes.scaled()]
     frozen = rest(job)
     return {
         "convolutions forward": Part([work for work in forward if work.operations]),
@@ -322,7 +322,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
         "statistics": Part(moments),
         "style gradient": Part(style),
         "content loss": Part(passes.content()),
-        "content features anew": Part(anew, missing["content"], len(anew)),
+        "content features anew": Part(uncached, missing["content"], len(uncached)),
         "pyramid": Part(passes.scaled() + passes.added_up()),
         "render": Part(render(job)),
         "raster gradient": Part(raster_gradient(job)),

@@ -32,7 +32,7 @@ def main() -> None:
     cameras = [resized(camera) for camera in spread(read_cameras(arguments.cameras), arguments.views)]
     results = {}
     for rasterizer, kept in (("cpu", "none"), ("cached", "float32")):
-        settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, kept_weights=kept)
+        settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, cached_weights=kept)
         stylizer = Stylizer.planned(scene, cameras, load_image(arguments.style), settings)
         for _ in cameras:  # the first round prepares views
             stylizer.run_step()

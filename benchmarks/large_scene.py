@@ -144,9 +144,9 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """From a scene in memory to the end of the first step, in parts; the weights of a network are installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
     timer, weights, style = Timer(), load_network_weights("auto"), soft_picture(512)
-    plan, workshop = make_plan(scene, cameras, settings, weights=weights, timer=timer)
+    plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
     with timer("preparing"):
-        stylizer = Stylizer(plan, scene, cameras, style, settings, weights=weights, workshop=workshop)
+        stylizer = Stylizer(plan, scene, cameras, style, settings, weights=weights, planning_context=planning_context)
     with timer("first_step"):
         stylizer.run_step()
     return {f"{name}_seconds_of_a_job": seconds for name, seconds in timer.seconds.items()}

@@ -68,7 +68,7 @@ def judged(outcomes: list[dict[str, Any]]) -> str:
             cell(outcome, "style", 3),
             cell(outcome, "palette", 1),
             f"{outcome['content']:.3f}",
-            f"{outcome['swing']:.3f}",
+            f"{outcome['background_sensitivity']:.3f}",
             f"{short['rmse']:.3f}" if short else "",
             "" if outcome["loss"] is None else f"{outcome['loss']:.3f}",
             str(outcome["steps"] or ""),

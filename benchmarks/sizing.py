@@ -42,9 +42,9 @@ def measured(settings: Settings) -> Probe:
         files = build_demo(Path(folder))
         scene, cameras = read_scene(files.ply).scene, read_cameras(files.cameras)
     fitted = fit_cameras(cameras, settings)
-    workshop = equip(scene, fitted, settings, load_network_weights("auto"), ALONE)
-    looked = survey(workshop.scene, fitted, workshop.rasterizer, ALONE)
-    return measure(workshop, looked, probe_link(ALONE, workshop.network.device))
+    planning_context = equip(scene, fitted, settings, load_network_weights("auto"), ALONE)
+    looked = survey(planning_context.scene, fitted, planning_context.rasterizer, ALONE)
+    return measure(planning_context, looked, probe_link(ALONE, planning_context.network.device))
 
 
 def changed(probe: Probe, gaussians: int, width: int, views: int) -> Probe:

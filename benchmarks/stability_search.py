@@ -90,7 +90,7 @@ def drawn(number: int) -> Situation:
     # Whether the loss falls is asked where steps are short, and the loss is one that steps are made for.
     tame = settings["learning_rate"] <= 0.01 and 0 < settings["content_weight"] <= 3e3 and min(width, height) >= 16
     tame &= min(style.shape[:2]) >= 16 and float(style.std()) > 0.05 and settings["style_loss"] == "sos"
-    tame &= settings.get("keep_colors") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
+    tame &= settings.get("preserve_colors") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
     falls = tame and "scales" not in settings
     weights = even_network() if number % 2 else None  # even numbers: the original network's sizes of features
     return Situation(scene, style, settings, views(width, height), falls=falls, weights=weights)
@@ -162,20 +162,20 @@ def _settings(rng: random.Random) -> dict[str, Any]:
         "seed": rng.randrange(1 << 20),
     }
     chances: dict[str, list[Any]] = {
-        "keep_colors": ["match", "luminance", "luminance"],
-        "sh_fade": [0.5, 0.999, 1.0],
+        "preserve_colors": ["match", "luminance", "luminance"],
+        "sh_attenuation": [0.5, 0.999, 1.0],
         "scales": [(1.0,), (0.0, 1.0), (1.0, 1e-6), (1e12, 3.0)],
         "style_scale": [0.25, 0.6, 2.0, 4.0],
         "style_rotation": [rng.uniform(-360, 360), 90.0, 45.0],
-        "surround": ["random", "palette", "background"],
+        "training_background": ["random", "palette", "background"],
         "background": [(1.0, 1.0, 1.0), (0.2, 0.9, 0.1)],
         "warm_start": [True, False],
         "position_weights": ["on", "off"],
-        "revive": [False],
+        "clamp_aware_gradient": [False],
         "unseen": ["keep"],
         "prune_weight": [_size(rng, 1e-6, 1.0)],
         "views_per_step": [2, 3],
-        "kept_weights": ["float32", "half", "none"],
+        "cached_weights": ["float32", "half", "none"],
         "memory_limit": [1 << 20, 1 << 24],
         "coarsest_side": [16, 32],
     }

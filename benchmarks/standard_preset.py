@@ -47,7 +47,12 @@ def main() -> None:
     file = read_scene(arguments.scene)
     cameras = read_views(arguments.cameras, file.scene, arguments.views, arguments.resolution)
     paper = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "learning_rate": PAPER_RATE}
-    paper |= {"revive": False, "early_stop": False, "surround": "background", "warm_start": False}
+    paper |= {
+        "clamp_aware_gradient": False,
+        "early_stop": False,
+        "training_background": "background",
+        "warm_start": False,
+    }
     results: dict[str, Any] = _stored(f"standard_{arguments.name}")
     for name, values in (("paper", paper), ("standard", {})):
         if arguments.only in (None, name):

@@ -79,7 +79,7 @@ class Target:
     types: dict[str, str] = field(default_factory=dict)
 
 
-def _of_kept_weights(form: str) -> dict[str, Target]:
+def _of_cached_weights(form: str) -> dict[str, Target]:
     scale, weights = _FORMS[form]
     types = {"weights": weights, "gaussians": "*i32"}
     read = {"SCALE": scale, "P": kept_kernels.PIECES.value}
@@ -150,8 +150,8 @@ KERNELS: dict[str, Target] = {
     "survey": Target(kernels.survey, _CUTS, 8, {"height": "i32"}),
     "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
     "count_pieces": Target(kept_kernels.count_pieces, _CUTS, 8),
-    **_of_kept_weights("float32"),
-    **_of_kept_weights("half"),
+    **_of_cached_weights("float32"),
+    **_of_cached_weights("half"),
     **_of_features("float32", _WIDEST, "float32"),
     **_of_features("bfloat16", _WIDEST, "bfloat16"),
     **_of_features("float32", _PIXELS, "pixels"),

@@ -25,7 +25,7 @@ LISTS_BESIDE_WEIGHTS = 16
 
 
 def measuring_memory(memory: int) -> int:
-    """Bytes that what is kept of held-out views may take, and the exact twin's views: of a rank's memory."""
+    """Bytes that what is kept of novel views may take, and the exact twin's views: of a rank's memory."""
     return memory // 16
 
 

@@ -24,13 +24,13 @@ from sgsst_core.options import Declared, Option
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
 PositionWeights = Literal["auto", "on", "off"]
-KeptWeights = Literal["auto", "float32", "half", "none"]
+CachedWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
-KeptColors = Literal["no", "match", "luminance"]
+PreservedColors = Literal["no", "match", "luminance"]
 StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: What lies behind the Gaussians in a step: `Settings.background`, a uniform color, or one of the style's pixels.
-PlannedSurround = Literal["background", "random", "palette"]
-Surround = Literal["auto", "background", "random", "palette"]
+PlannedBackground = Literal["background", "random", "palette"]
+TrainingBackground = Literal["auto", "background", "random", "palette"]
 #: What can be left out without changing the result, for `Settings.keep`.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
@@ -143,7 +143,7 @@ class Settings(BaseModel):
     background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
         (0.0, 0.0, 0.0), description="Color behind the Gaussians."
     )
-    surround: Surround = Field(
+    training_background: TrainingBackground = Field(
         "auto",
         description="What is behind the Gaussians in a step: the background, a random color each time, or that of a "
         "random pixel of the style; auto: by how much of the views is uncovered.",
@@ -155,12 +155,12 @@ class Settings(BaseModel):
     style_rotation: Annotated[float, Option(unit="degrees", metavar="D")] = Field(
         0.0, ge=-360, le=360, description="Turn the style image by D degrees, against the clock."
     )
-    keep_colors: KeptColors = Field(
+    preserve_colors: PreservedColors = Field(
         "no",
         description="match: the style image takes the scene's colors first, so that only its strokes are taken; "
         "luminance: colors change in luminance alone.",
     )
-    sh_fade: Annotated[Share, Option(unit="share", metavar="S")] = Field(
+    sh_attenuation: Annotated[Share, Option(unit="share", metavar="S")] = Field(
         0.0,
         description="Fade colors that depend on the direction of view by S, in the result too: 0 leaves spherical "
         "harmonics as they are, 1 leaves none above degree 0.",
@@ -201,7 +201,7 @@ class Settings(BaseModel):
     warm_start: Annotated[bool | None, Option(flags="--warm-start/--cold-start", default="on")] = Field(
         None, description="Begin with colors that are distributed as the style's; by luminance alone, for scans only."
     )
-    revive: bool = Field(
+    clamp_aware_gradient: bool = Field(
         False, description="Let colors that fell below black come back, by gradients that would raise them."
     )
     bounded: bool = Field(
@@ -223,7 +223,7 @@ class Settings(BaseModel):
     similar_views: Annotated[float, Option(unit="share of the longer side", metavar="S")] = Field(
         0.0, ge=0, lt=1, description="Leave out views that another, shifted by less than S of its side, shows."
     )
-    kept_weights: KeptWeights = Field(
+    cached_weights: CachedWeights = Field(
         "auto", description="How blend weights are kept between steps; auto: as memory allows."
     )
     views_per_step: Annotated[int, Option(unit="views", metavar="V")] = Field(
@@ -237,7 +237,7 @@ class Settings(BaseModel):
         description="Give slower workers less to do, once. Without it a run on as many workers repeats bit for bit "
         "even where they differ in speed.",
     )
-    keep: Annotated[tuple[Item, ...], Option(instead="keep_everything")] = Field(
+    keep: Annotated[tuple[Item, ...], Option(instead="compute_everything")] = Field(
         (), description="Items that are not left out although the scene does not need them; the result is the same."
     )
     measure: Annotated[Share, Option(unit="share of the steps' seconds", metavar="S")] = Field(
@@ -252,7 +252,7 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
-#: colors below 0 on their way and therefore need `revive` (docs/performance.md, "The standard preset"), and begin with
+#: colors below 0 on their way and therefore need `clamp_aware_gradient` (docs/performance.md, "The standard preset"), and begin with
 #: the style's colors, which steps alone reach slowly (docs/quality.md, "What colors begin with"). Phase 1 pays on
 #: large views, and has given what it can after some 80 steps (docs/performance.md, "At the photos' own size").
 _PRESETS: dict[PresetName, dict[str, Any]] = {
@@ -261,7 +261,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "steps_sos": 60,
         "learning_rate": 0.2,
         "learning_rate_end": 0.05,
-        "revive": True,
+        "clamp_aware_gradient": True,
         "bounded": True,
         "max_resolution": 640,
     },
@@ -270,7 +270,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "steps_sos": 200,
         "learning_rate": 0.2,
         "learning_rate_end": 0.02,
-        "revive": True,
+        "clamp_aware_gradient": True,
         "bounded": True,
         "early_stop": True,
     },
@@ -281,7 +281,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "learning_rate_end": 2.5e-3,
         "feature_scale": "paper",
         "position_weights": "off",
-        "surround": "background",
+        "training_background": "background",
         "warm_start": False,
         "unseen": "keep",
     },

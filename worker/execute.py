@@ -171,13 +171,15 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
 
 def _write_ply(job: Job) -> None:
     stylizer = job.stylizer
-    write_stylized(job.scene_file, job.outputs.ply, stylizer.stylized(), sh_fade=stylizer.settings.sh_fade)
+    write_stylized(
+        job.scene_file, job.outputs.ply, stylizer.stylized(), sh_attenuation=stylizer.settings.sh_attenuation
+    )
 
 
 def _only_colors_change(job: Job) -> bool:
     """Whether the result has the rows of the scene's file, each with all that it had but for f_dc."""
-    file, fade = job.scene_file, job.stylizer.settings.sh_fade
-    return file.kept is None and file.copies is None and not (fade and file.scene.sh_degree)
+    file, attenuation = job.scene_file, job.stylizer.settings.sh_attenuation
+    return file.kept is None and file.copies is None and not (attenuation and file.scene.sh_degree)
 
 
 def _write_packed(job: Job) -> PackedLoss | None:

@@ -16,9 +16,9 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture, normalized
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
@@ -81,7 +81,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     scene_file, reader = read_shared_scene(
         source.scene, collectives, drop_invalid=source.drop_invalid, growth=settings.refine
     )
-    together(collectives, lambda: check_fading(scene_file.path, scene_file.header, settings.sh_fade))
+    together(collectives, lambda: check_sh_attenuation(scene_file.path, scene_file.header, settings.sh_attenuation))
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)
     together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))
@@ -113,7 +113,9 @@ def read_regions(
         return style
 
     # One rank selects for all: votes of masks take renders, and processors may round them differently.
-    return collectives.broadcast(lambda: select_regions(request.regions, file, cameras, near, load, settings.sh_fade))
+    return collectives.broadcast(
+        lambda: select_regions(request.regions, file, cameras, near, load, settings.sh_attenuation)
+    )
 
 
 def load_styles(files: Sequence[StyleFile]) -> StyleMixture:

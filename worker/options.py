@@ -86,7 +86,7 @@ class StylizeOptions(_Chosen):
     """What `sgsst stylize` and a job of the service may be told; what is left out is the preset's."""
 
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 where it is installed, else VGG16.")
-    keep_everything: bool = Field(False, description="Leave nothing out; slower, with the same result.")
+    compute_everything: bool = Field(False, description="Leave nothing out; slower, with the same result.")
     workers: Annotated[
         int | None, Option(unit="ranks", metavar="N", default="this process alone; the service decides itself")
     ] = Field(
@@ -100,7 +100,7 @@ class StylizeOptions(_Chosen):
         """The settings that were given, by their names in `Settings`; without the preset."""
         known = declared(Settings)
         given = {known[name].field: getattr(self, name) for name in self.model_fields_set & known.keys() - {"preset"}}
-        given["keep"] = EVERYTHING if self.keep_everything else None
+        given["keep"] = EVERYTHING if self.compute_everything else None
         return {name: value for name, value in given.items() if value is not None}
 
     def settings(self) -> Settings:

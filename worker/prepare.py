@@ -89,11 +89,11 @@ def prepare(
             refinement = refinement if resumed else _refine(inputs, settings, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     regions = inputs.regions and inputs.regions.refined(refinement)
-    plan, workshop, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
+    plan, planning_context, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
     if plan is not None and resumed is not None:
         planned_ranks = resumed.ranks
     else:
-        plan, workshop = make_plan(
+        plan, planning_context = make_plan(
             scene_file.scene,
             inputs.cameras,
             settings,
@@ -118,7 +118,7 @@ def prepare(
             weights=inputs.weights,
             photos=inputs.load_photo,
             collectives=collectives,
-            workshop=workshop,
+            planning_context=planning_context,
             regions=regions,
         )
     stylizer.seconds_by_part.update(timer.seconds)

@@ -217,7 +217,7 @@ def region_options(
             raise SettingsError(f"--region-weight {text}: the weight is not above 0, or too large. Give another.")
         found[name] = region.model_copy(update={"weight": weight})
     for name in keeps:
-        found[name] = known(name, f"--region-keep {name}").model_copy(update={"keep": True})
+        found[name] = known(name, f"--region-freeze {name}").model_copy(update={"keep": True})
     return tuple(found.values())
 
 

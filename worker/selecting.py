@@ -30,7 +30,7 @@ def select_regions(
     cameras: Sequence[Camera],
     near: float,
     load: Callable[[Sequence[StyleFile]], StyleMixture],
-    sh_fade: float = 0.0,
+    sh_attenuation: float = 0.0,
 ) -> Regions | None:
     """The regions that were asked for; None where none were. Of regions that overlap, the later one has the Gaussians.
 
@@ -39,7 +39,7 @@ def select_regions(
         cameras: that masks are matched with, at the sizes that they are stylized at.
         near: plane, as for stylizing.
         load: reads the pictures of a style.
-        sh_fade: by which spherical harmonics fade.
+        sh_attenuation: by which spherical harmonics fade.
 
     Raises:
         InvalidInputError: a file cannot be used, every Gaussian is kept, or some are and all are to fade.
@@ -57,7 +57,7 @@ def select_regions(
         labels[own] = len(every)
         every.append(Region(request.name, request.selection.text, style, request.weight, request.keep, int(own.sum())))
     regions = Regions(tuple(every), labels)
-    check_regions(regions, sh_fade)
+    check_regions(regions, sh_attenuation)
     return regions
 
 

@@ -68,7 +68,7 @@ def submit(
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
-    region_keep: RegionKeepOption = None,
+    region_freeze: RegionKeepOption = None,
     *,
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
@@ -86,7 +86,7 @@ def submit(
     styles = parse_styles(style)
     if len(styles) > 1:
         told["style_weights"] = [file.weight for file in styles]
-    regions = region_options(region or (), region_style or (), region_weight or (), region_keep or ())
+    regions = region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
     theirs = [file for each in region_requests(regions) for file in each.styles]
     pictures = [file.path for file in (*styles, *theirs)]
     if regions:

@@ -107,7 +107,7 @@ def stylize(
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
-    region_keep: RegionKeepOption = None,
+    region_freeze: RegionKeepOption = None,
     *,
     options: StylizeOptions,
     run: RunOptions,
@@ -118,7 +118,9 @@ def stylize(
     from worker.request import SceneRequest, StylizeRequest
 
     source = SceneRequest.of(scene, cameras, options)
-    regions = region_requests(region_options(region or (), region_style or (), region_weight or (), region_keep or ()))
+    regions = region_requests(
+        region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
+    )
     styles = parse_styles(style)
     request = StylizeRequest(source, styles, images, out, options.backbone, run.resume, settings, regions)
     _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
@@ -276,7 +278,7 @@ def plan(
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
-    region_keep: RegionKeepOption = None,
+    region_freeze: RegionKeepOption = None,
     *,
     options: StylizeOptions,
 ) -> None:
@@ -286,7 +288,9 @@ def plan(
 
     settings = options.settings()
     source = SceneRequest.of(scene, cameras, options)
-    regions = region_requests(region_options(region or (), region_style or (), region_weight or (), region_keep or ()))
+    regions = region_requests(
+        region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
+    )
     request = StylizeRequest(source, parse_styles(style), None, out, options.backbone, False, settings, regions)
     with job_bar(error_console) as bar:
         made = make_plan(request, bar.show_planning, sheet)

@@ -12,9 +12,9 @@ from pathlib import Path
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
-from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
+from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.progress import ShowPlanning
@@ -54,7 +54,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
             raise OutputError(f"{sheet}: is not the name of a JPEG file. Name one to write, such as views.jpg.")
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
-    check_fading(file.path, file.header, settings.sh_fade)
+    check_sh_attenuation(file.path, file.header, settings.sh_attenuation)
     weights = load_network_weights(request.backbone)
     style = load_styles(request.styles)  # one that cannot be used is told before the work, too
     regions = read_regions(request, file, fit_cameras(cameras, settings))

@@ -92,7 +92,7 @@ export class ResultStage {
   async openRun(job) {
     const { viewer } = this.stage, name = this.jobs.length > 1 ? job.name || job.id.slice(-6) : say.stylized;
     if (!viewer || this.signal.aborted) return;
-    const fade = job.parameters.sh_fade ?? 0;
+    const fade = job.parameters.sh_attenuation ?? 0;
     if (this.original && sceneOf(job) === sceneOf(this.jobs[0])) {
       try {
         const answer = await ask("GET", artifactPath(job.id, "colors.f16"), { signal: this.signal });

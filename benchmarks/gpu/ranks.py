@@ -51,7 +51,7 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
     quick = sizes == QUICK
     settings = make_settings(
         "standard", steps_coarse=0, steps_sos=STEPS, early_stop=False, keep=("ranks", "unseen"), rebalance=False,
-        kept_weights="none", coarsest_side=24 if quick else None,
+        cached_weights="none", coarsest_side=24 if quick else None,
     )  # fmt: skip
     width, height = sizes.view
     stylizer = Stylizer.planned(

@@ -30,7 +30,7 @@ def run(sizes: Sizes, found: Findings) -> None:
         _harmonics(scene, cameras[0], f"{count}/spherical_harmonics", sizes.repeats, found)
         found.add(f"{count}/device_peak_bytes", peak_bytes(device()))
     for count in sizes.gaussians:
-        _kept(surface_scene(count), cameras[0], f"{count}/kept_weights", sizes.repeats, found)
+        _kept(surface_scene(count), cameras[0], f"{count}/cached_weights", sizes.repeats, found)
 
 
 def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:

@@ -33,7 +33,7 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     quick = sizes == QUICK
     settings = make_settings(
         "standard", steps_coarse=0, steps_sos=1000, early_stop=False, precision=precision,
-        coarsest_side=24 if quick else None, kept_weights="none" if quick else None,
+        coarsest_side=24 if quick else None, cached_weights="none" if quick else None,
     )  # fmt: skip
     stylizer = Stylizer.planned(
         scene,

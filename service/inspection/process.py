@@ -29,11 +29,11 @@ from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
-from sgsst_core.files.fading import check_fading
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
+from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
@@ -106,7 +106,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
                 f"The scene has {declared:,} Gaussians{_once(settings)}; {limits['gaussians']:,} may be.",
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
-        check_fading(file.path, file.header, settings.sh_fade)
+        check_sh_attenuation(file.path, file.header, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _ErrorsOf("style"):
         for path in staged.styles:

@@ -86,7 +86,7 @@ class Variant:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
-PAPER_RATE = {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "revive": False}
+PAPER_RATE = {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "clamp_aware_gradient": False}
 VARIANTS = {
     variant.name: variant
     for variant in (
@@ -98,14 +98,24 @@ VARIANTS = {
         Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
         Variant("cold-start", "standard, from the scene's own colors", settings={"warm_start": False}),
         Variant(
-            "fixed-surround", "standard, with the background behind every step", settings={"surround": "background"}
+            "fixed-background",
+            "standard, with the background behind every step",
+            settings={"training_background": "background"},
         ),
-        Variant("random-surround", "standard, with a random color behind each step", settings={"surround": "random"}),
-        Variant("no-revive", "standard; colors that fall below 0 stay there", settings={"revive": False}),
+        Variant(
+            "random-background",
+            "standard, with a random color behind each step",
+            settings={"training_background": "random"},
+        ),
+        Variant(
+            "no-clamp-aware-gradient",
+            "standard; colors that fall below 0 stay there",
+            settings={"clamp_aware_gradient": False},
+        ),
         Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
         Variant("tf32", "standard with TF32 convolutions", settings={"precision": "tf32"}),
-        Variant("half-weights", "standard with blend weights in half precision", settings={"kept_weights": "half"}),
-        Variant("no-kept-weights", "standard, blend weights computed anew", settings={"kept_weights": "none"}),
+        Variant("half-weights", "standard with blend weights in half precision", settings={"cached_weights": "half"}),
+        Variant("no-cached-weights", "standard, blend weights computed anew", settings={"cached_weights": "none"}),
         Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
         Variant("nnfm", "standard with ARF's nearest-neighbor style loss", settings={"style_loss": "nnfm"}),
         Variant("mixed", "standard with nearest neighbors beside the statistics", settings={"style_loss": "mixed"}),

@@ -24,9 +24,9 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.consistency import Consistency
 from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
-from sgsst_core.quality.held_out import HeldOut, HeldOutMoment
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
+from sgsst_core.quality.novel_views import NovelViewMoment, NovelViews
 from sgsst_core.report.charts import STYLE
 from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.report.palette import INK, color_of
@@ -146,18 +146,18 @@ def compare_quality(
     if lpips is None:
         raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
-    held_out = held_out_views(stylizer)
-    views = [held_out.cameras[index] for index in held_out.views]
-    judge = Judge(lpips, style, scene, held_out.rasterizer, views, stylizer.settings.background)
+    novel_views = novel_view_names(stylizer)
+    views = [novel_views.cameras[index] for index in novel_views.views]
+    judge = Judge(lpips, style, scene, novel_views.rasterizer, views, stylizer.settings.background)
     if not judge.cameras:
         raise SettingsError(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
             f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
         )
-    held_out.lpips = lpips
+    novel_views.lpips = lpips
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
-        found: HeldOutMoment = held_out.measure(sh_dc)
+        found: NovelViewMoment = novel_views.measure(sh_dc)
         judgment = judge.judge(sh_dc)
         assert judgment is not None
         return Outcome(name, what, sh_dc, judgment, found.short, found.long)
@@ -177,10 +177,10 @@ def compare_quality(
     return Quality(outcomes, curves, judge, style)
 
 
-def held_out_views(stylizer: Stylizer) -> HeldOut:
+def novel_view_names(stylizer: Stylizer) -> NovelViews:
     """Views between a job's cameras, of its whole scene."""
     exact = ExactLoss(stylizer, "sos")
-    return HeldOut(
+    return NovelViews(
         stylizer.views.cameras,
         stylizer.views.covered,
         stylizer.scene,

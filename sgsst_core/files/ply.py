@@ -28,9 +28,9 @@ from torch import Tensor
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.compressed_ply import read_compressed_ply, write_compressed_ply
-from sgsst_core.files.fading import Fading, check_fading
 from sgsst_core.files.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, SceneHeader, read_scene_header
+from sgsst_core.files.sh_attenuation import ShAttenuation, check_sh_attenuation
 from sgsst_core.files.splat import read_splat
 from sgsst_core.files.spz import read_spz, write_spz
 from sgsst_core.scene.gaussians import Scene
@@ -190,7 +190,7 @@ def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
     return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * count * header.vertex.count > limit
 
 
-def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: float = 0.0) -> None:
+def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
     """Write the scene's PLY again with new f_dc_0..2; every other byte comes back as it was, but for f_rest_* where
     they fade. A scene of a packed file becomes a PLY as `write_scene` writes it.
 
@@ -202,7 +202,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: f
         source: what `read_scene` gave.
         target: file to write; may be the source itself.
         sh_dc: [N, 3], finite, N = len(source.scene).
-        sh_fade: by how much f_rest_* fade, 0 to 1: see `Scene.faded`.
+        sh_attenuation: by how much f_rest_* fade, 0 to 1: see `Scene.faded`.
 
     Raises:
         SceneError: the source file was changed since it was read, or cannot hold faded coefficients.
@@ -214,17 +214,19 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_fade: f
     if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
     if source.form != "ply" or source.header is None:
-        write_scene(target, replace(source.scene.faded(sh_fade), sh_dc=sh_dc.detach().to("cpu", torch.float32)))
+        write_scene(
+            target, replace(source.scene.attenuated(sh_attenuation), sh_dc=sh_dc.detach().to("cpu", torch.float32))
+        )
         return
-    check_fading(source.path, source.header, sh_fade)
-    fading = Fading.of(source.header, sh_fade)
+    check_sh_attenuation(source.path, source.header, sh_attenuation)
+    attenuation = ShAttenuation.of(source.header, sh_attenuation)
     columns = _new_columns(source, sh_dc.detach().to("cpu", torch.float32))
     with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
         output.write(_header_for(source, source.header))
         if source.header.text:
-            _write_text(source, source.header, columns, fading, file, output)
+            _write_text(source, source.header, columns, attenuation, file, output)
         else:
-            _write_binary(source, source.header, columns, fading, file, output)
+            _write_binary(source, source.header, columns, attenuation, file, output)
 
 
 def write_scene(path: Path, scene: Scene) -> None:
@@ -521,7 +523,7 @@ def _write_binary(
     source: SceneFile,
     header: PlyHeader,
     columns: _NewColumns,
-    fading: Fading | None,
+    attenuation: ShAttenuation | None,
     file: io.BufferedReader,
     output: BinaryIO,
 ) -> None:
@@ -541,8 +543,8 @@ def _write_binary(
             column = values[gaussians]
             different = rows[name].astype(np.float32) != column
             rows[name][different] = column[different]
-        if fading is not None:
-            fading.apply(rows)
+        if attenuation is not None:
+            attenuation.apply(rows)
         output.write(rows.view(np.uint8).data)
     _copy(file, output)
     if file_stamp(source.path) != source.stamp:
@@ -563,14 +565,14 @@ def _write_text(
     source: SceneFile,
     header: PlyHeader,
     columns: _NewColumns,
-    fading: Fading | None,
+    attenuation: ShAttenuation | None,
     file: BinaryIO,
     output: BinaryIO,
 ) -> None:
     vertex = header.vertex
     before = header.elements[: header.elements.index(vertex)]
     order = [prop.name for prop in vertex.properties]
-    names = (*columns, *(fading.names if fading else ()))
+    names = (*columns, *(attenuation.names if attenuation else ()))
     slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
     file.seek(len(header.raw))
     # latin-1 gives every byte back as it came, newline="" every line end
@@ -582,21 +584,23 @@ def _write_text(
         for copies in times:
             line = lines.readline()
             for _ in range(copies):
-                output.write(_changed_line(line, slots, next(values), fading).encode("latin-1"))
+                output.write(_changed_line(line, slots, next(values), attenuation).encode("latin-1"))
     for line in lines:
         output.write(line.encode("latin-1"))
 
 
-def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any], fading: Fading | None) -> str:
+def _changed_line(
+    line: str, slots: list[tuple[int, str]], values: NDArray[Any], attenuation: ShAttenuation | None
+) -> str:
     """A row of text with some of its tokens replaced where their value changes, others that fade; all spacing stays.
 
     Args:
         slots: place and kind of the tokens: those that have a value first.
     """
     tokens = list(re.finditer(r"\S+", line))
-    if fading is not None:
+    if attenuation is not None:
         old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
-        values = np.concatenate([values, fading.faded(old)])
+        values = np.concatenate([values, attenuation.attenuated(old)])
     for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
         token = tokens[slot]
         if np.float32(token[0]) != value:

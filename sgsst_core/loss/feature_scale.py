@@ -64,7 +64,7 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
 def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
     """The network as a job with these settings uses it: at its scale, and shown luminance alone where colors stay."""
     scaled = at_scale(weights, settings.feature_scale)
-    return replace(scaled, gray=True) if settings.keep_colors == "luminance" else scaled
+    return replace(scaled, gray=True) if settings.preserve_colors == "luminance" else scaled
 
 
 def even_scales(weights: BackboneWeights) -> dict[str, float]:

@@ -99,18 +99,18 @@ class Regions:
         return replace(self, labels=labels, active=active, kept_in_view=kept)
 
 
-def check_regions(regions: Regions, sh_fade: float = 0.0) -> None:
+def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:
     """Prove that there is something to stylize, as far as that is known without a look at the views.
 
     Args:
-        sh_fade: by which spherical harmonics fade.
+        sh_attenuation: by which spherical harmonics fade.
 
     Raises:
         SettingsError: every Gaussian is kept, or some are and all are to fade.
     """
-    if sh_fade and bool(regions.kept.any()):
+    if sh_attenuation and bool(regions.kept.any()):
         raise SettingsError(
-            f"--sh-fade {sh_fade:g} would change Gaussians of every region, and some are kept. Leave one of both out."
+            f"--sh-attenuation {sh_attenuation:g} would change Gaussians of every region, and some are kept. Leave one of both out."
         )
     if bool(regions.kept.all()):
         names = ", ".join(region.name for region in regions.every if region.keep)

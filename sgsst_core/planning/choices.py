@@ -17,7 +17,7 @@ from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
-from sgsst_core.settings import PlannedSurround, Precision, Settings
+from sgsst_core.settings import PlannedBackground, Precision, Settings
 
 #: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
 #: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
@@ -26,7 +26,7 @@ LEAST_VISITS = 5
 #: some places only have holes of a few percent.)
 SCAN_SHARE = 0.2
 #: What is behind such an object in a step, if nothing else was asked for (docs/quality.md).
-SCAN_SURROUND: PlannedSurround = "palette"
+SCAN_BACKGROUND: PlannedBackground = "palette"
 
 
 def optimized_gaussians(looked: Survey, settings: Settings) -> Tensor:
@@ -55,7 +55,7 @@ def starts_warm(settings: Settings, *, scan: bool) -> bool:
     By luminance alone that is known of scans only, beside which nothing tells how bright they should be.
     """
     if settings.warm_start is None:
-        return scan or settings.keep_colors != "luminance"
+        return scan or settings.preserve_colors != "luminance"
     return settings.warm_start
 
 
@@ -68,11 +68,11 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
     return warm and not has_statistics(settings.style_loss)
 
 
-def surround_of(settings: Settings, *, scan: bool) -> PlannedSurround:
+def training_background_of(settings: Settings, *, scan: bool) -> PlannedBackground:
     """What is behind the Gaussians in a step."""
-    if settings.surround == "auto":
-        return SCAN_SURROUND if scan else "background"
-    return settings.surround
+    if settings.training_background == "auto":
+        return SCAN_BACKGROUND if scan else "background"
+    return settings.training_background
 
 
 def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
@@ -117,7 +117,7 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
     return options
 
 
-def rasterizer_anew(device: Device, problems: Mapping[str, str]) -> RasterizerName:
+def uncached_rasterizer(device: Device, problems: Mapping[str, str]) -> RasterizerName:
     """The rasterizer that computes blend weights anew: on a GPU the first of `GPU_RASTERIZERS` that works.
 
     Args:

@@ -23,7 +23,7 @@ from sgsst_core.planning.choices import (
     precision_of,
     rendered_gaussians,
     starts_warm,
-    surround_of,
+    training_background_of,
 )
 from sgsst_core.planning.cost import (
     WORKING_SHARE,
@@ -39,7 +39,7 @@ from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
 from sgsst_core.planning.visits import Visits
-from sgsst_core.settings import KeptWeights, Settings
+from sgsst_core.settings import CachedWeights, Settings
 
 #: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
 UNCOVERED_SHARE = 0.01
@@ -140,16 +140,16 @@ class _Deciding:
             covered=probe.distinct,
             weighted=weighted,
             steps_coarse=steps_coarse,
-            surround=surround_of(settings, scan=scan),
+            training_background=training_background_of(settings, scan=scan),
             warm_start=starts_warm(settings, scan=scan),
             memory_limit=probe.machine.memory_limit,
             device=probe.machine.device,
             rasterizer=probe.rasterizer if form == "none" else "cached",
-            anew=next((name for name in GPU_RASTERIZERS if name == probe.rasterizer), "cpu"),
+            uncached=next((name for name in GPU_RASTERIZERS if name == probe.rasterizer), "cpu"),
             precision=precision_of(settings.precision, probe.network.precision_ratio),
             search=probe.machine.device == "cuda" and self._passes_of_a_size(steps_coarse, weighted) >= LEAST_PASSES,
             graphs=self._graphs_pay(steps_coarse, weighted),
-            kept_weights=form,
+            cached_weights=form,
             coarse_weights=self._keeps_coarse(form, steps_coarse / views),
             measured=self.measured,
         )
@@ -170,9 +170,9 @@ class _Deciding:
         phases = bool(steps_coarse) + bool(settings.steps_sos)
         return self._passes_of_a_size(steps_coarse, weighted) >= phases * launches.least_visits
 
-    def _kept_form(self, visits: float) -> KeptWeights:
+    def _kept_form(self, visits: float) -> CachedWeights:
         """How blend weights are kept: exactly where they fit, in half precision where only that fits, where it pays."""
-        raster, form = self.probe.raster, self.settings.kept_weights
+        raster, form = self.probe.raster, self.settings.cached_weights
         if raster.bytes is None or raster.half_bytes is None or "blend-weights" in self.settings.keep:
             return "none"
         if form != "auto":
@@ -189,10 +189,10 @@ class _Deciding:
             return visits >= LEAST_VISITS
         return raster.least_visits is not None and visits >= raster.least_visits
 
-    def _keeps_coarse(self, form: KeptWeights, visits: float) -> bool:
+    def _keeps_coarse(self, form: CachedWeights, visits: float) -> bool:
         """Whether phase 1, with so many visits of each view, keeps the weights of the coarsest scale only."""
         on_cpu = self.probe.machine.device == "cpu" and self.probe.rasterizer not in GPU_RASTERIZERS
-        if form == "none" or self.settings.kept_weights != "auto" or not on_cpu:
+        if form == "none" or self.settings.cached_weights != "auto" or not on_cpu:
             return False
         size = self.probe.raster.bytes if form == "float32" else self.probe.raster.half_bytes
         return visits >= LEAST_VISITS and size is not None and size > self.budget
@@ -203,7 +203,7 @@ class _Deciding:
         found = [
             *decisions.of_scene(probe, plan, settings),
             *decisions.of_views(probe, plan, settings, self.work, shared),
-            *decisions.of_surround(plan, settings, self.visits),
+            *decisions.of_training_background(plan, settings, self.visits),
             *decisions.of_colors(settings),
             *decisions.of_network(probe, settings, self.work, self.activations),
             *decisions.of_rasterizer(probe, plan),

@@ -64,10 +64,10 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
 def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
     scene, degree = probe.scene, probe.scene.used_degree
     if not scene.sh_degree:
-        nothing = ": there is nothing to fade" if settings.sh_fade else ""
+        nothing = ": there is nothing to fade" if settings.sh_attenuation else ""
         return [Decision("spherical harmonics", "no view directions are computed", f"the scene has degree 0{nothing}")]
-    if settings.sh_fade:
-        return [_of_fading(probe, settings.sh_fade)]
+    if settings.sh_attenuation:
+        return [_of_sh_attenuation(probe, settings.sh_attenuation)]
     if "sh" in settings.keep or degree == scene.sh_degree:
         return []
     return [
@@ -80,9 +80,9 @@ def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
     ]
 
 
-def _of_fading(probe: Probe, fade: float) -> Decision:
+def _of_sh_attenuation(probe: Probe, attenuation: float) -> Decision:
     scene = probe.scene
-    if fade == 1:
+    if attenuation == 1:
         return Decision(
             "spherical harmonics",
             f"degrees 1 to {scene.sh_degree} are faded out: no view directions are computed, and the result has zeros",
@@ -92,7 +92,7 @@ def _of_fading(probe: Probe, fade: float) -> Decision:
         )
     return Decision(
         "spherical harmonics",
-        f"coefficients of degrees 1 to {scene.sh_degree} are {1 - fade:.3g} times as large, in the result too; "
+        f"coefficients of degrees 1 to {scene.sh_degree} are {1 - attenuation:.3g} times as large, in the result too; "
         f"evaluated up to degree {scene.used_degree}",
         "asked for",
         error="colors depend less on the direction of view",
@@ -139,22 +139,28 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
     return decisions
 
 
-def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision]:
+def of_training_background(plan: Plan, settings: Settings, visits: Visits) -> list[Decision]:
     """What is behind the Gaussians in a step, and what their colors begin with, where it is not the plain way."""
     share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
     decisions = []
-    if plan.surround != "background":
-        color = {"random": "a random color", "palette": "the color of a random pixel of the style"}[plan.surround]
-        reason = f"{share}: colors would be fitted to one that stays" if settings.surround == "auto" else "asked for"
+    if plan.training_background != "background":
+        color = {"random": "a random color", "palette": "the color of a random pixel of the style"}[
+            plan.training_background
+        ]
+        reason = (
+            f"{share}: colors would be fitted to one that stays"
+            if settings.training_background == "auto"
+            else "asked for"
+        )
         cost = visits.content.always + visits.images.always
         if cost:
             reason += f"; content features are computed with it, {cost:.2g} s in every iteration"
-        decisions.append(Decision("surround", f"{color} each time", reason, error=_ANOTHER_LOSS))
+        decisions.append(Decision("training_background", f"{color} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
         reason = "steps change slowly what all colors have in common"
         if is_scan(plan.survey, weighted=plan.weighted):
             reason = f"{share}: nothing beside the object tells how bright it should be"
-        by_luminance = settings.keep_colors == "luminance"
+        by_luminance = settings.preserve_colors == "luminance"
         begins = "luminance begins with the style's mean and spread" if by_luminance else "colors begin as the style's"
         if ends_with_transfer(settings, warm=True):
             begins += f"; the same once more behind the last step, because {settings.style_loss} lets them go"
@@ -171,7 +177,7 @@ def of_surround(plan: Plan, settings: Settings, visits: Visits) -> list[Decision
 
 def of_colors(settings: Settings) -> list[Decision]:
     """What becomes of the scene's colors, where they do not simply become the style's."""
-    if settings.keep_colors != "luminance":
+    if settings.preserve_colors != "luminance":
         return []
     return [
         Decision(
@@ -279,12 +285,12 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     if plan.device != "cuda":
         return []
     names = {"cuda": "gsplat", "triton": "Triton"}
-    how = f"{names[plan.anew]} on the GPU" if plan.anew in names else "on the CPU"
+    how = f"{names[plan.uncached]} on the GPU" if plan.uncached in names else "on the CPU"
     if plan.rasterizer == "cached":
         how += ", with kept blend weights"
     failed = [f"{names[name]} cannot be used: {problem}" for name, problem in probe.machine.problems.items()]
-    if plan.anew in names:
-        failed.append(f"{names[plan.anew]} works here")
+    if plan.uncached in names:
+        failed.append(f"{names[plan.uncached]} works here")
     return [Decision("rasterizer", how, "; ".join(failed) or "asked for")]
 
 
@@ -339,29 +345,29 @@ def _against_graphs(launches: LaunchCost) -> str:
 def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:
     """Whether blend weights are kept, in `budget` bytes."""
     raster = probe.raster
-    if plan.kept_weights == "none":
+    if plan.cached_weights == "none":
         visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
         reason = f"a view comes {visits:.1f} times"
-        if settings.kept_weights == "none" or "blend-weights" in settings.keep:
+        if settings.cached_weights == "none" or "blend-weights" in settings.keep:
             reason = "asked for"
         elif raster.bytes is None:
             reason = "gsplat keeps none"
-        elif plan.anew in GPU_RASTERIZERS:
+        elif plan.uncached in GPU_RASTERIZERS:
             reason = _why_not_on_a_gpu(raster, reason)
         return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
     room = f"{budget / 1e9:.1f} GB are there for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
     size, error = raster.bytes or 0, "none"
-    if plan.kept_weights == "half":
+    if plan.cached_weights == "half":
         size = raster.half_bytes or 0
         error = "each weight is off by at most 1/2048 of itself: 0.12 of 255 levels in a pixel"
     share = Made(0.0, size, budget, len(plan.covered)).kept
     part = "all" if share == 1 else f"{share:.0%} of the views'"
-    decision = f"{part} kept in {'half precision' if plan.kept_weights == 'half' else 'float32'}"
+    decision = f"{part} kept in {'half precision' if plan.cached_weights == 'half' else 'float32'}"
     if plan.coarse_weights:
         decision += "; in phase 1 only those of the coarsest scale"
     reason = f"they take {size / 1e9:.2f} GB of all views; {room}"
-    if plan.anew in GPU_RASTERIZERS and raster.kept_seconds is not None:
+    if plan.uncached in GPU_RASTERIZERS and raster.kept_seconds is not None:
         reason += f"; {_against(raster)}"
     return Decision(
         "blend weights", decision, reason, seconds=saved * share if saved is not None else None, error=error
@@ -403,7 +409,7 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
                 error="the steps, which work on the same loss",
             )
         )
-    if settings.early_stop and plan.surround != "background":
+    if settings.early_stop and plan.training_background != "background":
         reason = "losses with different colors behind the Gaussians do not tell whether they still fall"
         decisions.append(Decision("early stop", "none: every step is made", reason))
     elif settings.early_stop:

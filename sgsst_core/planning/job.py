@@ -15,7 +15,7 @@ from sgsst_core.planning.measuring import (
     allowed_seconds,
     choose_level,
     choose_loss_views,
-    held_out_seconds,
+    novel_view_seconds,
 )
 from sgsst_core.planning.plan import Decision, Plan, Prediction
 from sgsst_core.planning.probe import Probe
@@ -28,7 +28,7 @@ ENDING_SECONDS = 1.5
 ENDING_SECONDS_A_GAUSSIAN = 4e-6
 #: Of them the search, which every moment takes where some Gaussians are unseen.
 _NEIGHBORS_SECONDS_A_GAUSSIAN = 1.5e-6
-#: Renders that the depth of a held-out view takes.
+#: Renders that the depth of a novel view takes.
 _DEPTH_RENDERS = 2
 
 
@@ -71,7 +71,7 @@ def whole_job(
     ending = ENDING_SECONDS + ENDING_SECONDS_A_GAUSSIAN * probe.scene.gaussians
     expected = replace(expected, evaluation=loss_views * once, losses=loss_views * price, ending=ending)
     prices, total = _prices(expected, plan, probe, settings, work), plan.steps_coarse + settings.steps_sos
-    level = choose_level(prices, held_out_seconds(share, expected), total)
+    level = choose_level(prices, novel_view_seconds(share, expected), total)
     measuring = expected.losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
     return replace(expected, measuring=measuring, job=steps + measuring), Measured(level, loss_views)
 
@@ -90,11 +90,11 @@ def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> floa
 
 
 def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, work: Work) -> Prices:
-    """What held-out views are expected to cost; they lie between the job's, and are taken to be like them."""
+    """What novel views are expected to cost; they lie between the job's, and are taken to be like them."""
     raster, forward = probe.raster, work.pixels * probe.network.rate.forward
     render = RENDER * raster.seconds
     pruned = bool(pruned_gaussians(plan.survey, plan.seen).any())
-    approximated = plan.precision != "float32" or plan.kept_weights == "half" or pruned
+    approximated = plan.precision != "float32" or plan.cached_weights == "half" or pruned
     unseen = settings.unseen == "neighbors" and not bool(plan.seen.all())
     neighbors = _NEIGHBORS_SECONDS_A_GAUSSIAN * probe.scene.gaussians if unseen else 0.0
     return Prices(

@@ -1,8 +1,8 @@
 """What a job measures beside its steps, so that it takes no more than a share of the job's time.
 
-The loss before and after is taken on some of the job's views; held-out views are measured at moments of a run. Half of
+The loss before and after is taken on some of the job's views; novel views are measured at moments of a run. Half of
 what is allowed goes to the loss at most, and its views are fewer where they would take more. What it leaves is for
-held-out views: they and their moments become fewer from level to level (`LEVELS`). The plan takes the first level whose
+novel views: they and their moments become fewer from level to level (`LEVELS`). The plan takes the first level whose
 expected seconds are allowed; the first view that is really measured says whether a later level is needed
 (`quality.measure`). Nothing is measured before the first step, and nothing changes a color.
 """
@@ -21,7 +21,7 @@ _PLANNED = 0.8
 #: Views on which the loss is taken before and after: the most of these that half of the allowed seconds pay for. One is
 #: taken whatever it costs, because a job that cannot say what it has reached is worth little.
 LOSS_VIEWS = (4, 2, 1)
-#: Held-out views of a `Level.views` that are rendered: one for the Gram distance, the others of its pairs.
+#: Novel views of a `Level.views` that are rendered: one for the Gram distance, the others of its pairs.
 RENDERED = 4
 
 
@@ -55,7 +55,7 @@ LEVELS = (
     Level(1, (0,), start=False),
     Level(0, (), start=False),
 )
-#: Place of the level without any held-out view.
+#: Place of the level without any novel view.
 NOTHING = len(LEVELS) - 1
 
 
@@ -87,8 +87,8 @@ def allowed_seconds(share: float, steps: float) -> float:
     return max(LEAST_ALLOWED, share * steps)
 
 
-def held_out_seconds(share: float, expected: Prediction) -> float:
-    """Seconds that held-out views may take: what the loss before and after leaves; none without a share."""
+def novel_view_seconds(share: float, expected: Prediction) -> float:
+    """Seconds that novel views may take: what the loss before and after leaves; none without a share."""
     if not share:
         return 0.0
     return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)

@@ -21,7 +21,7 @@ SHAPE_BYTES, BUILDING_BYTES = 32, 104
 SEARCH_BYTES = 120
 #: Of a view's lists, what gradients of their entries take in a rasterizer's backward pass.
 SLOTS_SHARE = 0.25
-#: Of a pixel of a held-out view: its coverage, and the two warps that lead to or from it.
+#: Of a pixel of a novel view: its coverage, and the two warps that lead to or from it.
 _COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
 
 
@@ -59,7 +59,7 @@ class PeakMemory:
             return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMIZER_BYTES
         everything = probe.scene.gaussians
         building = everything * BUILDING_BYTES
-        kept = self._scene() + self._lists_and_weights() + self._content() + self._colors() + self._held_out()
+        kept = self._scene() + self._lists_and_weights() + self._content() + self._colors() + self._novel_views()
         kept += gaussians * OPTIMIZER_BYTES + measuring
         searching = everything * SEARCH_BYTES if self._unseen_are_searched() else 0
         rastering = gaussians * STEP_BYTES + int(SLOTS_SHARE * probe.raster.lists_bytes)
@@ -111,7 +111,7 @@ class PeakMemory:
         return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
 
     def _other_lists(self) -> int:
-        """Lists of held-out views, and of the exact twin where it has a scene of its own."""
+        """Lists of novel views, and of the exact twin where it has a scene of its own."""
         views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
         if self.level is not None and self._pruned():
             views += self.loss_views
@@ -130,8 +130,8 @@ class PeakMemory:
             copies += int((self.plan.survey.total_blend_weights > 0).sum()) * (each + SHAPE_BYTES)
         return copies
 
-    def _held_out(self) -> int:
-        """What is kept of held-out views beside their lists, and of the exact twin's views."""
+    def _novel_views(self) -> int:
+        """What is kept of novel views beside their lists, and of the exact twin's views."""
         if self.level is None:
             return 0
         memory, kept = measuring_memory(self.probe.machine.memory), 0
@@ -163,7 +163,7 @@ class PeakMemory:
         return bool((self.plan.survey.total_blend_weights[~self.plan.seen] > 0).any())
 
     def _approximated(self) -> bool:
-        return self.plan.precision != "float32" or self.plan.kept_weights == "half" or self._pruned()
+        return self.plan.precision != "float32" or self.plan.cached_weights == "half" or self._pruned()
 
     def _unseen_are_searched(self) -> bool:
         return self.settings.unseen == "neighbors" and not bool(self.plan.seen.all())

@@ -10,7 +10,7 @@ from torch import Tensor
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
 from sgsst_core.scene.split import Refinement
-from sgsst_core.settings import KeptWeights, PlannedSurround, Precision
+from sgsst_core.settings import CachedWeights, PlannedBackground, Precision
 
 Device = Literal["cpu", "cuda"]
 
@@ -83,17 +83,17 @@ class Plan:
         seen: [N] bool, Gaussians that are rendered: the optimized ones, or all for comparison.
         covered: indices of the views that are stylized.
         weighted: statistics are weighted by coverage.
-        surround: what is behind the Gaussians in a step.
+        training_background: what is behind the Gaussians in a step.
         warm_start: the job begins with the style's colors.
         steps_coarse: of phase 1; 0 where it is left out.
         memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
         device: on which the feature network computes.
-        rasterizer: that renders; "cached" keeps blend weights in the form `kept_weights`.
-        anew: rasterizer that computes blend weights, and every time those that are not kept.
+        rasterizer: that renders; "cached" keeps blend weights in the form `cached_weights`.
+        uncached: rasterizer that computes blend weights, and every time those that are not kept.
         precision: of the feature network.
         search: cuDNN tries its algorithms before it chooses (`FeatureNetwork.search`).
         graphs: a view's loss is captured as a graph where it can be (`LossGraphs`).
-        kept_weights: in which form blend weights are kept between iterations.
+        cached_weights: in which form blend weights are kept between iterations.
         coarse_weights: phase 1 keeps the weights of the coarsest scale only.
         measured: the prediction counts what measuring between steps and the report take.
         measuring: what is measured between steps, at most: place in `measuring.LEVELS`.
@@ -111,15 +111,15 @@ class Plan:
     weighted: bool
     steps_coarse: int
     memory_limit: int
-    surround: PlannedSurround = "background"
+    training_background: PlannedBackground = "background"
     warm_start: bool = False
     device: Device = "cpu"
     rasterizer: str = "cpu"
-    anew: RasterizerName = "cpu"
+    uncached: RasterizerName = "cpu"
     precision: Precision = "float32"
     search: bool = False
     graphs: bool = False
-    kept_weights: KeptWeights = "none"
+    cached_weights: CachedWeights = "none"
     coarse_weights: bool = False
     measured: bool = False
     measuring: int = 0

@@ -16,7 +16,7 @@ from sgsst_core.planning.decide import decide
 from sgsst_core.planning.decisions import of_regions, of_styles
 from sgsst_core.planning.orbit import Orbit, orbit_decisions
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.probe import Probe, Workshop, equip, measure
+from sgsst_core.planning.probe import PlanningContext, Probe, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
 from sgsst_core.planning.refine import refine_decision
@@ -44,7 +44,7 @@ def make_plan(
     style: StyleMixture | None = None,
     regions: Regions | None = None,
     refinement: Refinement | None = None,
-) -> tuple[Plan, Workshop]:
+) -> tuple[Plan, PlanningContext]:
     """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
 
     Args:
@@ -77,17 +77,17 @@ def make_plan(
         fitted = fit_cameras(cameras, settings)
         check_scales(settings.scales, fitted, settings.coarsest_side)
         weights = weights_for(weights or load_network_weights("auto"), settings)
-        workshop = equip(scene, fitted, settings, weights, collectives, rasterizer)
-        scene = workshop.scene
+        planning_context = equip(scene, fitted, settings, weights, collectives, rasterizer)
+        scene = planning_context.scene
         if looked is None:
             with timer("survey"):
-                looked = survey(scene, fitted, workshop.rasterizer, collectives, show)
+                looked = survey(scene, fitted, planning_context.rasterizer, collectives, show)
         resolved = regions and regions.resolved(looked.total_blend_weights)
         maps = len(resolved.active) if resolved is not None and resolved.mapped else 0
-        link = probe_link(collectives, workshop.network.device)
+        link = probe_link(collectives, planning_context.network.device)
         # Timings differ from rank to rank: one decides for all.
         plan = collectives.broadcast(
-            lambda: _decide(measure(workshop, looked, link, maps), settings, measured, style, resolved)
+            lambda: _decide(measure(planning_context, looked, link, maps), settings, measured, style, resolved)
         )
         if regions is not None and resolved is not None:
             plan = replace(plan, decisions=(*of_regions(regions, resolved, plan, fitted), *plan.decisions))
@@ -96,7 +96,7 @@ def make_plan(
         if refinement is not None:
             decisions = (refine_decision(refinement, settings), *plan.decisions)
             plan = replace(plan, refinement=refinement, decisions=decisions)
-    return plan, workshop
+    return plan, planning_context
 
 
 def _decide(

@@ -1,6 +1,6 @@
 """What is measured before anything is decided, on the rasterizer and the device that will do the work.
 
-A `Probe` holds plain facts; `decide` makes a plan of them. What measuring builds is a `Workshop`, which the job goes on
+A `Probe` holds plain facts; `decide` makes a plan of them. What measuring builds is a `PlanningContext`, which the job goes on
 to use.
 """
 
@@ -32,9 +32,9 @@ from sgsst_core.planning.choices import (
     optimized_gaussians,
     precision_of,
     pruned_gaussians,
-    rasterizer_anew,
     rasterizer_options,
     rendered_gaussians,
+    uncached_rasterizer,
 )
 from sgsst_core.planning.cost import LaunchCost, RasterCost, Rate
 from sgsst_core.planning.launches import launch_cost
@@ -46,8 +46,8 @@ from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.cached_weights import Precision as WeightPrecision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.kept_weights import Precision as WeightPrecision
 from sgsst_core.rasterizer.projection import Shapes
 from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.trial import drawing_problem
@@ -186,7 +186,7 @@ class Probe:
 
 
 @dataclass(frozen=True)
-class Workshop:
+class PlanningContext:
     """What measuring needs, and a job that follows the plan goes on to use.
 
     Attributes:
@@ -217,14 +217,14 @@ def equip(
     weights: BackboneWeights,
     collectives: Collectives,
     rasterizer: str | None = None,
-) -> Workshop:
+) -> PlanningContext:
     """See what there is to work with. Every rank calls this, and gets the same but for rounding.
 
     Args:
         cameras: at the size at which they are stylized.
         rasterizer: that computes blend weights anew; None chooses.
     """
-    sh_degree, scene = scene.sh_degree, scene.faded(settings.sh_fade)
+    sh_degree, scene = scene.sh_degree, scene.attenuated(settings.sh_attenuation)
     device = common_device(collectives)
     problems = gpu_problems(collectives) if device == "cuda" else {}
     ratio = precision_ratio(settings.precision, device, collectives)
@@ -238,9 +238,9 @@ def equip(
         ranks=collectives.size,
         problems=problems,
     )
-    name = rasterizer or rasterizer_anew(device, problems)
+    name = rasterizer or uncached_rasterizer(device, problems)
     whole = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
-    return Workshop(scene, tuple(cameras), settings, machine, weights, network, ratio, whole, sh_degree)
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, whole, sh_degree)
 
 
 def common_device(collectives: Collectives) -> Device:
@@ -279,7 +279,7 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
-def measure(workshop: Workshop, looked: Survey, link: Link, maps: int = 0) -> Probe:
+def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps: int = 0) -> Probe:
     """Time and count; one rank does it for all, because timings differ from rank to rank.
 
     Args:
@@ -288,30 +288,32 @@ def measure(workshop: Workshop, looked: Survey, link: Link, maps: int = 0) -> Pr
     Raises:
         SettingsError: pruning would leave no Gaussian.
     """
-    scene, cameras, settings = workshop.scene, workshop.cameras, workshop.settings
+    scene, cameras, settings = planning_context.scene, planning_context.cameras, planning_context.settings
     seen = rendered_gaussians(optimized_gaussians(looked, settings), settings)
     distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
-    network = _network_facts(workshop, cameras[distinct[0]], maps)
-    launches = _launch_cost(workshop, [cameras[index] for index in distinct])
-    budget = int(workshop.machine.memory * MEMORY_SHARES["rasterizer"])
-    raster = _raster_cost(workshop, [cameras[index] for index in distinct], budget)
+    network = _network_facts(planning_context, cameras[distinct[0]], maps)
+    launches = _launch_cost(planning_context, [cameras[index] for index in distinct])
+    budget = int(planning_context.machine.memory * MEMORY_SHARES["rasterizer"])
+    raster = _raster_cost(planning_context, [cameras[index] for index in distinct], budget)
     pruned = pruned_gaussians(looked, seen)
-    error = pruned_image_error(~seen, cameras, distinct, workshop.rasterizer) if pruned.any() else None
+    error = pruned_image_error(~seen, cameras, distinct, planning_context.rasterizer) if pruned.any() else None
     used_degree = scene.used_degree(seen)
     held_degree = 0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree
     return Probe(
-        SceneFacts(len(scene), workshop.sh_degree, used_degree, held_degree),
+        SceneFacts(len(scene), planning_context.sh_degree, used_degree, held_degree),
         tuple((camera.height, camera.width) for camera in cameras),
         looked,
         tuple(distinct),
         network,
-        workshop.rasterizer.name,
+        planning_context.rasterizer.name,
         raster,
-        workshop.machine,
+        planning_context.machine,
         link,
         psutil.Process().memory_info().rss,
         error,
-        torch.cuda.memory_allocated(workshop.network.device) if workshop.machine.device == "cuda" else 0,
+        torch.cuda.memory_allocated(planning_context.network.device)
+        if planning_context.machine.device == "cuda"
+        else 0,
         launches,
         maps=maps,
     )
@@ -320,13 +322,15 @@ def measure(workshop: Workshop, looked: Survey, link: Link, maps: int = 0) -> Pr
 # --- the feature network -------------------------------------------------------------------------------------------
 
 
-def _network_facts(workshop: Workshop, first: Camera, maps: int) -> NetworkFacts:
+def _network_facts(planning_context: PlanningContext, first: Camera, maps: int) -> NetworkFacts:
     """Of the network on made-up pictures, and where it is not in float32, its error on the first view."""
-    network, settings, loss = workshop.network, workshop.settings, _loss(workshop)
-    side = min(_side(workshop, loss), max(max(camera.width, camera.height) for camera in workshop.cameras))
+    network, settings, loss = planning_context.network, planning_context.settings, _loss(planning_context)
+    side = min(
+        _side(planning_context, loss), max(max(camera.width, camera.height) for camera in planning_context.cameras)
+    )
     fixed = 0.0
     rate = measure_rate(loss, side, maps)
-    if workshop.machine.ranks > 1:  # as good as no pixel: what it takes is the same for any number
+    if planning_context.machine.ranks > 1:  # as good as no pixel: what it takes is the same for any number
         fixed = measure_rate(loss, ALIGNMENT).both * ALIGNMENT**2
     return NetworkFacts(
         network.halo,
@@ -335,13 +339,13 @@ def _network_facts(workshop: Workshop, first: Camera, maps: int) -> NetworkFacts
         network.channels(CONTENT_LAYER) * torch.finfo(network.dtype).bits // 8 if settings.content_weight else 0,
         rate,
         fixed,
-        workshop.precision_ratio,
+        planning_context.precision_ratio,
         gradient_error(
             network,
-            workshop.weights,
-            workshop.scene,
+            planning_context.weights,
+            planning_context.scene,
             first,
-            workshop.rasterizer,
+            planning_context.rasterizer,
             loss.memory,
             side,
             settings.style_loss,
@@ -351,33 +355,33 @@ def _network_facts(workshop: Workshop, first: Camera, maps: int) -> NetworkFacts
     )
 
 
-def _loss(workshop: Workshop, scales: ScaleWeights = EVEN) -> SosLoss:
+def _loss(planning_context: PlanningContext, scales: ScaleWeights = EVEN) -> SosLoss:
     """As one rank's."""
-    settings = workshop.settings
+    settings = planning_context.settings
     return SosLoss(
-        workshop.network,
+        planning_context.network,
         content_weight=settings.content_weight,
         style_loss=settings.style_loss,
-        memory=int(workshop.machine.memory * MEMORY_SHARES["activations"]),
+        memory=int(planning_context.machine.memory * MEMORY_SHARES["activations"]),
         coarsest=settings.coarsest_side,
         scales=scales,
         keep_activations="activations" not in settings.keep,
     )
 
 
-def _launch_cost(workshop: Workshop, views: Sequence[Camera]) -> LaunchCost | None:
+def _launch_cost(planning_context: PlanningContext, views: Sequence[Camera]) -> LaunchCost | None:
     """Of the first view, on a GPU, where views of one size come often enough for graphs to be thought of."""
-    settings, sizes = workshop.settings, {(camera.height, camera.width) for camera in views}
+    settings, sizes = planning_context.settings, {(camera.height, camera.width) for camera in views}
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
-    if workshop.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
+    if planning_context.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
         return None
-    return launch_cost(_loss(workshop, ScaleWeights(settings.scales)), (views[0].height, views[0].width))
+    return launch_cost(_loss(planning_context, ScaleWeights(settings.scales)), (views[0].height, views[0].width))
 
 
-def _side(workshop: Workshop, loss: SosLoss) -> int:
+def _side(planning_context: PlanningContext, loss: SosLoss) -> int:
     """Largest side of pictures for measuring; on a GPU, of those whose activations fit."""
-    most = PROBE_SIDE[workshop.machine.device]
-    if workshop.machine.device == "cpu":
+    most = PROBE_SIDE[planning_context.machine.device]
+    if planning_context.machine.device == "cpu":
         return most
     fits = math.isqrt(int(loss.memory / (loss.network.held_bytes_per_pixel() + loss.network.working_bytes_per_pixel())))
     return max(min(most, fits), ALIGNMENT)
@@ -428,9 +432,9 @@ def _search_seconds(units: Tensor) -> float:
 # --- the rasterizer ------------------------------------------------------------------------------------------------
 
 
-def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> RasterCost:
+def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], budget: int) -> RasterCost:
     """Count and time blend weights on a few of some views, evenly spread; `budget`: bytes for kept ones."""
-    scene, rasterizer = workshop.scene, workshop.rasterizer
+    scene, rasterizer = planning_context.scene, planning_context.rasterizer
     count = min(SAMPLED_VIEWS, len(cameras))
     sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
     middle = count // 2
@@ -440,7 +444,7 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
         for camera in sample:
             rasterizer.lists(camera)  # the survey's, where it could keep them
             seconds += _raster_seconds(rasterizer, len(scene), camera)
-        more, lists_bytes = _lists_cost(scene, sample, workshop.settings.near)
+        more, lists_bytes = _lists_cost(scene, sample, planning_context.settings.near)
     else:
         timed = [_raster_seconds(rasterizer, len(scene), camera, visits=2) for camera in sample]
         seconds = [later for _, later in timed]
@@ -454,11 +458,11 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     }
     if rasterizer.name == "cuda":
         return RasterCost(mean, **known)
-    anew = rasterizer
-    if not isinstance(anew, CpuRasterizer | TritonRasterizer):
-        anew = CpuRasterizer(scene, near=workshop.settings.near)
-    cached = CachedRasterizer(scene, anew=anew)
-    if isinstance(anew, CpuRasterizer) and _comes_too_seldom(workshop.settings, len(cameras)):
+    uncached = rasterizer
+    if not isinstance(uncached, CpuRasterizer | TritonRasterizer):
+        uncached = CpuRasterizer(scene, near=planning_context.settings.near)
+    cached = CachedRasterizer(scene, uncached=uncached)
+    if isinstance(uncached, CpuRasterizer) and _comes_too_seldom(planning_context.settings, len(cameras)):
         total, half = (cached.count(sample[middle]).nbytes(form) * len(cameras) for form in _FORMS)
         return RasterCost(mean, None, total, half, **known)
     sizes = [[counted.nbytes(form) for form in _FORMS] for counted in map(cached.count, sample)]
@@ -467,9 +471,9 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
     if not fitting:
         return RasterCost(mean, None, total, half, **known)
     keeping = None
-    if isinstance(anew, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
+    if isinstance(uncached, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
         keeping = _keeping_seconds(cached, sample[middle], fitting[0])
-    cached = CachedRasterizer(scene, precision=fitting[0], anew=anew)
+    cached = CachedRasterizer(scene, precision=fitting[0], uncached=uncached)
     kept = _raster_seconds(cached, len(scene), sample[middle], visits=2)[1]
     # Of the mean view, as the seconds it is compared with.
     return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, **known)
@@ -478,7 +482,7 @@ def _raster_cost(workshop: Workshop, cameras: Sequence[Camera], budget: int) -> 
 def _comes_too_seldom(settings: Settings, views: int) -> bool:
     """Whether a view comes so seldom that its kept weights, which nobody asked for, do not pay on a CPU."""
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / views
-    return settings.kept_weights == "auto" and visits < LEAST_VISITS
+    return settings.cached_weights == "auto" and visits < LEAST_VISITS
 
 
 def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:

@@ -119,12 +119,12 @@ class Visits:
         room = memory * MEMORY_SHARES["views"]
         weighed = memory * MEMORY_SHARES["rasterizer"]
         surveyed = Made(0.0, len(probe.sizes) * raster.lists_bytes, weighed)
-        room_of_lists = weighed if plan.kept_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
+        room_of_lists = weighed if plan.cached_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
         lists = Made(raster.first_seconds, views * raster.lists_bytes, room_of_lists)
         colors = views * int(plan.seen.sum()) * COLOR_BYTES if probe.scene.used_degree else 0
         weights = None
-        if plan.kept_weights != "none":
-            size = (raster.bytes if plan.kept_weights == "float32" else raster.half_bytes) or 0
+        if plan.cached_weights != "none":
+            size = (raster.bytes if plan.cached_weights == "float32" else raster.half_bytes) or 0
             seconds = KEEPING_RENDERS * raster.seconds if raster.keeping_seconds is None else raster.keeping_seconds
             weights = Made(seconds, size, weighed, views)
         rendered = RENDER * raster.seconds if settings.content_weight else 0.0
@@ -132,7 +132,9 @@ class Visits:
         room_of_content = 0 if "content" in settings.keep else room / (4 if probe.maps else 2)
         share = coarse.pixels / work.pixels  # of the content's bytes, as of its pixels
         images = Made(0.0)
-        if plan.surround != "background" and settings.content_weight:  # features are another color's at every visit
+        if (
+            plan.training_background != "background" and settings.content_weight
+        ):  # features are another color's at every visit
             pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
             room_of_images, room_of_content = room_of_content / 2, 0
             images, rendered = Made(rendered, _IMAGE_BYTES * pixels, room_of_images), 0.0
@@ -154,10 +156,10 @@ class Visits:
 
     def rasterized(self) -> float:
         """Seconds of a render and its gradient at a later visit, mean over views."""
-        anew = self.raster + self.lists.always
+        uncached = self.raster + self.lists.always
         if self.weights is not None:
-            anew = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * anew
-        return anew + self.colors.always
+            uncached = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * uncached
+        return uncached + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
         """Seconds of every visit beside rendering and the network: content that is not kept."""

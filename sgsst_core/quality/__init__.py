@@ -1,1 +1,1 @@
-"""Judging a scene and a result: held-out views, consistency, exactness, findings about inputs."""
+"""Judging a scene and a result: novel views, consistency, exactness, findings about inputs."""

@@ -37,24 +37,24 @@ def approximations(stylizer: Stylizer) -> list[str]:
         found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
     if bool((stylizer.plan.survey.total_blend_weights[~stylizer.plan.seen] > 0).any()):
         found.append("pruned Gaussians")
-    if stylizer.plan.kept_weights == "half" and stylizer.views.rasterizer.name == "cached":
+    if stylizer.plan.cached_weights == "half" and stylizer.views.rasterizer.name == "cached":
         found.append("half-precision blend weights")
     return found
 
 
-def rasterizer_anew(stylizer: Stylizer) -> Rasterizer:
+def uncached_rasterizer(stylizer: Stylizer) -> Rasterizer:
     """What computes a job's blend weights anew; kept ones lie above it."""
     rasterizer = stylizer.views.rasterizer
-    return rasterizer.anew if isinstance(rasterizer, CachedRasterizer) else rasterizer
+    return rasterizer.uncached if isinstance(rasterizer, CachedRasterizer) else rasterizer
 
 
 def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
     """One of another scene with a job's settings, that keeps its lists in the bytes that the job's lists leave."""
-    settings, job = stylizer.settings, rasterizer_anew(stylizer)
+    settings, job = stylizer.settings, uncached_rasterizer(stylizer)
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
-    if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.anew:
+    if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.uncached:
         options["beside"] = job
-    return make_rasterizer(stylizer.plan.anew, scene, **options)
+    return make_rasterizer(stylizer.plan.uncached, scene, **options)
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ class ExactTwin(ExactLoss):
         super().__init__(stylizer, style_loss)
         settings = stylizer.settings
         self.shown = stylizer.plan.survey.total_blend_weights > 0
-        scene, rasterizer = stylizer.views.scene, rasterizer_anew(stylizer)
-        if not (torch.equal(self.shown, stylizer.plan.seen) and rasterizer.name == stylizer.plan.anew):
+        scene, rasterizer = stylizer.views.scene, uncached_rasterizer(stylizer)
+        if not (torch.equal(self.shown, stylizer.plan.seen) and rasterizer.name == stylizer.plan.uncached):
             scene = stylizer.scene.subset(self.shown).without_zero_bands()
             rasterizer = rasterizer_beside(stylizer, scene)
         self.views = Views(
@@ -141,7 +141,7 @@ class ExactTwin(ExactLoss):
             weighted=stylizer.plan.weighted,
             photos=stylizer.photos,
             memory=memory,
-            revive=settings.revive,
+            clamp_aware_gradient=settings.clamp_aware_gradient,
             maps=stylizer.styles.maps(rasterizer, self.shown),
         )
 

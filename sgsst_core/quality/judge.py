@@ -52,7 +52,7 @@ class Judgment:
             2 (C C_style)^1/2)); 0 is the style's mean and covariance.
         content: LPIPS (AlexNet) against the unstylized scene; 0 is the same picture.
         features: mean over the layers of 1 - cosine of AlexNet's features against the unstylized scene's.
-        swing: mean over views of how much `style` differs between black and white.
+        background_sensitivity: mean over views of how much `style` differs between black and white.
         saturated: share of the Gaussians of whose color a channel is outside [0, 1].
     """
 
@@ -60,7 +60,7 @@ class Judgment:
     palette: float
     content: float
     features: float
-    swing: float
+    background_sensitivity: float
     saturated: float
 
 
@@ -118,8 +118,8 @@ class Judge:
         style, palette, content, features = (
             fmean(fmean(one[place] for one in view) for view in views) for place in range(4)
         )
-        swing = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        return Judgment(style, palette, content, features, swing, saturated(sh_dc))
+        background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
+        return Judgment(style, palette, content, features, background_sensitivity, saturated(sh_dc))
 
     @torch.no_grad()
     def pictures(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:

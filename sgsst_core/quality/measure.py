@@ -1,4 +1,4 @@
-"""What a run measures at moments between its steps: held-out views, and its approximations against exact."""
+"""What a run measures at moments between its steps: novel views, and its approximations against exact."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from sgsst_core.planning.measuring import (
     Level,
     Prices,
     choose_level,
-    held_out_seconds,
+    novel_view_seconds,
 )
 from sgsst_core.quality.exact import ExactLoss, ExactTwin, approximations, rasterizer_beside
-from sgsst_core.quality.held_out import HeldOut
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
+from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import Evaluation
@@ -34,7 +34,7 @@ class Measurements:
     """Measures a job; pass an object of this as `loop.Callbacks.measure`.
 
     Everything is built at first use. Results go to `Stylizer.measured`, one entry a moment, ready for JSON: "step",
-    "held_out" and "approximation" (None where there is nothing to measure), the "seconds" it took. The moment of step 0
+    "novel_views" and "approximation" (None where there is nothing to measure), the "seconds" it took. The moment of step 0
     is measured together with the one after it, from the unstylized colors, so that the first step need not wait. How
     much is measured is the plan's, or less where the first view takes longer than it thought: decided once, by the
     first rank, and kept in the first entry with what a moment takes after it ("level", "again"). The last entry holds
@@ -48,7 +48,7 @@ class Measurements:
         self._stylizer = stylizer
         self.approximated = approximations(stylizer)
         self._exact: ExactTwin | None = None
-        self._held_out: HeldOut | None = None
+        self._novel_views: NovelViews | None = None
         self._seen_by: tuple[Scene, Rasterizer] | None = None
 
     @property
@@ -123,12 +123,12 @@ class Measurements:
 
     def _judge(self) -> None:
         """Judge the result and the unstylized scene, into the last entry ("judged"); the first rank's alone."""
-        stylizer, held_out = self._stylizer, self._of_held_out_views()
-        if held_out.lpips is None or stylizer.collectives.rank:
+        stylizer, novel_views = self._stylizer, self._novel_views_of_job()
+        if novel_views.lpips is None or stylizer.collectives.rank:
             return
-        views = [held_out.cameras[index] for index in held_out.views]
+        views = [novel_views.cameras[index] for index in novel_views.views]
         background = stylizer.settings.background
-        judge = Judge(held_out.lpips, stylizer.styles, held_out.scene, held_out.rasterizer, views, background)
+        judge = Judge(novel_views.lpips, stylizer.styles, novel_views.scene, novel_views.rasterizer, views, background)
         colors = {"before": stylizer.scene.sh_dc, "after": stylizer.stylized()}
         found = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
         stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in found.items() if one} or None
@@ -148,20 +148,20 @@ class Measurements:
             own = self._first(stylizer.scene.sh_dc if start else stylized, seconds)
         moment = self._moment(stylizer.scene.sh_dc if start else stylizer.stylized(), own, start=start)
         step = 0 if start else stylizer.step
-        entry = {"step": step, "held_out": moment, "approximation": approximation, **own}
+        entry = {"step": step, "novel_views": moment, "approximation": approximation, **own}
         entry["seconds"] = time.perf_counter() - started
         stylizer.measured.append(entry)
 
     def _moment(self, colors: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
-        """Held-out views with colors [N, 3]; None without any. `own`: what the first entry holds."""
-        stylizer, held_out = self._stylizer, self._of_held_out_views()
+        """Novel views with colors [N, 3]; None without any. `own`: what the first entry holds."""
+        stylizer, novel_views = self._stylizer, self._novel_views_of_job()
         if own:
-            own["held_out_views"] = [held_out.cameras[index].name for index in held_out.views]
-            own["lpips"] = held_out.lpips.network if held_out.lpips else None
+            own["novel_view_names"] = [novel_views.cameras[index].name for index in novel_views.views]
+            own["lpips"] = novel_views.lpips.network if novel_views.lpips else None
             own["approximated"] = self.approximated
-        if not held_out.views:
+        if not novel_views.views:
             return None
-        measured = held_out.measure(colors.to(held_out.rasterizer.device))
+        measured = novel_views.measure(colors.to(novel_views.rasterizer.device))
         if not start and (not stylizer.measured or stylizer.measured[0]["step"]):  # no start to compare it with
             measured = replace(measured, gram_relative=None)
         return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
@@ -171,27 +171,27 @@ class Measurements:
         stylizer, place = self._stylizer, self._stylizer.plan.measuring
         again = 0.0
         if LEVELS[place].views and LEVELS[place].start:
-            held_out, prices = self._trial(colors, seconds)
-            if held_out.views:
+            novel_views, prices = self._trial(colors, seconds)
+            if novel_views.views:
                 place = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
                 again = prices.again(LEVELS[place])
             if LEVELS[place].views == 1:
-                self._held_out = held_out
-        if self._held_out is None:
-            self._held_out = self._make(LEVELS[place].views)
+                self._novel_views = novel_views
+        if self._novel_views is None:
+            self._novel_views = self._make(LEVELS[place].views)
         return {"level": place, "again": again}
 
-    def _trial(self, colors: Tensor, seconds: float) -> tuple[HeldOut, Prices]:
+    def _trial(self, colors: Tensor, seconds: float) -> tuple[NovelViews, Prices]:
         """One view of colors [N, 3], measured, and its price; seconds: of a moment beside its views."""
         lpips = load_lpips_or_none(self._stylizer.network.device)  # is not what a view takes
         clock = [time.perf_counter()]
-        held_out = self._make(1, lpips)
-        for _ in range(2 if held_out.views else 0):  # the first time its lists, depth and warps are made
+        novel_views = self._make(1, lpips)
+        for _ in range(2 if novel_views.views else 0):  # the first time its lists, depth and warps are made
             clock.append(time.perf_counter())
-            held_out.measure(colors.to(held_out.rasterizer.device))
+            novel_views.measure(colors.to(novel_views.rasterizer.device))
         clock.append(time.perf_counter())
         again = clock[-1] - clock[-2]
-        return held_out, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
+        return novel_views, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
 
     def _affordable(self, place: int, prices: Prices) -> int:
         """The level that these prices allow, from the plan's on.
@@ -201,7 +201,7 @@ class Measurements:
         stylizer, expected = self._stylizer, self._stylizer.plan.prediction
         if expected is None:
             return place
-        allowed = held_out_seconds(stylizer.settings.measure, expected)
+        allowed = novel_view_seconds(stylizer.settings.measure, expected)
         # One view has been prepared by now: that it be measured at the end costs little.
         return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
 
@@ -211,21 +211,21 @@ class Measurements:
             return ExactLoss(self._stylizer, "sos")
         return self.exact if self._stylizer.network.precision != "float32" else self._stylizer
 
-    def _of_held_out_views(self) -> HeldOut:
-        if self._held_out is None:
-            self._held_out = self._make(self.level.views)
-        return self._held_out
+    def _novel_views_of_job(self) -> NovelViews:
+        if self._novel_views is None:
+            self._novel_views = self._make(self.level.views)
+        return self._novel_views
 
-    def _make(self, views: int, lpips: Lpips | None = None) -> HeldOut:
-        """Held-out views, at most so many."""
+    def _make(self, views: int, lpips: Lpips | None = None) -> NovelViews:
+        """Novel views, at most so many."""
         stylizer = self._stylizer
         if self._seen_by is None:
             scene = stylizer.scene.without_zero_bands()
             self._seen_by = scene, rasterizer_beside(stylizer, scene)
         scene, rasterizer = self._seen_by
         source = self._source_of_statistics()
-        first = stylizer.measured[0]["held_out"] if stylizer.measured else None
-        return HeldOut(
+        first = stylizer.measured[0]["novel_views"] if stylizer.measured else None
+        return NovelViews(
             stylizer.views.cameras,
             stylizer.views.covered,
             scene,

@@ -68,11 +68,11 @@ def make_rasterizer(
 
     Args:
         name: `cpu` computes blend weights in every call, `cached` keeps them (its options `precision`, `max_bytes` and
-            `anew`), `triton` runs on GPUs, `cuda` is gsplat, `reference` is slow and float64.
+            `uncached`), `triton` runs on GPUs, `cuda` is gsplat, `reference` is slow and float64.
         scene: its geometry must not change while the rasterizer lives.
         background: three values added where Gaussians leave pixels uncovered.
         near: near plane in world units.
-        device: for `cached`, `triton` and `cuda`; None is the CPU for the first (or what its option `anew` runs on) and
+        device: for `cached`, `triton` and `cuda`; None is the CPU for the first (or what its option `uncached` runs on) and
             the current GPU for the others.
         options: of the implementation's own constructor.
 

@@ -25,8 +25,8 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
+from sgsst_core.rasterizer.cached_weights import CachedWeights, CountedWeights, Precision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.kept_weights import CountedWeights, KeptWeights, Precision
 from sgsst_core.rasterizer.strips import CountedStrips
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.rasterizer.triton_kept import CountedPieces
@@ -39,7 +39,7 @@ class _Kept:
     """Weights in memory, and the band they are good for."""
 
     band: Rows
-    weights: KeptWeights
+    weights: CachedWeights
 
 
 class CachedRasterizer:
@@ -59,13 +59,13 @@ class CachedRasterizer:
         alpha_max: clamp of alpha.
         precision: of the kept weights. `half` takes half the memory; each weight then has a relative error of at most
             2^-11.
-        max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `anew`, which keeps
+        max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `uncached`, which keeps
             those that weights leave room for, and lets go of a view's once its weights are kept.
         least_list_bytes: memory for these lists beside it, however much is taken by weights.
         at_first_use: keep what comes; False keeps what `keep` is called for alone, so that looks at other views in
             between, as many as there may be, change no bit of what follows.
         device: where weights are kept and applied, and where results lie.
-        anew: computes weights, and what is not kept: of the same scene. Its lists, device, background, near plane and
+        uncached: computes weights, and what is not kept: of the same scene. Its lists, device, background, near plane and
             clamp of alpha take the place of those given here; None makes one.
 
     Raises:
@@ -88,7 +88,7 @@ class CachedRasterizer:
         least_list_bytes: int = 0,
         at_first_use: bool = True,
         device: torch.device | str = "cpu",
-        anew: CpuRasterizer | TritonRasterizer | None = None,
+        uncached: CpuRasterizer | TritonRasterizer | None = None,
     ) -> None:
         self.scene = scene
         self.precision: Precision = precision
@@ -96,12 +96,12 @@ class CachedRasterizer:
         self.least_list_bytes = least_list_bytes
         self.kept_bytes = 0
         self._at_first_use = at_first_use
-        if anew is None and torch.device(device).type == "cpu":
-            anew = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
-        elif anew is None:
-            anew = TritonRasterizer(scene, background=background, near=near, alpha_max=alpha_max, device=device)
-        self.anew = anew
-        self.device = anew.device
+        if uncached is None and torch.device(device).type == "cpu":
+            uncached = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
+        elif uncached is None:
+            uncached = TritonRasterizer(scene, background=background, near=near, alpha_max=alpha_max, device=device)
+        self.uncached = uncached
+        self.device = uncached.device
         self._kept: dict[tuple[CameraKey, Rows], _Kept | None] = {}
         self._lent: dict[tuple[CameraKey, Rows], _Kept] = {}
         self._lock = threading.Lock()
@@ -109,9 +109,9 @@ class CachedRasterizer:
     def count(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
         """Count a band's weights: costs about one render, and keeps nothing."""
         band = check_rows(camera, rows)
-        if isinstance(self.anew, CpuRasterizer):
-            return CountedStrips(self.anew, camera, band)
-        return CountedPieces(self.anew, camera, band)
+        if isinstance(self.uncached, CpuRasterizer):
+            return CountedStrips(self.uncached, camera, band)
+        return CountedPieces(self.uncached, camera, band)
 
     def operator_bytes(self, camera: Camera, rows: Rows | None = None) -> int:
         """Bytes that a band's weights take or would take. Costs about one render, and keeps nothing."""
@@ -150,7 +150,7 @@ class CachedRasterizer:
         values = check_colors(colors, len(self.scene), torch.float32, self.device)
         kept = self._kept_for(camera, band)
         if kept is None:
-            return self.anew.render(values, camera, band)
+            return self.uncached.render(values, camera, band)
         return kept.weights.render(values)[band[0] - kept.band[0] : band[1] - kept.band[0]]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
@@ -158,7 +158,7 @@ class CachedRasterizer:
         band = check_rows(camera, rows)
         kept = self._kept_for(camera, band)
         if kept is None:
-            return self.anew.coverage(camera, band)
+            return self.uncached.coverage(camera, band)
         return 1 - kept.weights.transmittance[band[0] - kept.band[0] : band[1] - kept.band[0]]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
@@ -167,7 +167,7 @@ class CachedRasterizer:
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
         kept = self._kept_for(camera, band)
         if kept is None:
-            return self.anew.color_gradient(pixels, camera, band)
+            return self.uncached.color_gradient(pixels, camera, band)
         if kept.band != band:  # the weights of the whole view: no gradient from the other rows
             whole = pixels.new_zeros((camera.height, camera.width, 3))
             whole[band[0] : band[1]] = pixels
@@ -176,7 +176,7 @@ class CachedRasterizer:
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]; keeps nothing."""
-        return self.anew.survey(camera)
+        return self.uncached.survey(camera)
 
     def _kept_for(self, camera: Camera, band: Rows) -> _Kept | None:
         """The kept weights that serve a band, made now if they are to be and fit; None where there are none."""
@@ -196,8 +196,8 @@ class CachedRasterizer:
             return None
         weights = counted.keep(self.precision)
         self.kept_bytes += weights.nbytes
-        if self.max_bytes is not None and isinstance(self.anew, CpuRasterizer):
-            self.anew.let_go_of_lists(camera, max(self.max_bytes - self.kept_bytes, self.least_list_bytes))
+        if self.max_bytes is not None and isinstance(self.uncached, CpuRasterizer):
+            self.uncached.let_go_of_lists(camera, max(self.max_bytes - self.kept_bytes, self.least_list_bytes))
         return _Kept(band, weights)
 
 
@@ -208,5 +208,5 @@ def repeatable(rasterizer: Rasterizer) -> Rasterizer:
     """
     if not isinstance(rasterizer, CachedRasterizer):
         return rasterizer
-    exact = rasterizer.precision == "float32" and isinstance(rasterizer.anew, CpuRasterizer)
-    return rasterizer if exact else rasterizer.anew
+    exact = rasterizer.precision == "float32" and isinstance(rasterizer.uncached, CpuRasterizer)
+    return rasterizer if exact else rasterizer.uncached

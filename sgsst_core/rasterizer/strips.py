@@ -14,8 +14,8 @@ from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import kernels
 from sgsst_core.rasterizer.arguments import Rows
+from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.kept_weights import Precision
 from sgsst_core.scene.camera import Camera
 
 _ITEM_BYTES = 20  # a Gaussian's index, a slot, a gradient

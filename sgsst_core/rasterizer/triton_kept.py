@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.rasterizer.arguments import Rows
-from sgsst_core.rasterizer.kept_weights import Precision
+from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.triton import TritonRasterizer, add_slots_, tiles_of
 from sgsst_core.scene.camera import Camera
 

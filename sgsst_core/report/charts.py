@@ -22,11 +22,11 @@ from sgsst_core.report.history import (
     History,
     column,
     drawable,
-    held_out_moments,
     history_of,
     joined,
     log_limits,
     moment_places,
+    novel_view_moments,
     thinned,
 )
 from sgsst_core.report.palette import GRID, INK, color_of
@@ -57,12 +57,12 @@ _PHASE_NAMES = {"coarse": "coarsest scale", "sos": "all scales"}
 
 
 def draw_loss(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
-    """Draw the loss of each scale and their mean, relative to the start, and the Gram distance of held-out views.
+    """Draw the loss of each scale and their mean, relative to the start, and the Gram distance of novel views.
 
     Lines are running means over one round of views; the range of the values lies faintly behind.
 
     Args:
-        moments: measurements of held-out views.
+        moments: measurements of novel views.
     """
     axes = figure.subplots()
     mark_phases(axes, history, against)
@@ -73,7 +73,7 @@ def draw_loss(figure: Figure, against: Against, history: History, moments: Seque
         draw_line(axes, history, against, values, color, label)
     x, gram = moment_places(moments, against), column([moment.get("gram_relative") for moment in moments])
     shown = drawable(x) & drawable(gram)
-    label = "Gram distance, held-out views"
+    label = "Gram distance, novel views"
     draw_points(axes, x[shown], gram[shown], marker="D", linestyle="", color=INK, markerfacecolor="none", label=label)
     set_log_x(axes, history.limits[against], against)
     set_log_y(axes, [*(values for _, values, _ in lines), gram[shown]])
@@ -91,7 +91,7 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.8), dpi=120, layout="constrained")
-        draw_loss(figure, "seconds", history_of(report), held_out_moments(report))
+        draw_loss(figure, "seconds", history_of(report), novel_view_moments(report))
         figure.axes[0].set_ylabel(RELATIVE_LOSS)
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png")

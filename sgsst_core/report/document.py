@@ -108,7 +108,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
         },
         "bought": bought(stylizer, before),
         "measuring": _measuring_json(stylizer),
-        "held_out": held_out_json(stylizer.measured),
+        "novel_views": novel_views_json(stylizer.measured),
         "approximations": approximations_json(stylizer.measured),
     }
 
@@ -261,7 +261,7 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
         "loss_views": len(stylizer.evaluation_views),
-        "held_out_views": len(stylizer.measured[0].get("held_out_views", [])) if stylizer.measured else 0,
+        "novel_view_names": len(stylizer.measured[0].get("novel_view_names", [])) if stylizer.measured else 0,
         "moments": [
             {"step": entry["step"], "seconds": round(entry["seconds"], 3) if "seconds" in entry else None}
             for entry in stylizer.measured
@@ -308,14 +308,14 @@ def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
     return {"relative": relative[-1], "reached": reached, "last_tenth": last}
 
 
-def held_out_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+def novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Quality on views that were not trained on, at each moment; None where there are none."""
-    moments = [entry["held_out"] for entry in measured if entry["held_out"]]
+    moments = [entry["novel_views"] for entry in measured if entry["novel_views"]]
     if not moments:
         return None
     first = measured[0]
     judged = measured[-1].get("judged")
-    return {"views": first["held_out_views"], "lpips": first["lpips"], "moments": moments, "judged": judged}
+    return {"views": first["novel_view_names"], "lpips": first["lpips"], "moments": moments, "judged": judged}
 
 
 def approximations_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:

@@ -31,10 +31,10 @@ from sgsst_core.report.history import (
     History,
     column,
     drawable,
-    held_out_moments,
     history_of,
     log_limits,
     moment_places,
+    novel_view_moments,
     thinned,
 )
 from sgsst_core.report.palette import INK, color_of
@@ -67,7 +67,7 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
     if not report["history"]:
         return []
     history = history_of(report)
-    moments = held_out_moments(report)
+    moments = novel_view_moments(report)
     probes = (report.get("approximations") or {}).get("moments") or []
     figures = [
         _figure(
@@ -90,7 +90,7 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
             "whose views differ by highlights, too."
         )
         draw = partial(_draw_consistency, history=history, moments=moments)
-        figures.append(_figure("consistency", "Consistency of held-out views", caption, draw))
+        figures.append(_figure("consistency", "Consistency of novel views", caption, draw))
     if drawable(column([probe.get("relative_error") for probe in probes])).any():
         caption = "Norm of the difference of the gradients over that of the exact one, on a sampled view."
         draw = partial(_draw_approximations, history=history, probes=probes)

@@ -46,7 +46,7 @@ class History:
 
     Attributes:
         x: seconds and steps so far.
-        limits: first and last place of either axis, those of the held-out moments included.
+        limits: first and last place of either axis, those of the novel moments included.
         phases: runs of equal stages, by name.
         terms: what the loss of a scale is the sum of.
         relative: loss of a scale over that of the unstylized scene.
@@ -83,7 +83,7 @@ def history_of(report: dict[str, Any]) -> History:
     several = [len(record["scales"]) > 1 for record in records]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         relative = {scale: _of_scale(records, scale, "total") / starts[scale] for scale in scales}
-    moments = held_out_moments(report)
+    moments = novel_view_moments(report)
     terms = _terms_there(records)
     return History(
         x=x,
@@ -110,9 +110,9 @@ def joined(columns: Sequence[Floats]) -> Floats:
     return np.concatenate([np.empty(0), *columns])
 
 
-def held_out_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """The report's measurements of held-out views; none where there are none."""
-    return (report.get("held_out") or {}).get("moments") or []
+def novel_view_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """The report's measurements of novel views; none where there are none."""
+    return (report.get("novel_views") or {}).get("moments") or []
 
 
 def moment_places(moments: Sequence[dict[str, Any]], against: Against) -> Floats:

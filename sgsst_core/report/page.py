@@ -20,9 +20,9 @@ from sgsst_core.report.tables import (
     approximation_table,
     decision_table,
     finding_table,
-    held_out_table,
     judged_table,
     loss_table,
+    novel_views_table,
     prediction_table,
 )
 from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
@@ -31,7 +31,7 @@ from sgsst_core.stylizing.state import BEFORE_STEPS
 #: Members of a list that the folded part shows; the rest is counted.
 _LIST = 40
 #: Fields of a report that have a place of their own on the page.
-_PLACED = ("history", "held_out", "approximations", "bought", "findings", "plan", "seconds_by_part")
+_PLACED = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
 _STOPPED = {
     "finished": "all planned steps were done",
     "max-seconds": "stopped at the time limit",
@@ -94,7 +94,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         # The figures' text is fixed or escaped by the XML writer: they are markup.
         figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
         losses=loss_table(report),
-        held_out=held_out_table(report),
+        novel_views=novel_views_table(report),
         judged=judged_table(report),
         seconds=duration(report["seconds"]),
         parts=_time_split(report),
@@ -224,9 +224,9 @@ def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
 def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """All fields that have no place of their own, as (field, [(name, value)])."""
     fields = {field: value for field, value in report.items() if field not in _PLACED}
-    if report.get("held_out"):
-        fields["held_out"] = {
-            name: value for name, value in report["held_out"].items() if name not in ("moments", "judged")
+    if report.get("novel_views"):
+        fields["novel_views"] = {
+            name: value for name, value in report["novel_views"].items() if name not in ("moments", "judged")
         }
     return [(field, [(name or field, text) for name, text in _flat("", value)]) for field, value in fields.items()]
 

@@ -38,9 +38,9 @@ def loss_table(report: dict[str, Any]) -> Table:
     )
 
 
-def held_out_table(report: dict[str, Any]) -> Table | None:
+def novel_views_table(report: dict[str, Any]) -> Table | None:
     """Every moment in numbers; columns that have none are left out."""
-    moments = (report.get("held_out") or {}).get("moments") or []
+    moments = (report.get("novel_views") or {}).get("moments") or []
     if not moments:
         return None
     scales = sorted({scale for moment in moments for scale in moment.get("gram") or {}}, key=int)
@@ -66,14 +66,14 @@ _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "palette": ("distance to its colors, in levels of 8 bits", number),
     "content": ("content lost (LPIPS)", number),
     "features": ("features turned (1 - cosine)", number),
-    "swing": ("style on black against white", number),
+    "background_sensitivity": ("style on black against white", number),
     "saturated": ("colors that no screen shows", percent),
 }
 
 
 def judged_table(report: dict[str, Any]) -> Table | None:
     """What the result is judged to be by a network that was not optimized, beside the unstylized scene."""
-    judged = (report.get("held_out") or {}).get("judged")
+    judged = (report.get("novel_views") or {}).get("judged")
     if not judged:
         return None
     before, after = judged["before"], judged["after"]

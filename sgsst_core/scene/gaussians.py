@@ -59,16 +59,16 @@ class Scene:
             used = _used_coefficients(self.sh_rest, rows)
         return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
 
-    def faded(self, fade: float) -> Scene:
+    def attenuated(self, attenuation: float) -> Scene:
         """The same scene with all SH bands above degree 0 times 1 - fade; of degree 0 where that leaves nothing.
 
-        Coefficients are multiplied in float32 by the factor rounded to float32: files hold the same (`fade_factor`).
+        Coefficients are multiplied in float32 by the factor rounded to float32: files hold the same (`attenuation_factor`).
         """
-        if not fade or not self.sh_degree:
+        if not attenuation or not self.sh_degree:
             return self
-        if fade == 1:
+        if attenuation == 1:
             return replace(self, sh_rest=self.means.new_zeros((len(self), 0, 3)))
-        factor = fade_factor(fade)
+        factor = attenuation_factor(attenuation)
         if isinstance(self.sh_rest, StoredHarmonics):
             return replace(self, sh_rest=self.sh_rest.times(factor))
         return replace(self, sh_rest=self.sh_rest * factor)
@@ -83,9 +83,9 @@ class Scene:
         return replace(self, sh_rest=self.sh_rest[:, :coefficients].contiguous())
 
 
-def fade_factor(fade: float) -> float:
+def attenuation_factor(attenuation: float) -> float:
     """What coefficients are multiplied by that fade by a share: a float32's value."""
-    return float(torch.tensor(1.0 - fade, dtype=torch.float32))
+    return float(torch.tensor(1.0 - attenuation, dtype=torch.float32))
 
 
 def sampled(scene: Scene, count: int) -> Scene:

@@ -332,7 +332,7 @@ def _completed(values: dict[str, Any], memory: int) -> dict[str, Any]:
         **values,
         "memory_limit": memory,
         "device": "cpu",
-        "rasterizer": "cpu" if values["kept_weights"] == "none" else "cached",
+        "rasterizer": "cpu" if values["cached_weights"] == "none" else "cached",
         "precision": "bfloat16" if precision else "float32",
         "measured": True,
     }

@@ -136,7 +136,7 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]
     if settings.target_loss and len(losses) >= stylizer.round_length:  # every view has been visited by then
         target = settings.target_loss * mean_loss(stylizer.start(), stylizer.loss.weights)
-        if stylizer.plan.surround != "background":
+        if stylizer.plan.training_background != "background":
             losses = _losses_on_background(stylizer)
         if has_reached(losses, target, stylizer.round_length):
             return "target-loss"

@@ -25,7 +25,7 @@ from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
-from sgsst_core.planning.probe import Workshop, equip
+from sgsst_core.planning.probe import PlanningContext, equip
 from sgsst_core.planning.progress import ShowPlanning, progress_of
 from sgsst_core.planning.refine import LEAST_PSNR, Footprints, candidates, choose_pieces, disagreement, most_children
 from sgsst_core.planning.survey import sees_something
@@ -71,9 +71,9 @@ def refine(
     if settings.refine <= 1:
         return None
     fitted = fit_cameras(cameras, settings)
-    workshop = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
+    planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
     kept = None if regions is None else regions.kept
-    return _Refining(workshop, StyleMixture.of(style), collectives, kept, show).run()
+    return _Refining(planning_context, StyleMixture.of(style), collectives, kept, show).run()
 
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:
@@ -109,16 +109,16 @@ class _Refining:
 
     def __init__(
         self,
-        workshop: Workshop,
+        planning_context: PlanningContext,
         style: StyleMixture,
         collectives: Collectives,
         kept: Tensor | None,
         show: ShowPlanning | None,
     ) -> None:
         self._kept, self._show = kept, show
-        self._workshop, self._given, self._collectives = workshop, style, collectives
-        self._scene, self._settings = workshop.scene, workshop.settings
-        self._rasterizer = workshop.rasterizer
+        self._planning_context, self._given, self._collectives = planning_context, style, collectives
+        self._scene, self._settings = planning_context.scene, planning_context.settings
+        self._rasterizer = planning_context.rasterizer
         self._footprints = Footprints(self._scene)
 
     def run(self) -> Refinement:
@@ -165,7 +165,7 @@ class _Refining:
 
     def _look(self) -> list[int]:
         """Look at every view; returns those that see anything."""
-        collectives, cameras = self._collectives, self._workshop.cameras
+        collectives, cameras = self._collectives, self._planning_context.cameras
         covered = []
         for index in self._shown(range(len(cameras))):
             coverage, weights = self._rasterizer.survey(cameras[index])
@@ -179,16 +179,16 @@ class _Refining:
 
     def _ask_the_loss(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
         """`disagreement` of the gradient of the style's loss, over some views."""
-        settings, cameras, total = self._settings, self._workshop.cameras, self._footprints.weights
-        device = self._workshop.network.device
+        settings, cameras, total = self._settings, self._planning_context.cameras, self._footprints.weights
+        device = self._planning_context.network.device
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
         style = style.map(lambda picture: picture.to(device))
         scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
         loss = SosLoss(
-            self._workshop.network,
+            self._planning_context.network,
             content_weight=0.0,
             style_loss=settings.style_loss,
-            memory=int(self._workshop.machine.memory * MEMORY_SHARES["activations"]),
+            memory=int(self._planning_context.machine.memory * MEMORY_SHARES["activations"]),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
             scales=ScaleWeights(settings.scales),
@@ -213,13 +213,13 @@ class _Refining:
     def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
         """What pieces [N, 3] do to the unstylized picture of some views, once colors are fitted to others."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
-        options = rasterizer_options(name, self._settings, self._workshop.machine.memory)
+        options = rasterizer_options(name, self._settings, self._planning_context.machine.memory)
         cut = make_rasterizer(name, scene, **options)
         scene = self._fit(scene, cut, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
         for index in self._own(views):
-            camera = self._workshop.cameras[index]
+            camera = self._planning_context.cameras[index]
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
             change = (render(scene, cut, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
@@ -238,7 +238,7 @@ class _Refining:
         for _ in range(_FITTING_STEPS):
             lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
             for index in self._own(views):
-                camera = self._workshop.cameras[index]
+                camera = self._planning_context.cameras[index]
                 missing = render(self._scene, self._rasterizer, camera) - render(scene, cut, camera)
                 lacks[:, :3] += cut.color_gradient(missing, camera)
                 lacks[:, 3] += cut.survey(camera)[1]

@@ -27,11 +27,11 @@ def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weigh
     """
     if settings.style_rotation:
         style = style.map(lambda picture: turned(picture, settings.style_rotation))
-    if settings.keep_colors == "match":
+    if settings.preserve_colors == "match":
         # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
         # 2017, section 5.2.
         style = in_colors_of(style, sh_dc, weights)
-    elif settings.keep_colors == "luminance":
+    elif settings.preserve_colors == "luminance":
         style = in_luminance_of(style, sh_dc, weights)  # section 5.1 there
     return style
 

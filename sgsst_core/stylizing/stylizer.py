@@ -28,7 +28,7 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import ends_with_transfer, rasterizer_options
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import Workshop, make_network, sharing_memory
+from sgsst_core.planning.probe import PlanningContext, make_network, sharing_memory
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import repeatable
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
@@ -50,8 +50,8 @@ from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.regions import JobStyles, neighbors_change_by_region
 from sgsst_core.stylizing.schedule import Phase, drawn_round, drawn_views, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
-from sgsst_core.stylizing.surround import Color, drawn_color
 from sgsst_core.stylizing.team import Team
+from sgsst_core.stylizing.training_background import Color, drawn_color
 from sgsst_core.stylizing.unseen import neighbors_change
 from sgsst_core.stylizing.views import Views
 from sgsst_core.timing import Timer
@@ -92,7 +92,7 @@ class Stylizer:
         weights: BackboneWeights,
         photos: PhotoLoader | None = None,
         collectives: Collectives = ALONE,
-        workshop: Workshop | None = None,
+        planning_context: PlanningContext | None = None,
         regions: Regions | None = None,
     ) -> None:
         self.plan = plan
@@ -114,7 +114,11 @@ class Stylizer:
         self.regions = regions = regions and regions.resolved(weights_of_views)
         self.styles = JobStyles.prepared(StyleMixture.of(style), regions, settings, scene.sh_dc, weights_of_views)
         forget_device_peak(plan.device)
-        self.network = workshop.network if workshop else make_network(weights, settings, plan.precision, plan.device)
+        self.network = (
+            planning_context.network
+            if planning_context
+            else make_network(weights, settings, plan.precision, plan.device)
+        )
         self._styles = self.styles.to(self.network.device)
         self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
@@ -127,10 +131,10 @@ class Stylizer:
         self.graphs = LossGraphs(self.loss) if plan.graphs and self.group.size == 1 else None
         self.sh_degree = scene.sh_degree
         #: With its spherical harmonics faded as the settings say.
-        self.scene = scene = workshop.scene if workshop else scene.faded(settings.sh_fade)
+        self.scene = scene = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
-        rasterizer, self._coarse = self._rasterizers(seen, workshop)
+        rasterizer, self._coarse = self._rasterizers(seen, planning_context)
         self.views = self._views(seen, fit_cameras(cameras, settings), rasterizer)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         # Made once: another processor may round it otherwise, and ranks begin with the same bits.
@@ -189,7 +193,7 @@ class Stylizer:
             regions=regions,
         )
         scene, regions = refined(scene, made), regions and regions.refined(made)
-        plan, workshop = make_plan(
+        plan, planning_context = make_plan(
             scene,
             cameras,
             settings,
@@ -209,7 +213,7 @@ class Stylizer:
             weights=weights,
             photos=photos,
             collectives=collectives,
-            workshop=workshop,
+            planning_context=planning_context,
             regions=regions,
         )
 
@@ -244,7 +248,7 @@ class Stylizer:
     @property
     def _keeps_chroma(self) -> bool:
         """Whether colors change in luminance alone."""
-        return self.settings.keep_colors == "luminance"
+        return self.settings.preserve_colors == "luminance"
 
     def _loss(self) -> SosLoss:
         settings = self.settings
@@ -262,20 +266,22 @@ class Stylizer:
             collectives=self.group,
         )
 
-    def _rasterizers(self, seen: Scene, workshop: Workshop | None) -> tuple[Rasterizer, CoarseRasterizer | None]:
+    def _rasterizers(
+        self, seen: Scene, planning_context: PlanningContext | None
+    ) -> tuple[Rasterizer, CoarseRasterizer | None]:
         """The rasterizer that the plan names, and the one that keeps weights of the coarsest scale for phase 1."""
         plan, settings = self.plan, self.settings
-        name = plan.anew if plan.rasterizer == "cached" else plan.rasterizer
+        name = plan.uncached if plan.rasterizer == "cached" else plan.rasterizer
         options = rasterizer_options(name, settings, self.memory)
-        whole = workshop.rasterizer if workshop else None
+        whole = planning_context.rasterizer if planning_context else None
         if whole is not None and whole.name == name and plan.seen.all():
-            anew = whole
+            uncached = whole
         elif isinstance(whole, CpuRasterizer) and whole.name == name:
-            anew = whole.of_subset(seen, plan.seen, max_list_bytes=options["max_list_bytes"])
+            uncached = whole.of_subset(seen, plan.seen, max_list_bytes=options["max_list_bytes"])
         else:  # what a GPU's prepared for the whole scene names its Gaussians by their place in it
-            anew = make_rasterizer(name, seen, **options)
+            uncached = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
-            return anew, None
+            return uncached, None
         budget = int(self.memory * MEMORY_SHARES["rasterizer"])
         share = budget // 4 if plan.coarse_weights else 0
         cached = make_rasterizer(
@@ -283,19 +289,19 @@ class Stylizer:
             seen,
             max_bytes=budget - share,
             least_list_bytes=self._least_list_bytes,
-            precision="half" if plan.kept_weights == "half" else "float32",
+            precision="half" if plan.cached_weights == "half" else "float32",
             at_first_use=False,
-            anew=anew,
+            uncached=uncached,
         )
         coarse = None
-        if plan.coarse_weights and isinstance(anew, CpuRasterizer):
-            coarse = CoarseRasterizer(anew, max_bytes=share, at_first_use=False)
+        if plan.coarse_weights and isinstance(uncached, CpuRasterizer):
+            coarse = CoarseRasterizer(uncached, max_bytes=share, at_first_use=False)
         return cached, coarse
 
     @property
     def _least_list_bytes(self) -> int:
         """For raster lists beside kept weights, of the memory for views."""
-        on_cpu = self.plan.rasterizer == "cached" and self.plan.anew == "cpu"
+        on_cpu = self.plan.rasterizer == "cached" and self.plan.uncached == "cpu"
         return self.memory // LISTS_BESIDE_WEIGHTS if on_cpu else 0
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
@@ -310,10 +316,10 @@ class Stylizer:
             photos=self.photos,
             memory=int(self.memory * MEMORY_SHARES["views"]) - self._least_list_bytes,
             keep_content="content" not in settings.keep,
-            revive=settings.revive,
+            clamp_aware_gradient=settings.clamp_aware_gradient,
             regions=plan.survey.regions if plan.weighted else None,
             background=settings.background,
-            drawn=plan.surround != "background",
+            drawn=plan.training_background != "background",
             maps=self.styles.maps(repeatable(rasterizer), plan.seen),
             collectives=self.group,
         )
@@ -335,7 +341,7 @@ class Stylizer:
     @property
     def stops_early(self) -> bool:
         """Whether the run ends when its losses have stopped falling, which must be of the same surround for that."""
-        return self.settings.early_stop and self.plan.surround == "background"
+        return self.settings.early_stop and self.plan.training_background == "background"
 
     @property
     def round_length(self) -> int:
@@ -373,7 +379,7 @@ class Stylizer:
 
     def behind(self, index: int) -> Color | None:
         """The color behind a view in the next step; None for the background of the settings."""
-        return drawn_color(self.plan.surround, self.settings.seed, self.step, index, self.style)
+        return drawn_color(self.plan.training_background, self.settings.seed, self.step, index, self.style)
 
     def style_targets(self, camera: Camera) -> StyleTargets:
         """The style's statistics for views of the camera's size."""
@@ -495,7 +501,7 @@ class Stylizer:
         speeds = self._team.compare_speeds(self._cost, self.timer.seconds)
         if speeds:
             self.loss.speeds = speeds
-            self.views.share_anew()
+            self.views.uncached_fraction()
 
     def _next_view(self) -> int:
         """Random views without replacement: every view once before any comes again."""

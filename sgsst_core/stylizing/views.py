@@ -24,7 +24,7 @@ from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_colors_gradient
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
 from sgsst_core.stylizing.regions import RegionMaps
-from sgsst_core.stylizing.surround import Color, put_behind
+from sgsst_core.stylizing.training_background import Color, put_behind
 
 
 class Views:
@@ -43,7 +43,7 @@ class Views:
         covered: indices of the views that see anything.
         weighted: weigh statistics by rendered coverage.
         memory: bytes that content features, coverage and colors of views may take.
-        revive: let colors that the clamp holds at 0 come back (`view_colors_gradient`).
+        clamp_aware_gradient: let colors that the clamp holds at 0 come back (`view_colors_gradient`).
         keep_content: keep content features that fit; False computes them at each visit, for comparison.
         regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
         background: what the rasterizer has behind the Gaussians.
@@ -64,7 +64,7 @@ class Views:
         photos: PhotoLoader | None = None,
         memory: int = 1 << 30,
         keep_content: bool = True,
-        revive: bool = False,
+        clamp_aware_gradient: bool = False,
         regions: Sequence[Rectangle] | None = None,
         background: Color = (0.0, 0.0, 0.0),
         drawn: bool = False,
@@ -107,7 +107,7 @@ class Views:
         self._shares: dict[tuple[int, tuple[int, ...]], Share] = {}
         self.covered = covered
         self.weighted = weighted
-        self.revive = revive
+        self.clamp_aware_gradient = clamp_aware_gradient
         self._background = background
         self._maps = maps
         self._drawn = drawn
@@ -157,7 +157,7 @@ class Views:
         gradient = rasterizer.color_gradient(rows, camera, band) if some else self._nothing(len(colors), 3)
         gradient = self._sum(gradient, self._shown_by(index, rasterizer, rows, band))
         # After the sum: which colors are let through depends on the sign of their whole gradient.
-        return view_colors_gradient(gradient, colors, revive=self.revive)
+        return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
     def keep_weights(self, index: int, rasterizer: Rasterizer | None = None) -> None:
         """Keep the blend weights of this rank's part of a view, where its rasterizer keeps any and they fit.
@@ -303,7 +303,7 @@ class Views:
         coverage = self.coverage(index)[scale]
         return put_behind(image * coverage[..., None].to(image.dtype), coverage, behind, (0.0, 0.0, 0.0))
 
-    def share_anew(self) -> None:
+    def uncached_fraction(self) -> None:
         """Forget what belongs to the present division of the work, because another follows."""
         self._content.clear()
         self._shares.clear()

@@ -88,7 +88,7 @@ def test_what_is_kept_is_not_made_anew() -> None:
     garden = forecast.kept_shares(JOBS["5187x3361"], make_loss("float32"), coarse=False)
     assert all(0 < share < 1 for share in garden.values())
     parts = forecast.step_parts(SMALL, "bfloat16")
-    assert [parts[name].visits for name in parts if name.endswith("anew")] == [0.0] * 3
+    assert [parts[name].visits for name in parts if name.endswith("uncached")] == [0.0] * 3
 
 
 def test_the_range_holds_the_likely_figure() -> None:

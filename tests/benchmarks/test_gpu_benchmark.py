@@ -41,7 +41,7 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     for count in ("60", "120"):
         entry = found["raster"][count]
         assert PASSES | {"survey_seconds_a_view", "lists_seconds", "lists_bytes", "pairs"} <= set(entry)
-        assert PASSES | {"first_render_seconds", "bytes"} <= set(entry["kept_weights"])
+        assert PASSES | {"first_render_seconds", "bytes"} <= set(entry["cached_weights"])
         assert entry["spherical_harmonics"]["seconds"] > 0
     for precision in ("float32", "bfloat16"):
         assert found["network"][precision]["both"]["tflops"] > 0

@@ -29,7 +29,7 @@ PARAMETERS = {
     "early_stop": False,
     "steps_coarse": 0,
     "backbone": "vgg16",
-    "keep_everything": True,
+    "compute_everything": True,
     "seed": 3,
 }
 

@@ -69,7 +69,7 @@ def go_on(job: Job, steps: int | None = None) -> Result:
     [
         pytest.param("preview", False, {"position_weights": "off"}, marks=pytest.mark.slow),
         pytest.param("standard", True, {"precision": "bfloat16", "views_per_step": 2}, marks=pytest.mark.slow),
-        pytest.param("paper", False, {"position_weights": "off", "kept_weights": "half"}, marks=pytest.mark.slow),
+        pytest.param("paper", False, {"position_weights": "off", "cached_weights": "half"}, marks=pytest.mark.slow),
     ],
 )
 def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, settings: dict[str, Any]) -> None:
@@ -77,7 +77,7 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
     asked = request_(tmp_path, scan=scan, preset=preset, **settings)
     first = prepare(asked)
     plan = first.stylizer.plan
-    assert (plan.device, plan.anew, plan.weighted) == ("cuda", "triton", scan)
+    assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
     assert go_on(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))
     assert second.stylizer.plan.rasterizer == plan.rasterizer
@@ -153,7 +153,7 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
 
     Over a drawn surround, content features take a forward pass of their own.
     """
-    weighted: dict[str, Any] = {"position_weights": "on" if scan else "off", "surround": "background"}
+    weighted: dict[str, Any] = {"position_weights": "on" if scan else "off", "training_background": "background"}
     settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, **weighted)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     weights = networks.comparing_pixels(networks.tiny_weights("vgg19"))

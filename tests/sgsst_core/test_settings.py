@@ -14,10 +14,10 @@ def test_paper_is_the_published_schedule() -> None:
     assert settings.position_weights == "off"
     assert settings.max_resolution is None
     assert settings.unseen == "keep"
-    assert not (settings.revive)
+    assert not (settings.clamp_aware_gradient)
     assert not (settings.early_stop)
     assert settings.warm_start is False
-    assert (settings.surround, settings.background) == ("background", (0, 0, 0))
+    assert (settings.training_background, settings.background) == ("background", (0, 0, 0))
     assert not (settings.prune_weight)
 
 

@@ -241,7 +241,7 @@ def test_colors_alone_are_those_of_the_result(request_: StylizeRequest, tmp_path
             assert np.array_equal(found, exact.numpy().astype(np.float16))
 
 
-@pytest.mark.parametrize("why", ["cut", "dropped", "faded"])
+@pytest.mark.parametrize("why", ["cut", "dropped", "attenuated"])
 def test_colors_alone_are_not_written_where_more_than_colors_changes(tmp_path: Path, why: str) -> None:
     if why == "cut":
         request = with_scene(small_request(tmp_path, 1, refine=3.0), large_wall())
@@ -250,7 +250,7 @@ def test_colors_alone_are_not_written_where_more_than_colors_changes(tmp_path: P
         scene.opacities[5] = torch.nan
         request = with_scene(small_request(tmp_path, 1), scene, drop_invalid=True)
     else:
-        request = with_scene(small_request(tmp_path, 1, sh_fade=0.5), wall(sh_degree=1))
+        request = with_scene(small_request(tmp_path, 1, sh_attenuation=0.5), wall(sh_degree=1))
     result = go_on(prepare(request))
     assert result.report_error is None
     assert request.out.exists()

@@ -148,14 +148,16 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
         style=lambda: _flat(0.1, 0.2, 0.9, 1, 1), style_rotation=45
     ),
     "colors matched to a scene of one color": lambda: _job(
-        lambda: colored(crowd(), 0.2, 0.5, 0.7), keep_colors="match"
+        lambda: colored(crowd(), 0.2, 0.5, 0.7), preserve_colors="match"
     ),
-    "colors matched to a gray scene": lambda: _job(lambda: _gray(crowd()), keep_colors="match"),
-    "colors of a flat style matched": lambda: _job(style=lambda: _flat(1, 1, 1), keep_colors="match"),
-    "luminance of a scene of one color": lambda: _job(lambda: colored(crowd(), 0.2, 0.5, 0.7), keep_colors="luminance"),
-    "luminance of a gray scene": lambda: _job(lambda: _gray(crowd()), keep_colors="luminance"),
-    "luminance of a black scene": lambda: _job(lambda: colored(crowd(), 0, 0, 0), keep_colors="luminance"),
-    "luminance of a flat style": lambda: _job(style=lambda: _flat(0, 0, 0), keep_colors="luminance"),
+    "colors matched to a gray scene": lambda: _job(lambda: _gray(crowd()), preserve_colors="match"),
+    "colors of a flat style matched": lambda: _job(style=lambda: _flat(1, 1, 1), preserve_colors="match"),
+    "luminance of a scene of one color": lambda: _job(
+        lambda: colored(crowd(), 0.2, 0.5, 0.7), preserve_colors="luminance"
+    ),
+    "luminance of a gray scene": lambda: _job(lambda: _gray(crowd()), preserve_colors="luminance"),
+    "luminance of a black scene": lambda: _job(lambda: colored(crowd(), 0, 0, 0), preserve_colors="luminance"),
+    "luminance of a flat style": lambda: _job(style=lambda: _flat(0, 0, 0), preserve_colors="luminance"),
     "one Gaussian in a job": lambda: _job(lambda: repeated(1, scale=1.0)),
     "all Gaussians at one place": lambda: _job(_coincident),
     "needles": lambda: _job(lambda: _shaped((3.0, 1e-5, 1e-5))),
@@ -164,11 +166,11 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "opacity 0 and 1": lambda: _job(lambda: _opacities(-80.0, 80.0, 0.0)),
     "opacity 1 alone": lambda: _job(lambda: _opacities(90.0)),
     "hardly any opacity": lambda: _job(lambda: _opacities(-5.4)),
-    "surround in the object's color": lambda: _scan(surround="palette"),
-    "surround of random colors, style of one": lambda: _scan(surround="random"),
-    "scan of one color, warm start": lambda: _scan(warm_start=True, surround="background"),
+    "surround in the object's color": lambda: _scan(training_background="palette"),
+    "surround of random colors, style of one": lambda: _scan(training_background="random"),
+    "scan of one color, warm start": lambda: _scan(warm_start=True, training_background="background"),
     "scan of one color, warm start in luminance": lambda: _scan(
-        warm_start=True, surround="palette", keep_colors="luminance"
+        warm_start=True, training_background="palette", preserve_colors="luminance"
     ),
     "nearest neighbors in a flat style": lambda: _unlike(crowd, lambda: _flat(0.5, 0.5, 0.5), style_loss="nnfm"),
     "nearest neighbors of a black scene": lambda: _unlike(
@@ -185,15 +187,15 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "black views, features at the paper's scale": lambda: _black_views("paper"),
     "black views, features at one scale": lambda: _black_views("even"),
     "harmonics of 1e4 that fade by half": lambda: _unlike(
-        lambda: _with_harmonics(1e4), lambda: texture(30, 26, 7), sh_fade=0.5
+        lambda: _with_harmonics(1e4), lambda: texture(30, 26, 7), sh_attenuation=0.5
     ),
-    "harmonics of 1e30 that fade out": lambda: _job(lambda: _with_harmonics(1e30), sh_fade=1.0),
+    "harmonics of 1e30 that fade out": lambda: _job(lambda: _with_harmonics(1e30), sh_attenuation=1.0),
     "pixels of one color, style of the same": lambda: _pixels(_scan()),
     "pixels of one color, style of another": lambda: _pixels(
         _unlike(lambda: colored(crowd(), 0.4, 0.4, 0.4), lambda: _flat(0.9, 0.3, 0.1))
     ),
     "pixels of one color, style of many": lambda: _pixels(_job(lambda: colored(crowd(), 0.2, 0.5, 0.7))),
-    "pixels in luminance, a gray scene": lambda: _pixels(_job(lambda: _gray(crowd()), keep_colors="luminance")),
+    "pixels in luminance, a gray scene": lambda: _pixels(_job(lambda: _gray(crowd()), preserve_colors="luminance")),
     "pixels, a style of one pixel": lambda: _pixels(_job(style=lambda: _flat(0.9, 0.5, 0.1, 1, 1))),
     "pixels, views of 3 x 2": lambda: _pixels(_tiny_views(3, 2)),
     "pixels 1e6 times as large": lambda: _pixels(_job(), 1e6),
@@ -215,7 +217,7 @@ def _chroma(full: bool) -> CaseResult:
     scene = crowd(60)
     sizes = torch.logspace(-6, 3, 60)[:, None]
     scene = replace(scene, sh_dc=scene.sh_dc * sizes)
-    job = make(Situation(scene, texture(30, 26, 7), {"keep_colors": "luminance", "steps_sos": 20 if full else 4}))
+    job = make(Situation(scene, texture(30, 26, 7), {"preserve_colors": "luminance", "steps_sos": 20 if full else 4}))
     while job.step < job.total:
         job.run_step()
     found = job.stylized().double()

@@ -145,7 +145,7 @@ def strain(situation: Situation) -> CaseResult:
     job = jobs[0]
     after = mean_loss(job.evaluate(job.evaluation_views), job.loss.weights)
     colors, moved = job.stylized(), _moved(job, begun)
-    judged = job.plan.surround == "background"  # else steps have another loss than what is judged
+    judged = job.plan.training_background == "background"  # else steps have another loss than what is judged
     most = job.total * job.settings.learning_rate * LONGEST_STEP
     broken = [
         what
@@ -167,7 +167,7 @@ def strain(situation: Situation) -> CaseResult:
 def _moved(job: Stylizer, begun: Tensor) -> float:
     """How far a coefficient has moved at most, beside what brings colors that began beyond the bounds into them."""
     found = job.sh_dc.detach()
-    chroma_of = begun if job.settings.keep_colors == "luminance" else None
+    chroma_of = begun if job.settings.preserve_colors == "luminance" else None
     within = constrained(begun, chroma_of, bounded=job.settings.bounded)
     return float(torch.minimum((found - begun).abs(), (found - within).abs()).max())
 

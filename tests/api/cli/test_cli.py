@@ -68,7 +68,16 @@ def second_reader(path: Path) -> dict[str, np.ndarray]:
 def test_several_styles(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other:2.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
-    told = ["--style", f"{files.style}:1", "--style", f"{other}:3", "--steps-sos", "2", "--surround", "palette"]
+    told = [
+        "--style",
+        f"{files.style}:1",
+        "--style",
+        f"{other}:3",
+        "--steps-sos",
+        "2",
+        "--training-background",
+        "palette",
+    ]
     assert main([part for part in files.stylize() if part not in ("--style", str(files.style))] + told) == 0
     shares = f"{files.style.name} 25%, other:2.png 75%"
     assert f"a mixture: {shares}" in capsys.readouterr().out
@@ -89,8 +98,8 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
     told = ["--region", "right:half-space=1,0,0,0.5", "--region-style", f"right={other}", "--region-weight", "right=2"]
-    told += ["--region", "left:half-space=-1,0,0,0.5", "--region-keep", "left", "--region", "far:sphere=0,0,99,1"]
-    assert main(files.stylize("--steps-sos", "2", "--warm-start", "--revive", *told)) == 0
+    told += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
+    assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *told)) == 0
     said = capsys.readouterr().out
     assert "take other.png, with weight 2" in said
     assert "region far:           warning: left out, because it has no Gaussians" in said
@@ -125,7 +134,7 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
         (["--region", "a:cube=1"], "selects nothing that is known"),
         (["--region", "a:mask=nowhere.npy"], "cannot be read as .npy"),
         (["--region", "a:property=color>1"], "no property 'color'"),
-        (["--region-keep", "rest"], "Every Gaussian is kept (rest)"),
+        (["--region-freeze", "rest"], "Every Gaussian is kept (rest)"),
         (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),
     ],
 )
@@ -240,7 +249,7 @@ def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFi
 @pytest.mark.slow
 def test_keep_everything_gives_the_same_scene(files: Files) -> None:
     results = []
-    for options in ([], ["--keep-everything"]):
+    for options in ([], ["--compute-everything"]):
         assert main(files.stylize("--steps-sos", "2", *options)) == 0
         report = json.loads(files.out.with_name("stylized.report.json").read_text())
         assert report["plan"]["measured"]["seconds"] > 0
@@ -335,14 +344,14 @@ def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.Captur
 
 @pytest.mark.slow
 def test_held_out_views_approximations_and_findings_are_reported(files: Files) -> None:
-    assert main(files.stylize("--steps-sos", "16", "--kept-weights", "half")) == 0
+    assert main(files.stylize("--steps-sos", "16", "--cached-weights", "half")) == 0
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    moments = report["held_out"]["moments"]
+    moments = report["novel_views"]["moments"]
     assert [moment["step"] for moment in moments] == [0, 1, 2, 4, 8, 16]
     assert moments[0]["gram_relative"] == 1
     assert moments[-1]["gram_relative"] < 1
     assert moments[0]["consistency"]["short"]["rmse"] >= 0
-    judged = report["held_out"]["judged"]
+    judged = report["novel_views"]["judged"]
     assert judged["before"]["content"] == 0 < judged["after"]["content"]
     assert judged["after"]["style"] != judged["before"]["style"]
     assert report["approximations"]["what"] == ["half-precision blend weights"]

@@ -15,7 +15,16 @@ from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
-CONTROLS = ["--keep-colors", "luminance", "--sh-fade", "0.25", "--scales", "1,0,0.5", "--coarsest-side", "16"]
+CONTROLS = [
+    "--preserve-colors",
+    "luminance",
+    "--sh-attenuation",
+    "0.25",
+    "--scales",
+    "1,0,0.5",
+    "--coarsest-side",
+    "16",
+]
 
 
 def command(name: str, folder: Path, *options: str) -> list[str]:
@@ -42,9 +51,9 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     assert float(change.abs().max()) > 0.1
     torch.testing.assert_close(change, change.mean(1, keepdim=True).expand(-1, 3), atol=1e-6, rtol=0)
     report = json.loads((tmp_path / "new" / "out.report.json").read_text())
-    assert report["settings"]["keep_colors"] == "luminance"
+    assert report["settings"]["preserve_colors"] == "luminance"
     assert report["settings"]["scales"] == [1, 0, 0.5]
-    assert report["settings"]["sh_fade"] == 0.25
+    assert report["settings"]["sh_attenuation"] == 0.25
     assert report["scene"]["sh_degree"] == 1
     loss = report["loss"]["after"]
     assert sorted(loss["scales"]) == ["0", "2"]
@@ -67,8 +76,8 @@ def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["--scales", "nan"], "finite"),
         (["--scales", "fine"], "are no numbers with commas between them"),
         (["--scales", "0,1"], "the views have one scale, 0"),
-        (["--sh-fade", "1.5"], "less than or equal to 1"),
-        (["--keep-colors", "hue"], "hue"),
+        (["--sh-attenuation", "1.5"], "less than or equal to 1"),
+        (["--preserve-colors", "hue"], "hue"),
     ],
     ids=str,
 )

@@ -43,7 +43,7 @@ def test_every_setting_is_an_option_or_names_the_one_that_stands_for_it() -> Non
     standing = {
         info.metadata[-1].instead for name, info in Settings.model_fields.items() if name not in fields(options)
     }
-    assert standing == {"learning_rate", "keep_everything"}
+    assert standing == {"learning_rate", "compute_everything"}
     assert options.keys() | standing <= OPTIONS.keys()
 
 
@@ -145,7 +145,9 @@ def test_the_reference_is_up_to_date() -> None:
 
 
 def test_options_become_settings() -> None:
-    told = StylizeOptions.model_validate({"preset": "preview", "steps_sos": "7", "near": 0.5, "keep_everything": True})
+    told = StylizeOptions.model_validate(
+        {"preset": "preview", "steps_sos": "7", "near": 0.5, "compute_everything": True}
+    )
     assert told.settings() == make_settings("preview", steps_sos=7, near=0.5, keep=EVERYTHING)
     assert StylizeOptions().settings() == make_settings()
     assert StylizeOptions().given_settings() == {}

@@ -166,8 +166,8 @@ PARAMETERS = [
     ('{"scales": [-1]}', "invalid-request"),
     ('{"scales": "1,1"}', "invalid-request"),
     ('{"scales": [0, 1]}', "invalid-settings"),
-    ('{"sh_fade": 2}', "invalid-request"),
-    ('{"keep_colors": "hue"}', "invalid-request"),
+    ('{"sh_attenuation": 2}', "invalid-request"),
+    ('{"preserve_colors": "hue"}', "invalid-request"),
     ('{"background": [0, 0]}', "invalid-request"),
     ('{"orbit": 3}', "invalid-cameras"),
     ('{"elevation": 30}', "invalid-cameras"),
@@ -192,7 +192,7 @@ def test_strokes_larger_than_any_picture_may_be(client: httpx.Client, files: dic
 
 
 def test_controls_are_told_in_a_plan(client: httpx.Client, files: dict[str, bytes]) -> None:
-    asked = {"keep_colors": "luminance", "sh_fade": 0.5, "scales": [1, 0.5], "coarsest_side": 16}
+    asked = {"preserve_colors": "luminance", "sh_attenuation": 0.5, "scales": [1, 0.5], "coarsest_side": 16}
     answer = client.post("/v1/jobs?dry_run=true", files=form(files), data={"parameters": json.dumps(asked)})
     assert answer.status_code == 200, answer.text
     items = {line["item"] for line in answer.json()["plan"]["decisions"]}

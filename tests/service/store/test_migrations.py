@@ -80,7 +80,7 @@ def test_this_version_goes_on_and_starts_on_the_next_ones_tables(tmp_path: Path,
 
     def submit(client: Any) -> str:
         body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-        parameters = {"steps_sos": 300, "steps_coarse": 0, "backbone": "vgg16", "keep_everything": True}
+        parameters = {"steps_sos": 300, "steps_coarse": 0, "backbone": "vgg16", "compute_everything": True}
         answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
         assert answer.status_code == 202, answer.text
         return str(answer.json()["id"])

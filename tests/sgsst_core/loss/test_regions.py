@@ -156,7 +156,7 @@ def test_nothing_to_do_is_an_error():
         check_regions(kept)
     partly = regions([0, 1, 2], a=True, b=True)
     check_regions(partly)
-    with pytest.raises(SettingsError, match=r"--sh-fade 0\.5 would change Gaussians of every region"):
+    with pytest.raises(SettingsError, match=r"--sh-attenuation 0\.5 would change Gaussians of every region"):
         check_regions(partly, 0.5)
     with pytest.raises(SettingsError, match="that a view sees is kept"):
         partly.resolved(torch.tensor([0.0, 1, 1]))

@@ -14,7 +14,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
-from sgsst_core.planning.choices import rasterizer_anew
+from sgsst_core.planning.choices import uncached_rasterizer
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
 from sgsst_core.planning.decide import LEAST_PASSES, decide
 from sgsst_core.planning.memory import MEASURING_BYTES, SHAPE_BYTES
@@ -134,28 +134,28 @@ def test_position_weights_are_for_views_with_an_empty_surround(share: float, wan
 
 
 @pytest.mark.parametrize(
-    ("share", "values", "surround", "warm"),
+    ("share", "values", "training_background", "warm"),
     [
         (0.0, {}, "background", True),
         (0.05, {}, "background", True),  # a room with holes
-        (0.05, {"keep_colors": "luminance"}, "background", False),
-        (0.5, {"keep_colors": "luminance"}, "palette", True),
+        (0.05, {"preserve_colors": "luminance"}, "background", False),
+        (0.5, {"preserve_colors": "luminance"}, "palette", True),
         (0.5, {}, "palette", True),
         (0.5, {"position_weights": "off"}, "background", True),
         (0.5, {"preset": "paper"}, "background", False),
-        (0.5, {"surround": "background", "warm_start": False}, "background", False),
-        (0.5, {"surround": "random"}, "random", True),
-        (0.0, {"surround": "random", "warm_start": True}, "random", True),
+        (0.5, {"training_background": "background", "warm_start": False}, "background", False),
+        (0.5, {"training_background": "random"}, "random", True),
+        (0.0, {"training_background": "random", "warm_start": True}, "random", True),
     ],
 )
 def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
-    share: float, values: dict[str, Any], surround: str, warm: bool
+    share: float, values: dict[str, Any], training_background: str, warm: bool
 ) -> None:
     plan = plan_of(probe(uncovered_share=share), **values)
-    assert (plan.surround, plan.warm_start) == (surround, warm)
-    behind, start = line(plan, "surround"), line(plan, "start")
-    assert (behind is not None, start is not None) == (surround != "background", warm)
-    for found, setting in ((behind, "surround"), (start, "warm_start")):
+    assert (plan.training_background, plan.warm_start) == (training_background, warm)
+    behind, start = line(plan, "training_background"), line(plan, "start")
+    assert (behind is not None, start is not None) == (training_background != "background", warm)
+    for found, setting in ((behind, "training_background"), (start, "warm_start")):
         if found:
             assert ("asked for" in found.reason) is (setting in values)
             scan = share == 0.5 and "position_weights" not in values
@@ -165,21 +165,22 @@ def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
 def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end() -> None:
     """Content features are computed with it at every visit, of images that are kept where they fit."""
     drawn, fixed = (
-        plan_of(probe(uncovered_share=0.5), surround=kind, early_stop=True) for kind in ("random", "background")
+        plan_of(probe(uncovered_share=0.5), training_background=kind, early_stop=True)
+        for kind in ("random", "background")
     )
     assert drawn.prediction is not None
     assert fixed.prediction is not None
     pixels = HEIGHT * WIDTH * (1 + 1 / 4)
     assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 1e-6, rel=0.01)
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
-    assert "0.6 s in every iteration" in said(drawn, "surround")
+    assert "0.6 s in every iteration" in said(drawn, "training_background")
     assert said(drawn, "early stop").startswith("none: every step is made: losses with different colors")
-    without = plan_of(probe(uncovered_share=0.5), surround="random", content_weight=0.0)
-    assert "every iteration" not in said(without, "surround")
-    anew = plan_of(probe(uncovered_share=0.5), surround="random", keep=("content",))
-    assert anew.prediction is not None
-    assert anew.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # a render of the content, too
-    assert drawn.prediction.first_visit - anew.prediction.first_visit == pytest.approx(0.15)
+    without = plan_of(probe(uncovered_share=0.5), training_background="random", content_weight=0.0)
+    assert "every iteration" not in said(without, "training_background")
+    uncached = plan_of(probe(uncovered_share=0.5), training_background="random", keep=("content",))
+    assert uncached.prediction is not None
+    assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # a render of the content, too
+    assert drawn.prediction.first_visit - uncached.prediction.first_visit == pytest.approx(0.15)
 
 
 def test_uncovered_pixels_do_not_go_through_the_network() -> None:
@@ -361,15 +362,15 @@ def test_the_measured_error_of_a_precision_is_said() -> None:
 
 def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
     kept, once = plan_of(probe()), plan_of(probe(), steps_coarse=0, steps_sos=4 * VIEWS)
-    assert (kept.rasterizer, kept.kept_weights) == ("cached", "float32")
+    assert (kept.rasterizer, kept.cached_weights) == ("cached", "float32")
     assert said(kept, "blend weights") == (
         "all kept in float32: they take 1.00 GB of all views; 2.5 GB are there for blend weights"
     )
-    assert (once.rasterizer, once.kept_weights) == ("cpu", "none")
+    assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
     assert said(once, "blend weights") == "computed anew in every iteration: a view comes 4.0 times"
     assert line(kept, "rasterizer") is line(once, "rasterizer") is None
     assert kept.prediction is not None
-    assert plan_of(probe(), kept_weights="none").prediction.seconds == pytest.approx(  # type: ignore[union-attr]
+    assert plan_of(probe(), cached_weights="none").prediction.seconds == pytest.approx(  # type: ignore[union-attr]
         kept.prediction.seconds + 0.2
     )
 
@@ -380,15 +381,15 @@ def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
         ({}, "half", True),
         ({"steps_coarse": 4 * VIEWS}, "half", False),  # too few visits of phase 1
         ({"preset": "paper"}, "float32", True),
-        ({"kept_weights": "float32"}, "float32", False),
-        ({"kept_weights": "half"}, "half", False),
-        ({"kept_weights": "none"}, "none", False),
+        ({"cached_weights": "float32"}, "float32", False),
+        ({"cached_weights": "half"}, "half", False),
+        ({"cached_weights": "none"}, "none", False),
         ({"keep": ("blend-weights",)}, "none", False),
     ],
 )
 def test_weights_that_do_not_fit(values: dict[str, Any], form: str, coarse: bool) -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 6 * GIGABYTE, 3 * GIGABYTE)), **values)
-    assert (plan.kept_weights, plan.coarse_weights) == (form, coarse)
+    assert (plan.cached_weights, plan.coarse_weights) == (form, coarse)
     assert plan.rasterizer == ("cpu" if form == "none" else "cached")
     assert ("phase 1 only those of the coarsest scale" in said(plan, "blend weights")) is coarse
     assert ("% of the views' kept" in said(plan, "blend weights")) is (form != "none")
@@ -396,16 +397,16 @@ def test_weights_that_do_not_fit(values: dict[str, Any], form: str, coarse: bool
 
 def test_half_precision_where_only_that_fits() -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 3 * GIGABYTE, 2 * GIGABYTE)))
-    assert (plan.kept_weights, plan.coarse_weights) == ("half", False)
+    assert (plan.cached_weights, plan.coarse_weights) == ("half", False)
     assert said(plan, "blend weights").startswith("all kept in half precision: they take 2.00 GB")
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
 
 
 def test_on_a_gpu_the_first_rasterizer_that_works_renders() -> None:
-    assert rasterizer_anew("cuda", {}) == "triton"
-    assert rasterizer_anew("cuda", {"triton": "no driver"}) == "cuda"
-    assert rasterizer_anew("cuda", {"triton": "no driver", "cuda": "no kernels"}) == "cpu"
-    assert rasterizer_anew("cpu", {}) == "cpu"
+    assert uncached_rasterizer("cuda", {}) == "triton"
+    assert uncached_rasterizer("cuda", {"triton": "no driver"}) == "cuda"
+    assert uncached_rasterizer("cuda", {"triton": "no driver", "cuda": "no kernels"}) == "cpu"
+    assert uncached_rasterizer("cpu", {}) == "cpu"
 
 
 def on_a_gpu(raster: RasterCost, **changes: Any) -> Probe:
@@ -418,7 +419,7 @@ FASTER = RasterCost(0.01, 0.004, GIGABYTE, GIGABYTE // 2, 0.012)
 
 def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     kept, once = plan_of(on_a_gpu(FASTER)), plan_of(on_a_gpu(FASTER), steps_coarse=0, steps_sos=VIEWS)
-    assert (kept.rasterizer, kept.anew, kept.kept_weights, kept.coarse_weights) == (
+    assert (kept.rasterizer, kept.uncached, kept.cached_weights, kept.coarse_weights) == (
         "cached",
         "triton",
         "float32",
@@ -433,7 +434,7 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     assert kept.prediction is not None
     assert once.prediction is not None
     assert once.prediction.seconds == pytest.approx(kept.prediction.seconds + 0.006)
-    assert (once.rasterizer, once.anew, once.kept_weights) == ("triton", "triton", "none")
+    assert (once.rasterizer, once.uncached, once.cached_weights) == ("triton", "triton", "none")
     assert said(once, "rasterizer") == "Triton on the GPU: Triton works here"
     assert said(once, "blend weights") == (
         "computed anew in every iteration: a view comes 1.0 times, and keeping pays from 2.0 on: 4 ms a view were "
@@ -452,15 +453,15 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     ],
 )
 def test_on_a_gpu_weights_are_not_kept_where_they_do_not_pay(raster: RasterCost, reason: str) -> None:
-    plan, asked_for = plan_of(on_a_gpu(raster)), plan_of(on_a_gpu(raster), kept_weights="half")
-    assert (plan.rasterizer, plan.kept_weights) == ("triton", "none")
+    plan, asked_for = plan_of(on_a_gpu(raster)), plan_of(on_a_gpu(raster), cached_weights="half")
+    assert (plan.rasterizer, plan.cached_weights) == ("triton", "none")
     assert said(plan, "blend weights") == f"computed anew in every iteration: {reason}"
-    assert (asked_for.rasterizer, asked_for.anew, asked_for.kept_weights) == ("cached", "triton", "half")
+    assert (asked_for.rasterizer, asked_for.uncached, asked_for.cached_weights) == ("cached", "triton", "half")
 
 
 def test_on_a_gpu_half_precision_where_only_that_fits() -> None:
     plan = plan_of(on_a_gpu(replace(FASTER, bytes=4 * GIGABYTE, half_bytes=2 * GIGABYTE)))
-    assert (plan.kept_weights, plan.coarse_weights) == ("half", False)
+    assert (plan.cached_weights, plan.coarse_weights) == ("half", False)
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
     most = plan_of(on_a_gpu(replace(FASTER, bytes=10 * GIGABYTE, half_bytes=5 * GIGABYTE)))
     assert said(most, "blend weights").startswith("50% of the views' kept in half precision")
@@ -469,8 +470,8 @@ def test_on_a_gpu_half_precision_where_only_that_fits() -> None:
 
 def test_gsplat_keeps_no_weights() -> None:
     second = probe(device="cuda", rasterizer="cuda", raster=RasterCost(0.01), problems={"triton": "no driver"})
-    for plan in (plan_of(second), plan_of(second, kept_weights="float32")):
-        assert (plan.rasterizer, plan.anew, plan.kept_weights) == ("cuda", "cuda", "none")
+    for plan in (plan_of(second), plan_of(second, cached_weights="float32")):
+        assert (plan.rasterizer, plan.uncached, plan.cached_weights) == ("cuda", "cuda", "none")
         expected = "gsplat on the GPU: Triton cannot be used: no driver; gsplat works here"
         assert said(plan, "rasterizer") == expected
         assert said(plan, "blend weights") == "computed anew in every iteration: gsplat keeps none"
@@ -478,16 +479,21 @@ def test_gsplat_keeps_no_weights() -> None:
 
 def test_on_a_gpu_without_a_rasterizer_weights_are_kept_on_the_cpu() -> None:
     broken = probe(device="cuda", problems={"triton": "no driver", "cuda": "no kernels"})
-    plan, once = plan_of(broken), plan_of(broken, kept_weights="none")
+    plan, once = plan_of(broken), plan_of(broken, cached_weights="none")
     why = "Triton cannot be used: no driver; gsplat cannot be used: no kernels"
-    assert (plan.rasterizer, plan.anew, plan.kept_weights, plan.coarse_weights) == ("cached", "cpu", "float32", False)
+    assert (plan.rasterizer, plan.uncached, plan.cached_weights, plan.coarse_weights) == (
+        "cached",
+        "cpu",
+        "float32",
+        False,
+    )
     assert said(plan, "rasterizer") == f"on the CPU, with kept blend weights: {why}"
-    assert (once.rasterizer, once.kept_weights) == ("cpu", "none")
+    assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
     assert said(once, "rasterizer") == f"on the CPU: {why}"
 
 
 def test_the_reason_for_no_kept_weights_may_be_a_wish() -> None:
-    for values in ({"kept_weights": "none"}, {"keep": ("blend-weights",)}):
+    for values in ({"cached_weights": "none"}, {"keep": ("blend-weights",)}):
         assert said(plan_of(probe(), **values), "blend weights").endswith("in every iteration: asked for")
         assert said(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every iteration: asked for")
 
@@ -539,7 +545,7 @@ def test_ranks_take_part_as_the_link_allows() -> None:
 
 def test_kept_coarse_weights_need_no_exchange_of_images() -> None:
     tight = RasterCost(0.3, 0.3, 6 * GIGABYTE, 6 * GIGABYTE)
-    plans = [plan_of(probe(ranks=2, link=Link(1e8, 1e-3), raster=tight), kept_weights=w) for w in ("auto", "float32")]
+    plans = [plan_of(probe(ranks=2, link=Link(1e8, 1e-3), raster=tight), cached_weights=w) for w in ("auto", "float32")]
     assert [plan.coarse_weights for plan in plans] == [True, False]
     coarse, whole = (plan.prediction.seconds_coarse for plan in plans)  # type: ignore[union-attr]
     assert coarse < whole
@@ -633,7 +639,7 @@ def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
         "similar views",
         "uncovered pixels",
         "position weights",
-        "surround",
+        "training_background",
         "start",
         "network layers",
         "content",

@@ -17,7 +17,7 @@ from sgsst_core.planning.measuring import (
     Prices,
     choose_level,
     choose_loss_views,
-    held_out_seconds,
+    novel_view_seconds,
 )
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.settings import make_settings
@@ -64,10 +64,10 @@ def test_the_first_level_that_is_allowed_is_taken() -> None:
 
 def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() -> None:
     steps = Prediction(1.0, 1.0, 0, losses=3.0, measuring=50.0, job=1050.0)
-    assert held_out_seconds(0.1, steps) == 80.0 - 3.0
-    assert held_out_seconds(0.001, steps) == 0.8 * LEAST_ALLOWED - 3.0
-    assert held_out_seconds(0.001, replace(steps, losses=32.0)) == 0.0
-    assert held_out_seconds(0.0, steps) == 0.0
+    assert novel_view_seconds(0.1, steps) == 80.0 - 3.0
+    assert novel_view_seconds(0.001, steps) == 0.8 * LEAST_ALLOWED - 3.0
+    assert novel_view_seconds(0.001, replace(steps, losses=32.0)) == 0.0
+    assert novel_view_seconds(0.0, steps) == 0.0
 
 
 def test_the_loss_has_half_of_what_is_allowed_and_one_view_at_least() -> None:

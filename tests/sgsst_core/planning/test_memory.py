@@ -54,8 +54,8 @@ def test_views_that_no_step_comes_to_take_nothing() -> None:
 def test_weights_take_the_room_of_the_surveys_lists() -> None:
     """Both have one budget, and what did not fit it has a sixteenth of the memory beside it."""
     kept = [RasterCost(0.3, 0.1, size, size, lists_bytes=10**8) for size in (10**9, ROOM, 4 * ROOM)]
-    peaks = [plan_of(probe(raster=raster), kept_weights="float32").prediction for raster in kept]
-    base = plan_of(probe(raster=replace(kept[0], bytes=0, lists_bytes=0)), kept_weights="float32").prediction
+    peaks = [plan_of(probe(raster=raster), cached_weights="float32").prediction for raster in kept]
+    base = plan_of(probe(raster=replace(kept[0], bytes=0, lists_bytes=0)), cached_weights="float32").prediction
     assert base is not None
     rises = [found.peak_bytes - base.peak_bytes for found in peaks if found is not None]
     lists = VIEWS * 10**8

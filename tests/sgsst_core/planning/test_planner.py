@@ -71,18 +71,18 @@ def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: It
     if item == "unseen":
         gradients[1] = gradients[1][lean.plan.seen]
     assert relative_error(gradients[0], gradients[1]) < 1e-4
-    assert lean.plan.kept_weights == "float32"
-    assert (other.plan.kept_weights == "none") == (item == "blend-weights")
+    assert lean.plan.cached_weights == "float32"
+    assert (other.plan.cached_weights == "none") == (item == "blend-weights")
 
 
 def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
     scene, views = wall(), cameras(3)
-    assert make(scene, views, tiny_weights, steps_sos=14).plan.kept_weights == "none"  # fewer than 5 visits a view
+    assert make(scene, views, tiny_weights, steps_sos=14).plan.cached_weights == "none"  # fewer than 5 visits a view
     lean = make(scene, views, tiny_weights, steps_sos=30)
-    assert lean.plan.kept_weights == "float32"
+    assert lean.plan.cached_weights == "float32"
     little = make(scene, views, tiny_weights, steps_sos=30, memory_limit=400_000)
-    assert little.plan.kept_weights == "half"
-    assert make(scene, views, tiny_weights, steps_sos=30, kept_weights="none").views.rasterizer.name == "cpu"
+    assert little.plan.cached_weights == "half"
+    assert make(scene, views, tiny_weights, steps_sos=30, cached_weights="none").views.rasterizer.name == "cpu"
     decision = next(d for d in little.plan.decisions if d.item == "blend weights")
     assert "half precision" in decision.decision
     assert "1/2048" in decision.error

@@ -15,7 +15,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.cost import Rate
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import Workshop, _side, equip, measure, measure_rate
+from sgsst_core.planning.probe import PlanningContext, _side, equip, measure, measure_rate
 from sgsst_core.planning.progress import PlanningProgress, progress_of
 from sgsst_core.planning.pruning import pruned_image_error
 from sgsst_core.planning.ranks_model import Link
@@ -34,21 +34,21 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 FREE = Link(float("inf"), 0.0)
 
 
-def equipped(weights: BackboneWeights, scene: Scene, **values: Any) -> Workshop:
+def equipped(weights: BackboneWeights, scene: Scene, **values: Any) -> PlanningContext:
     return equip(scene, cameras(3), make_settings(**values), weights, ALONE)
 
 
 def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     scene = replace(wall(), sh_rest=torch.zeros(len(wall()), 15, 3))
-    workshop = equipped(tiny_weights, scene, memory_limit=10**9)
-    probe = measure(workshop, survey(scene, workshop.cameras, workshop.rasterizer), FREE)
+    planning_context = equipped(tiny_weights, scene, memory_limit=10**9)
+    probe = measure(planning_context, survey(scene, planning_context.cameras, planning_context.rasterizer), FREE)
     assert (probe.scene.gaussians, probe.scene.sh_degree, probe.scene.used_degree) == (len(scene), 3, 0)
     assert probe.sizes == tuple((camera.height, camera.width) for camera in cameras(3))
     assert probe.distinct == (0, 1, 2)
     assert probe.pruned_error is None
     assert (probe.network.halo, probe.network.held_bytes) == (
-        workshop.network.halo,
-        workshop.network.held_bytes_per_pixel(),
+        planning_context.network.halo,
+        planning_context.network.held_bytes_per_pixel(),
     )
     assert 0 < probe.network.rate.forward < 10 * probe.network.rate.both
     assert probe.network.precision_ratio is None
@@ -80,13 +80,13 @@ def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> N
 
 def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
     """On a GPU large, as far as their activations fit; the views' own size bounds both (`measure_rate` is given it)."""
-    workshop = equipped(tiny_weights, wall(), memory_limit=10**9)
-    on_gpu = replace(workshop, machine=replace(workshop.machine, device="cuda"))
-    network = workshop.network
+    planning_context = equipped(tiny_weights, wall(), memory_limit=10**9)
+    on_gpu = replace(planning_context, machine=replace(planning_context.machine, device="cuda"))
+    network = planning_context.network
     a_pixel = network.held_bytes_per_pixel() + network.working_bytes_per_pixel()
     for memory, on_cpu, with_gpu in ((1 << 40, 384, 1024), (int(500.5**2 * a_pixel), 384, 500), (1, 384, ALIGNMENT)):
         loss = SosLoss(network, memory=memory)
-        assert (_side(workshop, loss), _side(on_gpu, loss)) == (on_cpu, with_gpu)
+        assert (_side(planning_context, loss), _side(on_gpu, loss)) == (on_cpu, with_gpu)
 
 
 def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,20 +157,22 @@ def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeigh
 def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneWeights, kept: str) -> None:
     """Network and lists of views; but not where Gaussians are left out, whose places in the lists would be others."""
     for scene, handed_on in ((ball(), True), (wall(), False)):
-        settings = make_settings(kept_weights=kept)
-        plan, workshop = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+        settings = make_settings(cached_weights=kept)
+        plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
         inputs = (plan, scene, cameras(2), style(), settings)
-        used, fresh = (Stylizer(*inputs, weights=tiny_weights, workshop=shop) for shop in (workshop, None))
+        used, fresh = (
+            Stylizer(*inputs, weights=tiny_weights, planning_context=shop) for shop in (planning_context, None)
+        )
         assert bool(plan.seen.all()) is handed_on
-        assert used.network is workshop.network
+        assert used.network is planning_context.network
         rasterizer = used.views.rasterizer
-        own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer.anew  # type: ignore[attr-defined]
-        assert (own is workshop.rasterizer) is handed_on
+        own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer.uncached  # type: ignore[attr-defined]
+        assert (own is planning_context.rasterizer) is handed_on
         assert used.run_step().loss == fresh.run_step().loss
         assert torch.equal(used.sh_dc, fresh.sh_dc)
 
 
 def test_a_rasterizer_that_is_named_is_measured_and_used(tiny_weights: BackboneWeights) -> None:
-    settings = make_settings(kept_weights="none")
+    settings = make_settings(cached_weights="none")
     stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
     assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"

@@ -52,7 +52,7 @@ def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
     """Lists are kept in a smaller room beside them, and every view is rendered from these."""
     found = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
     predictions = [plan.prediction for plan in found.values()]
-    assert all(plan.kept_weights == "half" for plan in found.values())
+    assert all(plan.cached_weights == "half" for plan in found.values())
     assert predictions[0] is not None
     assert predictions[1] is not None
     assert predictions[0].peak_bytes - predictions[1].peak_bytes == pytest.approx(2 * GIGABYTE, rel=0.2)
@@ -89,15 +89,15 @@ def test_phase_1_makes_what_phase_2_finds() -> None:
 
 
 def test_content_that_is_not_kept_is_computed_at_every_visit() -> None:
-    kept, anew = expected(LARGE), expected(LARGE, keep=("content",))
-    assert anew.seconds - kept.seconds == pytest.approx(kept.first_visit - anew.first_visit)
-    assert anew.first_visit == pytest.approx(0.25 * 5 + 0.5)
+    kept, uncached = expected(LARGE), expected(LARGE, keep=("content",))
+    assert uncached.seconds - kept.seconds == pytest.approx(kept.first_visit - uncached.first_visit)
+    assert uncached.first_visit == pytest.approx(0.25 * 5 + 0.5)
 
 
 def test_weights_that_do_not_fit_save_nothing() -> None:
     """Of 10 GB, kept weights have a quarter."""
     fit, quarter = (
-        expected(RasterCost(0.3, 0.1, 40 * GIGABYTE, size), kept_weights="half")
+        expected(RasterCost(0.3, 0.1, 40 * GIGABYTE, size), cached_weights="half")
         for size in (10 * GIGABYTE // 4, 10 * GIGABYTE)
     )
     assert quarter.seconds - fit.seconds == pytest.approx(0.2 * 3 / 4)

@@ -25,7 +25,7 @@ def make(weights: BackboneWeights, scene: object = None, **values: Any) -> Styli
     given: dict[str, Any] = {
         "steps_coarse": 0,
         "steps_sos": 12,
-        "surround": "background",
+        "training_background": "background",
         "warm_start": False,
         **values,
     }
@@ -46,7 +46,7 @@ def test_an_exact_job_agrees_with_its_twin(tiny_weights: BackboneWeights) -> Non
 
 
 def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights) -> None:
-    stylizer = make(tiny_weights, kept_weights="half")
+    stylizer = make(tiny_weights, cached_weights="half")
     run(stylizer)
     assert approximations(stylizer) == ["half-precision blend weights"]
     error = ExactTwin(stylizer).gradient_error()
@@ -57,7 +57,7 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
 
 def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeights) -> None:
     """After some steps it is what it was before them, and the colors are those of the steps."""
-    stylizer = make(tiny_weights, kept_weights="half")
+    stylizer = make(tiny_weights, cached_weights="half")
     twin = ExactTwin(stylizer)
     first = twin.gradient_error()
     for _ in range(3):
@@ -88,12 +88,12 @@ def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: Backb
 def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -> None:
     """Planned by hand. On a processor a network in TF32 is one in float32; what GPUs do is imitated."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
-    plan, workshop = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+    plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     plan = replace(plan, precision="tf32")
-    rounded = RoundedToTf32(tiny_weights, workshop.network.layers)
+    rounded = RoundedToTf32(tiny_weights, planning_context.network.layers)
     errors = []
-    for shop in (None, replace(workshop, network=rounded)):
-        stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights, workshop=shop)
+    for shop in (None, replace(planning_context, network=rounded)):
+        stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights, planning_context=shop)
         assert approximations(stylizer) == ["TF32 convolutions"]
         errors.append(ExactTwin(stylizer).gradient_error())
     assert errors[0].relative_error < 1e-5

@@ -87,7 +87,7 @@ def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> Non
     found = judged(judge_of(alex, scene, [view]), other)
     styles, palette, content, features = plain(scene, other, view, style())
     assert found.style == pytest.approx(sum(styles) / 2, rel=1e-4)
-    assert found.swing == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
+    assert found.background_sensitivity == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
     assert found.palette == pytest.approx(palette, rel=1e-4)
     assert found.content == pytest.approx(content, rel=1e-3)
     assert found.features == pytest.approx(features, rel=1e-3)
@@ -98,7 +98,7 @@ def test_the_unstylized_scene_has_its_whole_content(alex: Lpips) -> None:
     found = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
     assert found.content == 0
     assert found.features == 0
-    assert found.swing > 0  # an object has a surround
+    assert found.background_sensitivity > 0  # an object has a surround
 
 
 def test_a_scene_of_the_style_is_near_the_style(alex: Lpips) -> None:

@@ -50,7 +50,7 @@ def test_all_moments_where_they_are_cheap(tiny_weights: BackboneWeights) -> None
     assert measured(stylizer) == [0, 1, 2, 4, 8, 16]
     first = stylizer.measured[0]
     assert first["level"] == 0
-    assert len(first["held_out_views"]) == 3  # first ones of the pairs of four views
+    assert len(first["novel_view_names"]) == 3  # first ones of the pairs of four views
     assert first["again"] > 0 < first["seconds"]
     assert stylizer.seconds_by_part["measuring"] >= sum(entry["seconds"] for entry in stylizer.measured)
 
@@ -61,7 +61,7 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
     measured(usual)
     measured(other)
     assert other.measured[0]["step"] == usual.measured[0]["step"] == 0
-    start, same = (found.measured[0]["held_out"]["gram"] for found in (other, usual))
+    start, same = (found.measured[0]["novel_views"]["gram"] for found in (other, usual))
     assert start == pytest.approx(same, rel=1e-6)
     assert all(terms["nearest"] > 0 for terms in other.history[-1].terms.values())
 
@@ -71,15 +71,15 @@ def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeig
     stylizer = make(tiny_weights, EXPENSIVE)
     assert measured(stylizer) == [0, 16]
     assert stylizer.measured[0]["level"] == NOTHING - 1
-    start, end = (entry["held_out"]["gram_relative"] for entry in stylizer.measured)
+    start, end = (entry["novel_views"]["gram_relative"] for entry in stylizer.measured)
     assert start == 1 > end
-    assert len(stylizer.measured[0]["held_out_views"]) == 1
+    assert len(stylizer.measured[0]["novel_view_names"]) == 1
 
 
 def test_the_end_alone_is_compared_with_nothing(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, level=NOTHING - 1)
     assert measured(stylizer) == [16]
-    moment = stylizer.measured[0]["held_out"]
+    moment = stylizer.measured[0]["novel_views"]
     assert moment["gram_relative"] is None
     assert all(value > 0 for value in moment["gram"].values())
 
@@ -100,7 +100,7 @@ def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeight
     measure(late)
     assert torch.equal(late.stylized(), colors)
     assert [entry["step"] for entry in late.measured] == [0, 1]
-    assert before.measured[0]["held_out"] == late.measured[0]["held_out"]
+    assert before.measured[0]["novel_views"] == late.measured[0]["novel_views"]
 
 
 def test_a_job_that_ends_before_the_first_moment_has_its_start_and_its_end(tiny_weights: BackboneWeights) -> None:

@@ -369,7 +369,7 @@ def test_weights_and_lists_share_a_budget() -> None:
     weights = [CachedRasterizer(scene).operator_bytes(view) for view in views]
     lists = [CpuRasterizer(scene).lists(view).nbytes for view in views]
     cpu = CpuRasterizer(scene, max_list_bytes=sum(weights[:2]) + lists[2])
-    kept = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + lists[2], anew=cpu)
+    kept = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + lists[2], uncached=cpu)
     for view in views:
         cpu.lists(view)
     for view in views:

@@ -19,7 +19,7 @@ from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.rasterizer.kept_weights import Precision
+from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
@@ -62,19 +62,19 @@ def on_device(scene: Scene) -> TritonRasterizer:
 
 
 def kept_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
-    return CachedRasterizer(scene, anew=on_device(scene), **options)
+    return CachedRasterizer(scene, uncached=on_device(scene), **options)
 
 
 def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
     scene, view = case
-    reference, anew = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
+    reference, uncached = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
     band = reference.near_cutoff(view, CLOSE)
     colors, pixels = colors_of(scene), pixels_like(view)
     pixels[band] = 0
     image, coverage = reference.render(colors, view), reference.coverage(view)
     gradient = reference.color_gradient(pixels, view)
     for precision, error in ERRORS.items():
-        kept = CachedRasterizer(scene, precision=precision, anew=anew)
+        kept = CachedRasterizer(scene, precision=precision, uncached=uncached)
         assert_close_outside_band(kept.render(colors, view).cpu(), image, band, tolerance=2 * error + 1e-5)
         assert_close_outside_band(kept.coverage(view).cpu(), coverage, band, tolerance=1e-5)
         assert relative_error(kept.color_gradient(pixels, view).cpu(), gradient) < error + 5e-6
@@ -84,8 +84,8 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
 def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
     """Down to the least weights: a faint Gaussian behind opaque ones."""
     scene, view = cloud(150, seed=7, log_scale=-1.0), camera(18, 17)
-    anew = on_device(scene)
-    exact, half = (CachedRasterizer(scene, anew=anew).count(view).keep(form) for form in ERRORS)
+    uncached = on_device(scene)
+    exact, half = (CachedRasterizer(scene, uncached=uncached).count(view).keep(form) for form in ERRORS)
     weights = exact.weights.double()  # type: ignore[attr-defined]
     rounded = half.weights.double() / half.scale  # type: ignore[attr-defined]
     # On a GPU the exact ones come from another kernel, which may round differently.
@@ -108,8 +108,8 @@ def test_gradient_is_the_transpose_and_repeats_to_the_bit(precision: Precision) 
 
 def test_bands_put_together_are_the_whole() -> None:
     scene, view = cloud(100, seed=14), camera(20, 35)
-    colors, pixels, anew = colors_of(scene), pixels_like(view), on_device(scene)
-    whole, parts = (CachedRasterizer(scene, anew=anew) for _ in range(2))
+    colors, pixels, uncached = colors_of(scene), pixels_like(view), on_device(scene)
+    whole, parts = (CachedRasterizer(scene, uncached=uncached) for _ in range(2))
     bands = [(0, 16), (16, 21), (21, 35)]
     image, gradient = whole.render(colors, view), whole.color_gradient(pixels, view)
     # A block that a band cuts may have fewer pieces, which are then added up in other groups.
@@ -138,21 +138,23 @@ def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
 def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() -> None:
     scene = cloud(100, seed=20)
     views = [camera(20, 17), camera(20, 17, pose=turned_pose(0.1)), camera(17, 20, pose=turned_pose(0.2))]
-    colors, pixels, anew = colors_of(scene), pixels_like(views[0]), on_device(scene)
+    colors, pixels, uncached = colors_of(scene), pixels_like(views[0]), on_device(scene)
     for precision in ERRORS:
-        sizes = [CachedRasterizer(scene, precision=precision, anew=anew).operator_bytes(view) for view in views[:2]]
+        sizes = [
+            CachedRasterizer(scene, precision=precision, uncached=uncached).operator_bytes(view) for view in views[:2]
+        ]
         budget = sum(sizes)
-        kept = CachedRasterizer(scene, precision=precision, anew=anew, max_bytes=budget)
+        kept = CachedRasterizer(scene, precision=precision, uncached=uncached, max_bytes=budget)
         for view in views:
             kept.coverage(view)
         assert [kept.is_kept(view) for view in views] == [True, True, False]
         assert kept.kept_bytes == budget
-    assert torch.equal(kept.render(colors, views[2]), anew.render(colors, views[2]))
+    assert torch.equal(kept.render(colors, views[2]), uncached.render(colors, views[2]))
     gradient = kept.color_gradient(pixels_like(views[2]), views[2])
-    assert torch.equal(gradient, anew.color_gradient(pixels_like(views[2]), views[2]))
+    assert torch.equal(gradient, uncached.color_gradient(pixels_like(views[2]), views[2]))
     band = (3, 16)
     assert kept.operator_bytes(views[2], band) < kept.operator_bytes(views[2])
-    alone = CachedRasterizer(scene, anew=anew)
+    alone = CachedRasterizer(scene, uncached=uncached)
     alone.color_gradient(pixels[3:16], views[0], band)
     assert alone.kept_bytes == alone.operator_bytes(views[0], band)
 
@@ -192,7 +194,7 @@ def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monk
     """The wait of the lists is for their length, that of the weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
     kept, colors, pixels = kept_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
-    kept.anew.lists(view)
+    kept.uncached.lists(view)
     with waits(monkeypatch) as found:
         kept.coverage(view)
     assert found == ["__int__"]
@@ -203,12 +205,12 @@ def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monk
 
 def test_made_by_its_name() -> None:
     scene = cloud(10)
-    anew = make_rasterizer("triton", scene, device=DEVICE)
-    rasterizer: Any = make_rasterizer("cached", scene, anew=anew)
-    assert (rasterizer.device, rasterizer.anew) == (anew.device, anew)
+    uncached = make_rasterizer("triton", scene, device=DEVICE)
+    rasterizer: Any = make_rasterizer("cached", scene, uncached=uncached)
+    assert (rasterizer.device, rasterizer.uncached) == (uncached.device, uncached)
     if DEVICE == "cuda":
         on_gpu: Any = make_rasterizer("cached", scene, device="cuda")
-        assert isinstance(on_gpu.anew, TritonRasterizer)
+        assert isinstance(on_gpu.uncached, TritonRasterizer)
 
 
 # --- plan and job --------------------------------------------------------------------------------------------------
@@ -220,11 +222,11 @@ VIEWS = cameras(2, 32, 24)
 
 def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
-    workshop = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    found = measure(workshop, survey(scene, VIEWS, workshop.rasterizer), Link(float("inf"), 0.0)).raster
+    planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
+    found = measure(planning_context, survey(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)).raster
     planned: dict[Precision, int | None] = {"float32": found.bytes, "half": found.half_bytes}
     for precision, size in planned.items():
-        kept = CachedRasterizer(scene, precision=precision, anew=workshop.rasterizer)  # type: ignore[arg-type]
+        kept = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
         for view in VIEWS:
             kept.coverage(view)
         assert kept.kept_bytes == size
@@ -236,14 +238,16 @@ def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) ->
 @pytest.mark.slow
 def test_a_job_goes_on_with_the_lists_of_its_plan(tiny_weights: BackboneWeights) -> None:
     scene, losses = ball(60), {}
-    settings = make_settings("preview", steps_coarse=0, steps_sos=1, kept_weights="half")
+    settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half")
     for name in ("cpu", "triton"):
-        plan, workshop = make_plan(scene, VIEWS[:1], settings, weights=tiny_weights, rasterizer=name)
+        plan, planning_context = make_plan(scene, VIEWS[:1], settings, weights=tiny_weights, rasterizer=name)
         inputs = (plan, scene, VIEWS[:1], style(), settings)
-        used, resumed = (Stylizer(*inputs, weights=tiny_weights, workshop=shop) for shop in (workshop, None))
+        used, resumed = (
+            Stylizer(*inputs, weights=tiny_weights, planning_context=shop) for shop in (planning_context, None)
+        )
         rasterizers: list[Any] = [stylizer.views.rasterizer for stylizer in (used, resumed)]
-        assert rasterizers[0].anew is workshop.rasterizer
+        assert rasterizers[0].uncached is planning_context.rasterizer
         for each in rasterizers:
-            assert (each.name, each.precision, each.anew.name) == ("cached", "half", name)
+            assert (each.name, each.precision, each.uncached.name) == ("cached", "half", name)
         losses[name] = used.run_step().loss
     assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-3)

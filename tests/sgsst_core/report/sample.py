@@ -52,7 +52,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "memory": {"limit_bytes": 8_000_000_000, "peak_bytes": 2_400_000_000},
         "machine": {"processor": "some processor", "cores": 2, "device": "cpu"},
         "history": history,
-        "held_out": {
+        "novel_views": {
             "views": ["c"],
             "lpips": "alex",
             "moments": [_moment(s, history) for s in (0, 4, coarse + sos)],
@@ -126,4 +126,4 @@ def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _judged(style: float, content: float) -> dict[str, float]:
     found = {"style": style, "palette": 40 * style, "content": content, "features": content / 2}
-    return {**found, "swing": 0.25, "saturated": 0.02}
+    return {**found, "background_sensitivity": 0.25, "saturated": 0.02}

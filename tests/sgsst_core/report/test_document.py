@@ -30,7 +30,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evaluation]:
     """Six views of a ball of which one sees nothing, after seven steps; the loss before and after."""
     views = [*cameras(3), blind_camera(), *cameras(2)]
-    plain: dict[str, Any] = {"surround": "background", "warm_start": False}  # steps' losses compare with the start's
+    plain: dict[str, Any] = {
+        "training_background": "background",
+        "warm_start": False,
+    }  # steps' losses compare with the start's
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3, **plain)
     stylizer = Stylizer.planned(ball(), views, style(), settings, weights=tiny_weights)
     before = stylizer.evaluate(stylizer.evaluation_views)
@@ -97,8 +100,8 @@ def test_what_was_measured_and_its_share(
     monkeypatch.setattr(stylizer, "seconds", 200.0)
     monkeypatch.setitem(stylizer.seconds_by_part, "measuring", 30.0)
     entries = [
-        {"step": 0, "held_out": None, "approximation": None, "held_out_views": ["a", "b"], "seconds": 9.0},
-        {"step": 7, "held_out": None, "approximation": None},  # of a version that did not tell
+        {"step": 0, "novel_views": None, "approximation": None, "novel_view_names": ["a", "b"], "seconds": 9.0},
+        {"step": 7, "novel_views": None, "approximation": None},  # of a version that did not tell
     ]
     monkeypatch.setattr(stylizer, "measured", entries)
     monkeypatch.setattr(stylizer, "plan", replace(stylizer.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50)))
@@ -108,7 +111,7 @@ def test_what_was_measured_and_its_share(
         "seconds": 30.0,
         "of_steps": 0.15,
         "loss_views": 4,
-        "held_out_views": 2,
+        "novel_view_names": 2,
         "moments": [{"step": 0, "seconds": 9.0}, {"step": 7, "seconds": None}],
     }
 

@@ -119,7 +119,7 @@ def losses_alone(coarse: int = 6, sos: int = 12) -> dict[str, Any]:
     report = sample_report(coarse, sos)
     for record in report["history"]:
         del record["memory_bytes"]
-    return {**report, "held_out": None, "approximations": None}
+    return {**report, "novel_views": None, "approximations": None}
 
 
 def test_page_is_whole_and_refers_to_nothing_outside() -> None:
@@ -203,7 +203,7 @@ def test_every_figure_is_there_against_seconds_and_against_steps() -> None:
 def test_lines_are_named_and_phases_marked() -> None:
     loss = draw_figures(sample_report())[0].svg["steps"]
     words = Page(loss).text
-    for name in ("scale 0 (full size)", "scale 1 (1/2)", "mean", "Gram distance, held-out views", "steps"):
+    for name in ("scale 0 (full size)", "scale 1 (1/2)", "mean", "Gram distance, novel views", "steps"):
         assert name in words
     assert "coarsest scale" in words
     assert "all scales" in words
@@ -228,11 +228,13 @@ def test_terms_that_a_loss_does_not_have_are_not_drawn() -> None:
 
 
 def test_both_axes_of_the_loss_are_logarithmic() -> None:
-    """Held-out points of which each has twice the step and half the value of the one before lie evenly spaced."""
+    """Novel points of which each has twice the step and half the value of the one before lie evenly spaced."""
     report = sample_report(0, 64)
-    for moment, step in zip(report["held_out"]["moments"], (0, 4, 8), strict=True):
+    for moment, step in zip(report["novel_views"]["moments"], (0, 4, 8), strict=True):
         moment.update(step=step, gram_relative=1 / step if step else 1.0)
-    report["held_out"]["moments"].append({**report["held_out"]["moments"][-1], "step": 16, "gram_relative": 1 / 16})
+    report["novel_views"]["moments"].append(
+        {**report["novel_views"]["moments"][-1], "step": 16, "gram_relative": 1 / 16}
+    )
     svg = draw_figures(report)[0].svg["steps"]
     marks = [
         (float(attributes["x"] or ""), float(attributes["y"] or ""))
@@ -365,9 +367,9 @@ def test_what_the_result_is_judged_to_be_stands_beside_the_start() -> None:
     assert page.cells[place : place + 3] == ["distance to the style", "1.5", "0.625"]
     place = page.cells.index("colors that no screen shows")
     assert page.cells[place + 1 : place + 3] == ["2 %", "2 %"]
-    report["held_out"]["judged"] = None
+    report["novel_views"]["judged"] = None
     assert "distance to the style" not in parsed_without_figures(report).text
-    del report["held_out"]["judged"]  # a report of a version that did not judge
+    del report["novel_views"]["judged"]  # a report of a version that did not judge
     assert "distance to the style" not in parsed_without_figures(report).text
 
 
@@ -385,7 +387,7 @@ def test_folded_part_holds_all_other_fields() -> None:
 
 def test_reports_without_the_optional_parts() -> None:
     report = sample_report()
-    report.update(held_out=None, approximations=None, bought=None, findings=[], seconds_by_part={})
+    report.update(novel_views=None, approximations=None, bought=None, findings=[], seconds_by_part={})
     report["plan"] = {"decisions": [], "prediction": None, "measured": {"seconds": None, "peak_bytes": 1}}
     for record in report["history"]:
         del record["memory_bytes"], record["parts"]
@@ -397,7 +399,7 @@ def test_reports_without_the_optional_parts() -> None:
 
 def test_held_out_views_without_numbers() -> None:
     report = sample_report()
-    for moment in report["held_out"]["moments"]:
+    for moment in report["novel_views"]["moments"]:
         moment["consistency"] = {
             "short": {"gap": 1, "pairs": 0, "compared": 0.0, "rmse": None, "lpips": None},
             "long": None,
@@ -408,15 +410,15 @@ def test_held_out_views_without_numbers() -> None:
     page = parsed(report)
     assert "consistency" not in [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert "They were not compared with the exact gradient." in page.text
-    report["held_out"]["moments"] = []
+    report["novel_views"]["moments"] = []
     parsed(report)
 
 
 @pytest.mark.parametrize("missing", ["short", "long"])
 def test_views_of_one_reach_alone_leave_both_panels_their_room(missing: str) -> None:
-    """Four cameras make too few held-out views for the long range: it is in no panel, and nor is its name."""
+    """Four cameras make too few novel views for the long range: it is in no panel, and nor is its name."""
     report = sample_report()
-    for moment in report["held_out"]["moments"]:
+    for moment in report["novel_views"]["moments"]:
         moment["consistency"]["long"] = {**moment["consistency"]["short"], "gap": 7}
         moment["consistency"][missing] = None
     svg = {figure.name: figure for figure in draw_figures(report)}["consistency"].svg
@@ -447,7 +449,7 @@ def test_probes_that_no_axis_shows_are_not_drawn() -> None:
 
 
 def test_every_color_of_a_figure_has_one_for_dark_screens() -> None:
-    page = parsed({**sample_report(1, 2, len(COLORS)), "held_out": None, "approximations": None})
+    page = parsed({**sample_report(1, 2, len(COLORS)), "novel_views": None, "approximations": None})
     used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
     assert {color[1:] for color in (*COLORS, INK, GRID)} <= used
     defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))

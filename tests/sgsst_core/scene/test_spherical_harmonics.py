@@ -201,18 +201,18 @@ def test_revived_colors_only_come_back() -> None:
     """Where the clamp holds a color at 0, a gradient that would raise it passes, one that would lower it does not."""
     colors = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
     gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
-    found = view_colors_gradient(gradient, colors, revive=True)
+    found = view_colors_gradient(gradient, colors, clamp_aware_gradient=True)
     torch.testing.assert_close(found, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
 
 
 def test_dark_colors_come_back_when_revived() -> None:
     """Descent on |c - 0.6|^2 from far below 0: stuck without, at its target with."""
     ends = []
-    for revive in (False, True):
+    for clamp_aware_gradient in (False, True):
         sh_dc = torch.full((1, 3), -4.0)
         for _ in range(400):
             colors = view_colors(sh_dc, torch.zeros(1, 3))
-            sh_dc -= view_colors_gradient(2 * (colors - 0.6), colors, revive=revive)
+            sh_dc -= view_colors_gradient(2 * (colors - 0.6), colors, clamp_aware_gradient=clamp_aware_gradient)
         ends.append(view_colors(sh_dc, torch.zeros(1, 3)))
     assert bool((ends[0] == 0).all())
     torch.testing.assert_close(ends[1], torch.full((1, 3), 0.6), rtol=1e-4, atol=0)

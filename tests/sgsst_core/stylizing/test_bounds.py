@@ -40,9 +40,9 @@ def bright_wall() -> Scene:
     "values",
     [
         {},
-        {"revive": False},
+        {"clamp_aware_gradient": False},
         {"unseen": "keep"},
-        {"surround": "palette", "warm_start": True},
+        {"training_background": "palette", "warm_start": True},
         {"views_per_step": 2},
     ],
     ids=str,
@@ -67,7 +67,7 @@ def test_no_color_that_changes_leaves_what_screens_show(
 
 def test_luminance_alone_keeps_chroma_within_the_bounds(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
-    stylizer = make(tiny_weights, scene, bounded=True, keep_colors="luminance")
+    stylizer = make(tiny_weights, scene, bounded=True, preserve_colors="luminance")
     run(stylizer)
     found = stylizer.stylized()
     change = (found - scene.sh_dc).double()
@@ -94,7 +94,7 @@ def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeight
 def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) -> None:
     """Rendering what no view sees changes nothing, to the bit, although its colors begin beyond the bounds."""
     lean, full = (
-        make(tiny_weights, bright_wall(), bounded=True, kept_weights="none", keep=keep) for keep in ((), ("unseen",))
+        make(tiny_weights, bright_wall(), bounded=True, cached_weights="none", keep=keep) for keep in ((), ("unseen",))
     )
     for stylizer in (lean, full):
         run(stylizer)

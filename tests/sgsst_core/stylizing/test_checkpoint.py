@@ -53,7 +53,7 @@ def state() -> StylizerState:
         ],
         seconds_by_part={"render": 0.1},
         memory=12345,
-        measured=[{"step": 0, "held_out": None, "approximation": {"cosine": 1 / 3}}],
+        measured=[{"step": 0, "novel_views": None, "approximation": {"cosine": 1 / 3}}],
     )
 
 
@@ -70,7 +70,7 @@ def kept(state: StylizerState) -> Checkpoint:
         steps_coarse=7,
         memory_limit=12345,
         rasterizer="cached",
-        kept_weights="half",
+        cached_weights="half",
         measured=True,
         ranks=2,
         decisions=(Decision("item", "decision", "reason", seconds=0.1, bytes=3),),
@@ -129,7 +129,7 @@ def test_a_checkpoint_of_version_3_comes_back_with_what_its_plan_meant(kept: Che
     of_version_3(tmp_path / "c")
     assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
     for form, rasterizer in (("none", "cpu"), ("float32", "cached")):
-        other = replace(kept, plan=replace(kept.plan, kept_weights=form))  # type: ignore[arg-type]
+        other = replace(kept, plan=replace(kept.plan, cached_weights=form))  # type: ignore[arg-type]
         save_checkpoint(tmp_path / "c", other, "job")
         of_version_3(tmp_path / "c", decision="features in bfloat16")
         found = load_checkpoint(tmp_path / "c", "job").plan

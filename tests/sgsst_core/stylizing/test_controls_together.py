@@ -54,7 +54,7 @@ def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_we
 
 @pytest.mark.parametrize("colors", ["no", "luminance"])
 def test_all_at_once(tiny_weights: BackboneWeights, colors: str) -> None:
-    values = {"refine": 2.0, "keep_colors": colors, "scales": (1.0, 0.5), "warm_start": True}
+    values = {"refine": 2.0, "preserve_colors": colors, "scales": (1.0, 0.5), "warm_start": True}
     stylizer = job(tiny_weights, **values)
     before = stylizer.scene.sh_dc.clone()
     found = stylized(stylizer)

@@ -18,7 +18,7 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
-from sgsst_core.settings import PlannedSurround, make_settings
+from sgsst_core.settings import PlannedBackground, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
@@ -44,7 +44,7 @@ def make(
     graphs: bool,
     scan: bool = False,
     rasterizer: str = "triton",
-    surround: PlannedSurround = "background",
+    training_background: PlannedBackground = "background",
     **values: Any,
 ) -> Stylizer:
     """Of two views in two scales, three steps in each phase unless told otherwise."""
@@ -58,7 +58,7 @@ def make(
         seen=some,
         covered=tuple(looked.covered),
         weighted=scan,
-        surround=surround,
+        training_background=training_background,
         steps_coarse=settings.steps_coarse,
         memory_limit=10**9,
         device="cuda",
@@ -99,7 +99,9 @@ def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
     """One graph serves every color, and nothing is waited for or copied because of it."""
     leave_out_kernels(monkeypatch)
     options: dict[str, Any] = {"scan": True, "rasterizer": "triton", "steps_coarse": 0, "steps_sos": 8}
-    plain, graphs = (make(tiny_weights, graphs=graphs, surround="random", **options) for graphs in (False, True))
+    plain, graphs = (
+        make(tiny_weights, graphs=graphs, training_background="random", **options) for graphs in (False, True)
+    )
     fixed = make(tiny_weights, graphs=True, **options)
     found: dict[str, list[tuple[int, int]]] = {"drawn": [], "fixed": []}
     for _ in range(plain.total):

@@ -29,7 +29,7 @@ def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
     size = sum(kept.operator_bytes(camera) for camera in VIEWS) // 2
     settings = {"steps_coarse": 0, "steps_sos": STEPS, "position_weights": "on", "seed": 3, **settings}
     chosen = make_settings(
-        "preview", kept_weights=form, memory_limit=int(size / MEMORY_SHARES["rasterizer"]), **settings
+        "preview", cached_weights=form, memory_limit=int(size / MEMORY_SHARES["rasterizer"]), **settings
     )
     return Stylizer.planned(scene, VIEWS, style(), chosen, weights=weights)
 
@@ -117,12 +117,12 @@ def test_lent_weights_are_those_that_are_kept() -> None:
     keeper.keep(view)
     with lender.lending(view):
         assert torch.equal(lender.color_gradient(pixels, view), keeper.color_gradient(pixels, view))
-    anew = CpuRasterizer(scene).color_gradient(pixels, view)
-    assert torch.equal(lender.color_gradient(pixels, view), anew)
+    uncached = CpuRasterizer(scene).color_gradient(pixels, view)
+    assert torch.equal(lender.color_gradient(pixels, view), uncached)
     assert lender.kept_bytes == 0
     small = CachedRasterizer(scene, at_first_use=False, precision="half", max_bytes=10)
     with small.lending(view):
-        assert torch.equal(small.color_gradient(pixels, view), anew)
+        assert torch.equal(small.color_gradient(pixels, view), uncached)
     with keeper.lending(view):
         pass
     assert keeper.is_kept(view)

@@ -36,7 +36,7 @@ ROUNDING = 2**-22
 
 
 def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) -> Stylizer:
-    chosen: dict[str, Any] = {"coarsest_side": 24, "keep_colors": "luminance"} | values
+    chosen: dict[str, Any] = {"coarsest_side": 24, "preserve_colors": "luminance"} | values
     settings = make_settings(steps_coarse=2, steps_sos=steps, early_stop=False, **chosen)
     return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
 
@@ -52,9 +52,9 @@ def chroma_off(found: torch.Tensor, scene: Scene) -> float:
     "values",
     [
         {},
-        {"revive": False},
+        {"clamp_aware_gradient": False},
         {"warm_start": True},
-        {"surround": "palette"},
+        {"training_background": "palette"},
         {"style_loss": "mixed"},
         {"content_weight": 0, "views_per_step": 2},
         {"unseen": "keep"},
@@ -82,7 +82,7 @@ def test_every_gaussian_keeps_its_chroma(
 def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: BackboneWeights) -> None:
     """dE/d(what is added to all three channels of a Gaussian), by autograd through definitions in float64."""
     scene, view = wall(), cameras(1)[0]
-    settings = make_settings(keep_colors="luminance", coarsest_side=24, steps_coarse=0, revive=False)
+    settings = make_settings(preserve_colors="luminance", coarsest_side=24, steps_coarse=0, clamp_aware_gradient=False)
     stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
     found, _ = stylizer.gradient(0, range(stylizer.scale_count(0)))
 
@@ -126,7 +126,7 @@ def test_the_style_takes_the_scenes_luminance() -> None:
     generator = torch.Generator().manual_seed(1)
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
-    settings = make_settings(keep_colors="luminance")
+    settings = make_settings(preserve_colors="luminance")
     painting = StyleMixture.of(0.5 + 0.1 * picture(64, 64, seed=2).float())
     (found,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).pictures
     assert torch.equal(found[..., 0], found[..., 1])
@@ -144,7 +144,7 @@ def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
     dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
     mixture = StyleMixture.weighted([dark.float(), bright.float()], [3, 1])
     ones = torch.ones(5000, dtype=torch.float64)
-    found = prepared_style(mixture, make_settings(keep_colors="luminance"), (colors - 0.5) / SH_C0, ones)
+    found = prepared_style(mixture, make_settings(preserve_colors="luminance"), (colors - 0.5) / SH_C0, ones)
     first, second = (luminance(each.double()) for each in found.pictures)
     assert float(first.mean()) < float(second.mean())
     values = luminance(colors.double())
@@ -160,7 +160,7 @@ def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
 def test_flat_styles_and_scenes_are_finite(value: float) -> None:
-    settings = make_settings(keep_colors="luminance")
+    settings = make_settings(preserve_colors="luminance")
     flat, some = torch.full((5, 4, 3), value), 0.3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     ones = torch.ones(20, dtype=torch.float64)
     for scene_colors, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):

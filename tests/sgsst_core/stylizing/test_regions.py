@@ -80,10 +80,10 @@ def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
 @pytest.mark.parametrize(
     "values",
     [
-        {"warm_start": True, "revive": True},
+        {"warm_start": True, "clamp_aware_gradient": True},
         {"unseen": "neighbors", "views_per_step": 2, "background": (1.0, 0.5, 0.0)},
-        {"keep": ("unseen",), "surround": "random"},
-        {"kept_weights": "half", "keep_colors": "match", "style_loss": "mixed"},
+        {"keep": ("unseen",), "training_background": "random"},
+        {"cached_weights": "half", "preserve_colors": "match", "style_loss": "mixed"},
     ],
 )
 @pytest.mark.parametrize("kept", ["rest", "right"])

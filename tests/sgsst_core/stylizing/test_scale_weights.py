@@ -50,7 +50,7 @@ def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: Backbone
     run(stylizer)
     measure = Measurements(stylizer)
     measure.at_the_end()
-    assert set(map(int, stylizer.measured[-1]["held_out"]["gram"])) == {0, 2}
+    assert set(map(int, stylizer.measured[-1]["novel_views"]["gram"])) == {0, 2}
 
 
 def test_one_scale_leaves_phase_1_out(tiny_weights: BackboneWeights) -> None:

@@ -81,7 +81,7 @@ def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
         [[1.0, 0.3, 0.0], [0.0, 1.0, 0.5], [0.0, 0.0, 0.4]]
     )
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
-    settings = make_settings("standard", keep_colors="match")
+    settings = make_settings("standard", preserve_colors="match")
     style = 0.5 + 0.05 * torch.randn(64, 64, 3, generator=generator)
     (image,) = prepared_style(StyleMixture.of(style), settings, (colors - 0.5) / SH_C0, weights).pictures
     found = image.reshape(-1, 3).double()
@@ -94,7 +94,7 @@ def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
 
 
 def test_a_flat_style_takes_the_scenes_mean() -> None:
-    settings = make_settings("standard", keep_colors="match")
+    settings = make_settings("standard", preserve_colors="match")
     gray = StyleMixture.of(torch.full((4, 4, 3), 0.9))
     (found,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).pictures
     torch.testing.assert_close(found, torch.full((4, 4, 3), 0.5))
@@ -134,7 +134,7 @@ def test_a_style_may_be_as_large_as_a_view_may_be() -> None:
 
 
 def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
-    settings = make_settings("standard", style_rotation=90, keep_colors="match", style_scale=2, coarsest_side=24)
+    settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), picture()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     (used,) = stylizer.style.pictures

@@ -56,9 +56,9 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
     assert not torch.equal(first.sh_dc, other.sh_dc)
 
 
-@pytest.mark.parametrize("kept_weights", ["none", "float32"])
+@pytest.mark.parametrize("cached_weights", ["none", "float32"])
 def test_raster_lists_of_the_survey_are_not_built_again(
-    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, kept_weights: str
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, cached_weights: str
 ) -> None:
     """They are cut down to what the views see, with the same bits as lists that are built for it."""
     built: list[int] = []
@@ -71,13 +71,13 @@ def test_raster_lists_of_the_survey_are_not_built_again(
     monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_raster_lists", build)
     scene, views = ball(), cameras(3)
     scene.means[-10:, 2] *= -1  # behind the cameras
-    settings = make_settings(steps_sos=6, kept_weights=kept_weights)
-    plan, workshop = make_plan(scene, views, settings, weights=tiny_weights)
+    settings = make_settings(steps_sos=6, cached_weights=cached_weights)
+    plan, planning_context = make_plan(scene, views, settings, weights=tiny_weights)
     assert not plan.seen.all()
-    assert plan.kept_weights == kept_weights
+    assert plan.cached_weights == cached_weights
     results = []
-    for given in (workshop, None):
-        stylizer = Stylizer(plan, scene, views, style(), settings, weights=tiny_weights, workshop=given)
+    for given in (planning_context, None):
+        stylizer = Stylizer(plan, scene, views, style(), settings, weights=tiny_weights, planning_context=given)
         run(stylizer)
         results.append(stylizer.stylized())
     assert built == [len(scene)] * 3 + [int(plan.seen.sum())] * 3
@@ -113,7 +113,9 @@ def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWe
     options: dict[str, Any] = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
     views = [resized(camera, 100) for camera in cameras(2)]
     lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=tiny_weights)
-    plain = Stylizer.planned(scene, views, style(), make_settings(**options, kept_weights="none"), weights=tiny_weights)
+    plain = Stylizer.planned(
+        scene, views, style(), make_settings(**options, cached_weights="none"), weights=tiny_weights
+    )
     assert lean.plan.coarse_weights
     assert not plain.plan.coarse_weights
     for scales in ([2], [0, 1, 2]):

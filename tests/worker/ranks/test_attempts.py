@@ -216,7 +216,7 @@ def command(request: StylizeRequest, *options: str) -> list[str]:
     """`sgsst stylize` of the same job."""
     source = request.source
     files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
-    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--keep-everything"]
+    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--compute-everything"]
     return ["stylize", *files, "--out", str(request.out), *settings, "--workers", "2", *options]
 
 

@@ -20,11 +20,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("scene", "values"),
     [
-        pytest.param(wall(sh_degree=1), {"keep_colors": "luminance"}, id="luminance"),
-        pytest.param(wall(sh_degree=2), {"sh_fade": 0.3}, id="fading"),
+        pytest.param(wall(sh_degree=1), {"preserve_colors": "luminance"}, id="luminance"),
+        pytest.param(wall(sh_degree=2), {"sh_attenuation": 0.3}, id="attenuation"),
         pytest.param(wall(), {"scales": (1.0, 0.5)}, id="scales"),
         pytest.param(wall(), {"scales": (0.0, 1.0), "style_loss": "mixed"}, id="one-scale"),
-        pytest.param(ball(), {"keep_colors": "luminance", "surround": "palette"}, id="luminance-of-a-scan"),
+        pytest.param(
+            ball(), {"preserve_colors": "luminance", "training_background": "palette"}, id="luminance-of-a-scan"
+        ),
     ],
 )
 def test_ranks_end_where_one_rank_ends(scene: Scene, values: dict[str, Any]) -> None:

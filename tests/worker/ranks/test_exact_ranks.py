@@ -213,13 +213,19 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
 
 def test_ranks_draw_the_same_colors_behind_a_scan() -> None:
     """One rank's, whatever the groups in which views are taken."""
-    values = {"steps_coarse": 2, "steps_sos": 3, "views_per_step": 2, "learning_rate": 0.01, "surround": "palette"}
+    values = {
+        "steps_coarse": 2,
+        "steps_sos": 3,
+        "views_per_step": 2,
+        "learning_rate": 0.01,
+        "training_background": "palette",
+    }
     expected = stylize(ALONE, ball(), 3, values)
     for ranks in (2, 3):
         for result in on_ranks(ranks, stylize, ball(), 3, values):
             assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
             assert relative_error(result["colors"], expected["colors"]) < 1e-3
-    assert expected["losses"] != stylize(ALONE, ball(), 3, {**values, "surround": "random"})["losses"]
+    assert expected["losses"] != stylize(ALONE, ball(), 3, {**values, "training_background": "random"})["losses"]
 
 
 def one_view_a_step_by_hand(views: list[int]) -> Tensor:

@@ -34,7 +34,7 @@ def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int],
         counts.clear()
         losses.append(stylizer.run_step().loss)
         waits.append(counts.waits.total())
-    return stylizer.stylized(), losses, waits, f"{stylizer.plan.device} {stylizer.plan.anew}"
+    return stylizer.stylized(), losses, waits, f"{stylizer.plan.device} {stylizer.plan.uncached}"
 
 
 @pytest.mark.slow

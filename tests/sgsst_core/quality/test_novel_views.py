@@ -1,4 +1,4 @@
-"""Held-out views: where they stand, and what is measured on them."""
+"""Novel views: where they stand, and what is measured on them."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from sgsst_core.loss.sos_reference import box_average_reference, features_refere
 from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
-from sgsst_core.quality.held_out import MOST_VIEWS, HeldOut, neighbors
 from sgsst_core.quality.lpips import Lpips
+from sgsst_core.quality.novel_views import MOST_VIEWS, NovelViews, neighbors
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
@@ -192,9 +192,9 @@ def lpips(vgg16_weights) -> Lpips:
 COARSEST = 40
 
 
-def held_out(
+def novel_views(
     scene: Scene, views: list[Camera], network: FeatureNetwork, coarsest: int = COARSEST_SHORTER_SIDE, **options
-) -> HeldOut:
+) -> NovelViews:
     """Of a job whose every view is covered and of one size."""
     loss = SosLoss(network, coarsest=coarsest)
     rasterizer = make_rasterizer("cpu", scene, background=(0.2, 0.3, 0.4))
@@ -207,7 +207,7 @@ def held_out(
         return targets[size]
 
     options = {"covered": range(len(views)), "weighted": False, **options}
-    return HeldOut(views, scene=scene, rasterizer=rasterizer, loss=loss, style_targets=style_targets, **options)
+    return NovelViews(views, scene=scene, rasterizer=rasterizer, loss=loss, style_targets=style_targets, **options)
 
 
 def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | None) -> dict[int, float]:
@@ -237,7 +237,7 @@ def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | 
 @pytest.mark.parametrize(("scene", "weighted"), [(wall(sh_degree=1), False), (ball(), True)], ids=["wall", "ball"])
 def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, weighted: bool):
     views = cameras(6)
-    measured = held_out(scene, views, network, coarsest=COARSEST, weighted=weighted)
+    measured = novel_views(scene, views, network, coarsest=COARSEST, weighted=weighted)
     assert measured.views == [0, 1, 2, 3]
     sh_dc = 4 * scene.sh_dc  # colors far outside 0..1
     reference = make_rasterizer("reference", scene, background=(0.2, 0.3, 0.4))
@@ -255,21 +255,21 @@ def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, w
 
 def test_the_first_measurement_is_the_measure_of_the_others(network):
     scene, views = wall(), cameras(4)
-    measured = held_out(scene, views, network)
+    measured = novel_views(scene, views, network)
     first = measured.measure(scene.sh_dc)
     assert first.gram_relative == 1.0
     assert measured.measure(scene.sh_dc) == first
     gray = measured.measure(torch.zeros_like(scene.sh_dc))
     assert gray.gram_relative == pytest.approx(gray.gram[0] / first.gram[0])
     assert abs(gray.gram_relative - 1) > 0.1
-    resumed = held_out(scene, views, network, first=first.gram)
+    resumed = novel_views(scene, views, network, first=first.gram)
     assert resumed.measure(torch.zeros_like(scene.sh_dc)) == gray
 
 
 def test_what_is_kept_changes_nothing_and_the_job_s_loss_is_left_alone(network, lpips):
     scene, views = wall(sh_degree=1), cameras(10)
-    kept = held_out(scene, views, network, weighted=True, lpips=lpips)
-    nothing_kept = held_out(scene, views, network, weighted=True, lpips=lpips, memory=0)
+    kept = novel_views(scene, views, network, weighted=True, lpips=lpips)
+    nothing_kept = novel_views(scene, views, network, weighted=True, lpips=lpips, memory=0)
     moment = kept.measure(scene.sh_dc)
     assert moment == nothing_kept.measure(scene.sh_dc) == kept.measure(scene.sh_dc)
     assert {gap: len(pairs) for gap, pairs in kept.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
@@ -279,7 +279,7 @@ def test_consistency_does_not_see_what_cannot_be_seen(network, lpips):
     front, back = wall(), wall()
     back = replace(back, means=back.means * torch.tensor([1.0, 1, -1]))  # behind all cameras
     both = Scene(*(torch.cat([getattr(front, f), getattr(back, f)]) for f in Scene.__dataclass_fields__))
-    measured = held_out(both, cameras(10), network, lpips=lpips)
+    measured = novel_views(both, cameras(10), network, lpips=lpips)
     before = measured.measure(both.sh_dc)
     noise = torch.randn(len(back), 3, generator=torch.Generator().manual_seed(0))
     after = measured.measure(torch.cat([front.sh_dc, noise]))
@@ -296,7 +296,7 @@ def test_colors_that_depend_on_the_view_are_less_consistent(network, lpips):
     plain = replace(plain, sh_dc=smooth, sh_rest=torch.zeros_like(plain.sh_rest))
     generator = torch.Generator().manual_seed(3)
     noisy = replace(plain, sh_rest=1.5 * torch.randn(plain.sh_rest.shape, generator=generator))
-    calm, rough = (held_out(s, views, network, lpips=lpips).measure(s.sh_dc) for s in (plain, noisy))
+    calm, rough = (novel_views(s, views, network, lpips=lpips).measure(s.sh_dc) for s in (plain, noisy))
     for before, after in ((calm.short, rough.short), (calm.long, rough.long)):
         assert after.compared == before.compared > 0.5
         assert after.rmse > 3 * before.rmse
@@ -316,7 +316,7 @@ def test_a_view_inside_of_something_is_not_measured(network):
     shell = replace(shell, means=centered * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
     room = wall()
     both = Scene(*(torch.cat([getattr(room, f), getattr(shell, f)]) for f in Scene.__dataclass_fields__))
-    empty, filled = held_out(room, views, network), held_out(both, views, network)
+    empty, filled = novel_views(room, views, network), novel_views(both, views, network)
     assert names(empty.cameras) == names(filled.cameras) == ["0–1", "1–2", "2–3"]
     assert (empty.views, empty.pairs[SHORT_RANGE]) == ([0, 1], [(0, 1), (1, 2)])
     assert (filled.views, filled.pairs[SHORT_RANGE]) == ([1], [(1, 2)])
@@ -324,7 +324,7 @@ def test_a_view_inside_of_something_is_not_measured(network):
 
 def test_jobs_of_one_and_of_two_cameras(network, lpips):
     scene = wall()
-    alone = held_out(scene, cameras(1), network)
+    alone = novel_views(scene, cameras(1), network)
     nothing = alone.measure(scene.sh_dc)
     assert (alone.cameras, alone.views) == ([], [])
     assert nothing.as_dict(0, 0.0) == {
@@ -334,16 +334,16 @@ def test_jobs_of_one_and_of_two_cameras(network, lpips):
         "gram_relative": None,
         "consistency": {"short": None, "long": None},
     }
-    blind = held_out(scene, [*cameras(1), blind_camera()], network, covered=[0])
+    blind = novel_views(scene, [*cameras(1), blind_camera()], network, covered=[0])
     assert blind.views == []
-    two = held_out(scene, cameras(2), network, lpips=lpips).measure(scene.sh_dc)
+    two = novel_views(scene, cameras(2), network, lpips=lpips).measure(scene.sh_dc)
     assert set(two.gram) == {0}
     assert two.short is two.long is None
 
 
 def test_a_moment_is_plain_json(network, lpips):
     scene = wall()
-    measured = held_out(scene, cameras(9), network, lpips=lpips)
+    measured = novel_views(scene, cameras(9), network, lpips=lpips)
     moment = measured.measure(scene.sh_dc)
     values = json.loads(json.dumps(moment.as_dict(7, 1.5), allow_nan=False))
     assert list(values) == ["step", "seconds", "gram", "gram_relative", "consistency"]
@@ -357,7 +357,7 @@ def test_a_moment_is_plain_json(network, lpips):
         "lpips": moment.short.lpips,
     }
     assert (values["consistency"]["long"]["gap"], values["consistency"]["long"]["pairs"]) == (7, 1)
-    without = held_out(scene, cameras(3), network).measure(scene.sh_dc).as_dict(0, 0.0)["consistency"]
+    without = novel_views(scene, cameras(3), network).measure(scene.sh_dc).as_dict(0, 0.0)["consistency"]
     assert without["short"]["lpips"] is None
     assert without["short"]["rmse"] > 0
     assert without["long"] is None
@@ -371,7 +371,7 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
     painting = load_image(shared_data / "styles" / "starry_night.jpg")
     settings = make_settings(steps_coarse=0, steps_sos=10, learning_rate=0.2, learning_rate_end=0.1)
     stylizer = Stylizer.planned(scene, views, painting, settings, weights=vgg16_weights)
-    measured = HeldOut(
+    measured = NovelViews(
         stylizer.views.cameras,
         stylizer.views.covered,
         scene,

@@ -1,6 +1,6 @@
 """Quality on views that were never trained on, measured at moments of a run.
 
-No camera is taken away from the training: held-out views lie halfway between neighboring cameras. What is measured is
+No camera is taken away from the training: novel views lie halfway between neighboring cameras. What is measured is
 how far their style is from the style image's (the Gram terms of the SOS loss) and how well they agree with each other
 (multi-view consistency). Geometry is frozen, so that coverage and warps are the same at every moment and are kept.
 """
@@ -46,7 +46,7 @@ JUMP = 4.0
 #: Nor are two that are turned against each other by more than this, about the field of view of a photo: halfway between
 #: them, nothing need be in view that either sees.
 LARGEST_TURN = math.radians(60)
-#: Median depth and coverage of a held-out view are at least the smaller of its neighbors' divided by this, and at most
+#: Median depth and coverage of a novel view are at least the smaller of its neighbors' divided by this, and at most
 #: the larger times this. Inside an object or behind a wall they are not; on the chord of an arc of 60 degrees they
 #: change by no more than a third.
 LIKENESS = 2.0
@@ -59,7 +59,7 @@ _COSINE_ROUNDING = 1e-6
 
 
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
-    """The pairs that held-out cameras lie between: each two neighbors; neighbors in space follow each other.
+    """The pairs that novel cameras lie between: each two neighbors; neighbors in space follow each other.
 
     The list's order counts. Where the next camera is mostly no neighbor (see `JUMP` and `LARGEST_TURN`) the list is
     not in the order of a capture, and a walk from each camera to the nearest one takes its place. Fewer than two
@@ -107,7 +107,7 @@ def _similarly_turned(rotations: Tensor, rotation: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class HeldOutMoment:
+class NovelViewMoment:
     """What one measurement gives.
 
     Attributes:
@@ -132,15 +132,15 @@ class HeldOutMoment:
         }
 
 
-class HeldOut:
-    """Measures the held-out views of one job.
+class NovelViews:
+    """Measures the novel views of one job.
 
     Args:
         cameras: of the job.
         covered: indices of those that see anything.
-        scene: what is stylized. Gaussians that it lacks are missing in the held-out views too.
+        scene: what is stylized. Gaussians that it lacks are missing in the novel views too.
         rasterizer: of the scene. Best one of its own: a `cached` one that the job uses as well would keep the weights
-            of held-out views in the place of views that come again in every round.
+            of novel views in the place of views that come again in every round.
         loss: gives network, memory and partition; it is not used itself, so that its timer does not run.
         style_targets: the style's statistics for views of a camera's size, in the loss's units.
         weighted: weigh statistics by rendered coverage, as the job does.
@@ -153,7 +153,7 @@ class HeldOut:
         maps: renders the share of each region, which `style_targets` are those of; None where the scene has none.
 
     Attributes:
-        cameras: all held-out views.
+        cameras: all novel views.
         views: indices of those whose Gram distance is measured, at most 4; without any there is nothing to measure.
         pairs: gap to the pairs of views that are compared, at most 4 each.
         first: see above; set by the first measurement.
@@ -206,7 +206,7 @@ class HeldOut:
     def _choose(
         self, parents: list[tuple[Camera, Camera]], most: int
     ) -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
-        """Views and pairs to measure, evenly spread over the held-out views; those inside of something are dropped."""
+        """Views and pairs to measure, evenly spread over the novel views; those inside of something are dropped."""
         count = len(self.cameras)
         pairs = {gap: view_pairs(count, gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
         # the first views of the short pairs: they have to be rendered anyway, and are as even
@@ -232,7 +232,7 @@ class HeldOut:
     def _is_clear(
         self, camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], tuple[float, float | None]]
     ) -> bool:
-        """Whether a held-out camera sees much the same as its neighbors do, rather than the inside of something."""
+        """Whether a novel camera sees much the same as its neighbors do, rather than the inside of something."""
         (covered, depth), *others = (outlook(view) for view in (camera, *parents))
         return (
             covered > 0
@@ -241,7 +241,7 @@ class HeldOut:
         )
 
     @torch.no_grad()
-    def measure(self, sh_dc: Tensor) -> HeldOutMoment:
+    def measure(self, sh_dc: Tensor) -> NovelViewMoment:
         """Measure the scene with colors sh_dc [N, 3].
 
         Raises:
@@ -256,7 +256,7 @@ class HeldOut:
         gram = self._gram(picture)
         self.first = self.first or gram
         start = _mean(self.first)
-        return HeldOutMoment(
+        return NovelViewMoment(
             gram,
             _mean(gram) / start if start else None,
             self._consistency(SHORT_RANGE, picture),
@@ -264,7 +264,7 @@ class HeldOut:
         )
 
     def _picture(self, index: int, sh_dc: Tensor) -> Tensor:
-        """Picture [H, W, 3] of a held-out view, as a screen shows it."""
+        """Picture [H, W, 3] of a novel view, as a screen shows it."""
         camera = self.cameras[index]
         if self.scene.sh_degree == 0:
             rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)

@@ -32,17 +32,17 @@ def line(stylizer: Stylizer) -> str:
     return f"{found.decision}: {found.reason}"
 
 
-@pytest.mark.parametrize("fade", [0.4, 1.0])
-def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeights, fade: float) -> None:
+@pytest.mark.parametrize("attenuation", [0.4, 1.0])
+def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeights, attenuation: float) -> None:
     scene = wall(sh_degree=2)
-    stylizer = make(tiny_weights, scene, sh_fade=fade)
-    came = replace(scene, sh_rest=held(scene.sh_rest) * torch.tensor(1 - fade, dtype=torch.float32))
+    stylizer = make(tiny_weights, scene, sh_attenuation=attenuation)
+    came = replace(scene, sh_rest=held(scene.sh_rest) * torch.tensor(1 - attenuation, dtype=torch.float32))
     other = make(tiny_weights, came.without_zero_bands())
     for each in (stylizer, other):
         run(each)
     assert torch.equal(stylizer.stylized(), other.stylized())
     assert [record.loss for record in stylizer.history] == [record.loss for record in other.history]
-    assert stylizer.scene.sh_degree == (0 if fade == 1 else 2)
+    assert stylizer.scene.sh_degree == (0 if attenuation == 1 else 2)
     assert stylizer.sh_degree == 2
     exact = ExactTwin(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
     assert exact.keys() == stylizer.evaluate(stylizer.evaluation_views).keys()
@@ -51,16 +51,16 @@ def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeigh
 
 
 @pytest.mark.parametrize("held_bytes", [0, None])
-@pytest.mark.parametrize("fade", [0.4, 1.0])
+@pytest.mark.parametrize("attenuation", [0.4, 1.0])
 def test_the_picture_of_the_result_is_what_was_optimized(
-    tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, fade: float
+    tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, attenuation: float
 ) -> None:
     write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
     source = read_scene(tmp_path / "scene.ply", held_bytes=held_bytes)
     assert isinstance(source.scene.sh_rest, StoredHarmonics) == (held_bytes == 0)
-    settings = make_settings(steps_coarse=0, steps_sos=2, sh_fade=fade)
+    settings = make_settings(steps_coarse=0, steps_sos=2, sh_attenuation=attenuation)
     colors = stylize(source.scene, cameras(), style(), settings, weights=tiny_weights)
-    write_stylized(source, tmp_path / "out.ply", colors, sh_fade=fade)
+    write_stylized(source, tmp_path / "out.ply", colors, sh_attenuation=attenuation)
     result = read_scene(tmp_path / "out.ply").scene
     stylizer = Stylizer.planned(source.scene, cameras(), style(), settings, weights=tiny_weights)
     stylizer.set_colors(colors)
@@ -73,8 +73,8 @@ def test_the_picture_of_the_result_is_what_was_optimized(
 
 
 def test_the_plan_says_what_fades(tiny_weights: BackboneWeights) -> None:
-    assert "there is nothing to fade" in line(make(tiny_weights, wall(), sh_fade=0.5))
-    assert "0.75 times as large" in line(make(tiny_weights, wall(sh_degree=1), sh_fade=0.25))
-    out = make(tiny_weights, wall(sh_degree=1), sh_fade=1)
+    assert "there is nothing to fade" in line(make(tiny_weights, wall(), sh_attenuation=0.5))
+    assert "0.75 times as large" in line(make(tiny_weights, wall(sh_degree=1), sh_attenuation=0.25))
+    out = make(tiny_weights, wall(sh_degree=1), sh_attenuation=1)
     assert "faded out: no view directions are computed" in line(out)
     assert out.views.scene.sh_degree == 0

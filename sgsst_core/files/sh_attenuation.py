@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.ply_header import PlyHeader
-from sgsst_core.scene.gaussians import fade_factor
+from sgsst_core.scene.gaussians import attenuation_factor
 
 
 @dataclass(frozen=True)
-class Fading:
+class ShAttenuation:
     """What fades in rows of a file.
 
     Attributes:
@@ -31,11 +31,11 @@ class Fading:
     factor: float
 
     @staticmethod
-    def of(header: PlyHeader, fade: float) -> Fading | None:
+    def of(header: PlyHeader, attenuation: float) -> ShAttenuation | None:
         """Of a file's vertices; None where nothing changes."""
         names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
-        factor = fade_factor(fade)
-        return Fading(names, factor) if names and factor != 1 else None
+        factor = attenuation_factor(attenuation)
+        return ShAttenuation(names, factor) if names and factor != 1 else None
 
     def apply(self, rows: NDArray[Any]) -> None:
         """Fade a structured block of rows, in place."""
@@ -51,17 +51,17 @@ class Fading:
         if packed and first % 4 == 0 and dtype.itemsize % 4 == 0:  # as trainers write them: one pass over the rows
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             part = table[:, first // 4 : first // 4 + len(self.names)]
-            part[:] = self.faded(part)
+            part[:] = self.attenuated(part)
             return
         for name in self.names:
-            rows[name] = self.faded(rows[name].astype(np.float32))
+            rows[name] = self.attenuated(rows[name].astype(np.float32))
 
-    def faded(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def attenuated(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Float32 values after fading."""
         return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
 
 
-def check_fading(path: Path, header: PlyHeader | None, fade: float) -> None:
+def check_sh_attenuation(path: Path, header: PlyHeader | None, attenuation: float) -> None:
     """Prove that a file can hold faded coefficients.
 
     Args:
@@ -70,12 +70,12 @@ def check_fading(path: Path, header: PlyHeader | None, fade: float) -> None:
     Raises:
         SceneError: they are stored as integers.
     """
-    if header is None or "vertex" not in header.names or not fade:
+    if header is None or "vertex" not in header.names or not attenuation:
         return
     kinds = {prop.name: prop.kind for prop in header.vertex.properties}
     whole = [name for name, kind in kinds.items() if re.fullmatch(r"f_rest_\d+", name) and kind[0] != "f"]
     if whole:
         raise SceneError(
             f"{path}: {whole[0]} is stored as integers, which cannot fade. Convert it to float first, or leave "
-            "--sh-fade out."
+            "--sh-attenuation out."
         )

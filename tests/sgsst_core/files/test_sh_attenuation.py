@@ -15,7 +15,7 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_packed, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
-from sgsst_core.scene.gaussians import fade_factor
+from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import cloud
 
@@ -51,19 +51,19 @@ def in_another_form(path: Path, form: str) -> Path:
 
 
 @pytest.mark.parametrize("form", ["plain", "text", "big", "doubles", "mixed up"])
-@pytest.mark.parametrize("fade", FADES)
-def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, fade: float) -> None:
+@pytest.mark.parametrize("attenuation", FADES)
+def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, attenuation: float) -> None:
     path = written(tmp_path)
     if form != "plain":
         path = in_another_form(path, form)
     source = read_scene(path)
-    wanted = source.scene.faded(fade)
+    wanted = source.scene.attenuated(attenuation)
     colors = source.scene.sh_dc + 1
-    write_stylized(source, tmp_path / "out.ply", colors, sh_fade=fade)
+    write_stylized(source, tmp_path / "out.ply", colors, sh_attenuation=attenuation)
     found = read_scene(tmp_path / "out.ply").scene
-    rest = torch.zeros_like(held(found.sh_rest)) if fade == 1 else held(wanted.sh_rest)
+    rest = torch.zeros_like(held(found.sh_rest)) if attenuation == 1 else held(wanted.sh_rest)
     assert torch.equal(held(found.sh_rest), rest)
-    if fade == 1:
+    if attenuation == 1:
         assert wanted.sh_degree == 0
         assert not torch.signbit(held(found.sh_rest)).any()
     assert torch.equal(found.sh_dc, colors)
@@ -78,18 +78,18 @@ def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, fade: f
 
 def test_without_fading_every_byte_stays(tmp_path: Path) -> None:
     source = read_scene(written(tmp_path))
-    for name, values in (("a", {}), ("b", {"sh_fade": 0.0}), ("c", {"sh_fade": 1e-9})):
+    for name, values in (("a", {}), ("b", {"sh_attenuation": 0.0}), ("c", {"sh_attenuation": 1e-9})):
         write_stylized(source, tmp_path / f"{name}.ply", source.scene.sh_dc, **values)
         assert (tmp_path / f"{name}.ply").read_bytes() == source.path.read_bytes()
-    assert source.scene.faded(0) is source.scene
+    assert source.scene.attenuated(0) is source.scene
 
 
-@pytest.mark.parametrize("fade", FADES)
-def test_coefficients_in_the_file_are_those_in_memory(tmp_path: Path, fade: float) -> None:
+@pytest.mark.parametrize("attenuation", FADES)
+def test_coefficients_in_the_file_are_those_in_memory(tmp_path: Path, attenuation: float) -> None:
     path = written(tmp_path)
-    stored, plain = (read_scene(path, held_bytes=limit).scene.faded(fade) for limit in (0, None))
+    stored, plain = (read_scene(path, held_bytes=limit).scene.attenuated(attenuation) for limit in (0, None))
     assert isinstance(plain.sh_rest, Tensor)
-    if fade == 1:
+    if attenuation == 1:
         assert stored.sh_rest.shape == plain.sh_rest.shape == (60, 0, 3)
         return
     assert isinstance(stored.sh_rest, StoredHarmonics)
@@ -107,7 +107,7 @@ def test_rows_that_were_dropped_are_absent_and_the_others_fade(tmp_path: Path) -
     scene.means[5] = torch.nan
     write_scene(tmp_path / "scene.ply", scene)
     source = read_scene(tmp_path / "scene.ply", drop_invalid=True)
-    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.5)
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
     found = read_scene(tmp_path / "out.ply").scene
     assert len(found) == 59
     assert torch.equal(held(found.sh_rest), held(source.scene.sh_rest) * 0.5)
@@ -115,15 +115,15 @@ def test_rows_that_were_dropped_are_absent_and_the_others_fade(tmp_path: Path) -
 
 def test_a_scene_of_degree_0_has_nothing_to_fade(tmp_path: Path) -> None:
     source = read_scene(written(tmp_path, degree=0))
-    assert source.scene.faded(0.5) is source.scene
-    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.5)
+    assert source.scene.attenuated(0.5) is source.scene
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
     assert (tmp_path / "out.ply").read_bytes() == source.path.read_bytes()
 
 
 def test_packed_scenes_fade_into_their_ply(tmp_path: Path) -> None:
     write_packed(tmp_path / "scene.spz", cloud(60, degree=1), "spz")
     source = read_scene(tmp_path / "scene.spz")
-    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.25)
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.25)
     assert torch.equal(held(read_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.75)
 
 
@@ -134,10 +134,10 @@ def test_whole_numbers_cannot_fade(tmp_path: Path) -> None:
     source = read_scene(tmp_path / "whole.ply")
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
     with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot fade"):
-        write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_fade=0.5)
+        write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
 
 
 def test_the_factor_is_a_float32() -> None:
-    assert fade_factor(0) == 1
-    assert fade_factor(1) == 0
-    assert np.float32(fade_factor(0.3)) == fade_factor(0.3)
+    assert attenuation_factor(0) == 1
+    assert attenuation_factor(1) == 0
+    assert np.float32(attenuation_factor(0.3)) == attenuation_factor(0.3)

@@ -17,7 +17,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_ch
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.surround import Color, drawn_color, put_behind
+from sgsst_core.stylizing.training_background import Color, drawn_color, put_behind
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 
@@ -85,14 +85,14 @@ def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Co
 
 
 @pytest.mark.parametrize("scales", [[0, 1], [1]])
-@pytest.mark.parametrize("kept", ["kept", "anew"])
+@pytest.mark.parametrize("kept", ["kept", "uncached"])
 def test_a_steps_gradient_is_that_of_a_job_with_this_background(
-    tiny_weights: BackboneWeights, scales: list[int], kept: Literal["kept", "anew"]
+    tiny_weights: BackboneWeights, scales: list[int], kept: Literal["kept", "uncached"]
 ) -> None:
     """Content included, whether or not images of it are kept."""
     keep = () if kept == "kept" else ("content",)
-    drawn = make(tiny_weights, ball(), surround="random", background=(0.1, 0.1, 0.5), keep=keep)
-    fixed = make(tiny_weights, ball(), surround="background", background=COLOR)
+    drawn = make(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5), keep=keep)
+    fixed = make(tiny_weights, ball(), training_background="background", background=COLOR)
     with torch.no_grad():
         drawn.sh_dc += 0.3
         fixed.sh_dc.copy_(drawn.sh_dc)
@@ -107,7 +107,7 @@ def test_a_steps_gradient_is_that_of_a_job_with_this_background(
 
 def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeights) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
-    settings = make_settings(surround="random", steps_sos=2)
+    settings = make_settings(training_background="random", steps_sos=2)
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
     coverage = stylizer.views.coverage(0)[0][..., None]
     content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
@@ -120,7 +120,9 @@ def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeight
 def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
     """Loss before and after, on the color of the settings, whatever was behind in steps."""
     values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
-    drawn, fixed = (make(tiny_weights, ball(), surround=kind, **values) for kind in ("palette", "background"))
+    drawn, fixed = (
+        make(tiny_weights, ball(), training_background=kind, **values) for kind in ("palette", "background")
+    )
     assert drawn.start() == fixed.start()
     run(drawn)
     assert mean_loss(drawn.evaluate([0, 1])) == mean_loss(fixed.evaluate([0, 1], drawn.sh_dc.detach()))
@@ -131,17 +133,19 @@ def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
 
 @pytest.mark.parametrize("kind", ["random", "palette"])
 def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_path: Path, kind: str) -> None:
-    whole, again, resumed, other = (make(tiny_weights, ball(), surround=kind, seed=seed) for seed in (3, 3, 3, 4))
+    whole, again, resumed, other = (
+        make(tiny_weights, ball(), training_background=kind, seed=seed) for seed in (3, 3, 3, 4)
+    )
     for stylizer in (whole, again, other):
         assert run(stylizer) == "finished"
     assert torch.equal(whole.sh_dc, again.sh_dc)
     assert not torch.equal(whole.sh_dc, other.sh_dc)
-    stopped = make(tiny_weights, ball(), surround=kind, seed=3)
+    stopped = make(tiny_weights, ball(), training_background=kind, seed=3)
     for _ in range(4):
         stopped.run_step()
     save_checkpoint(tmp_path / "c", Checkpoint(stopped.state(), stopped.plan, 1, "run", versions()), "job")
     loaded = load_checkpoint(tmp_path / "c", "job")
-    assert (loaded.plan.surround, loaded.plan.warm_start) == (kind, True)
+    assert (loaded.plan.training_background, loaded.plan.warm_start) == (kind, True)
     resumed.load_state(loaded.state)
     run(resumed)
     assert torch.equal(whole.sh_dc, resumed.sh_dc)
@@ -151,20 +155,20 @@ def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_pa
 
 def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: BackboneWeights) -> None:
     """To the last bit as with a fixed background."""
-    plain = make(tiny_weights, wall(), surround="background")
+    plain = make(tiny_weights, wall(), training_background="background")
     automatic = make(tiny_weights, wall())
     for stylizer in (plain, automatic):
         run(stylizer)
     assert torch.equal(plain.sh_dc, automatic.sh_dc)
     told = [[line.item for line in stylizer.plan.decisions] for stylizer in (plain, automatic)]
     assert told[0] == told[1]
-    assert "surround" not in told[0]
+    assert "training_background" not in told[0]
 
 
 def test_the_paper_is_the_papers_for_scans_too(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("paper", steps_coarse=1, steps_sos=1)
     stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
-    assert (stylizer.plan.surround, stylizer.plan.warm_start) == ("background", False)
+    assert (stylizer.plan.training_background, stylizer.plan.warm_start) == ("background", False)
     assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.plan.seen])
 
 
@@ -173,12 +177,20 @@ def test_losses_with_different_colors_behind_do_not_end_a_run_early(
 ) -> None:
     """A target is compared with the loss on the background, once in a round."""
     drawn, fixed = (
-        make(tiny_weights, ball(), surround=kind, early_stop=True, learning_rate=1e-9, steps_sos=60, steps_coarse=0)
+        make(
+            tiny_weights,
+            ball(),
+            training_background=kind,
+            early_stop=True,
+            learning_rate=1e-9,
+            steps_sos=60,
+            steps_coarse=0,
+        )
         for kind in ("palette", "background")
     )
     assert run(fixed) == "converged"
     assert run(drawn) == "finished"
-    target = make(tiny_weights, ball(), surround="random", target_loss=0.9, warm_start=False, steps_sos=90)
+    target = make(tiny_weights, ball(), training_background="random", target_loss=0.9, warm_start=False, steps_sos=90)
     assert run(target) == "target-loss"
     assert mean_loss(target.evaluate(target.evaluation_views)) <= 0.9 * mean_loss(target.start())
     assert target.step % target.round_length == 0

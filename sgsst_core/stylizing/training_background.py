@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.settings import PlannedSurround
+from sgsst_core.settings import PlannedBackground
 
 #: Red, green, blue in 0..1.
 Color = tuple[float, float, float]
@@ -24,7 +24,7 @@ Color = tuple[float, float, float]
 _BITS = 53  # of a float64's fraction
 
 
-def drawn_color(kind: PlannedSurround, seed: int, step: int, view: int, style: Tensor | StyleMixture) -> Color | None:
+def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Tensor | StyleMixture) -> Color | None:
     """What is behind a view in the step after `step` others; None for the background of the settings.
 
     Args:

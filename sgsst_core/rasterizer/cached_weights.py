@@ -10,7 +10,7 @@ from torch import Tensor
 Precision = Literal["float32", "half"]
 
 
-class KeptWeights(Protocol):
+class CachedWeights(Protocol):
     """Blend weights of one band of a view, on the device where they are applied.
 
     Attributes:
@@ -40,6 +40,6 @@ class CountedWeights(Protocol):
         """Bytes that they would take."""
         ...
 
-    def keep(self, precision: Precision) -> KeptWeights:
+    def keep(self, precision: Precision) -> CachedWeights:
         """Compute them once more, and keep them."""
         ...

@@ -1,10 +1,10 @@
 """What lies behind an object scan, and what its colors begin with: a table of ways, judged by another network.
 
-python -m benchmarks.surround SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
+python -m benchmarks.training_background SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
 
 A way is a surround (background, random, palette), with "+warm" from the style's distribution of colors. All of them
 have the same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`) on
-views between those. Rows are added to the file benchmarks/results/surround.json, under NAME; the figures of more seeds
+views between those. Rows are added to the file benchmarks/results/training_background.json, under NAME; the figures of more seeds
 are means.
 """
 
@@ -35,7 +35,7 @@ from sgsst_core.stylizing.evaluation import mean_loss
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
 #: Views that are judged, and those of each way on the sheet.
 JUDGED, SHOWN = 6, 3
-COLUMNS = ("style", "palette", "swing", "content", "saturated", "loss", "seconds")
+COLUMNS = ("style", "palette", "background_sensitivity", "content", "saturated", "loss", "seconds")
 
 
 def main() -> None:
@@ -77,8 +77,8 @@ def main() -> None:
 
 
 def _settings(way: str) -> dict[str, Any]:
-    surround, _, start = way.partition("+")
-    return {"surround": surround, "warm_start": start == "warm"}
+    training_background, _, start = way.partition("+")
+    return {"training_background": training_background, "warm_start": start == "warm"}
 
 
 def _judge(scene: Scene, style: torch.Tensor, between: list[Camera]) -> Judge:
@@ -114,13 +114,13 @@ def _print(way: str, row: dict[str, float]) -> None:
 
 def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> None:
     """Add the rows of a pair to those that are there."""
-    path = RESULTS / "surround.json"
+    path = RESULTS / "training_background.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
     told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
     told |= {"size": [arguments.width, arguments.height], "steps": arguments.steps}
     earlier = pairs.get(arguments.name, {}).get("ways", {})
     pairs[arguments.name] = {**told, "ways": {**earlier, **ways}}
-    write_result("surround", {"pairs": pairs})
+    write_result("training_background", {"pairs": pairs})
 
 
 def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
