@@ -36,7 +36,7 @@ from sgsst_core.scene.gaussians import Scene
 
 #: Views on the sheet.
 SHOWN = 3
-COLUMNS = ("style", "palette", "sliced", "content", "features", "background_sensitivity", "saturated", "seconds")
+COLUMNS = ("style", "color_distance", "sliced", "content", "features", "background_sensitivity", "saturated", "seconds")
 #: Directions of color, and quantiles along each, that distributions are compared by.
 DIRECTIONS, QUANTILES = 64, 1024
 

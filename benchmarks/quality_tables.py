@@ -16,7 +16,10 @@ from sgsst_core.bench.quality import UNSTYLIZED
 from sgsst_core.files.atomic import atomic_path
 
 STORE = RESULTS / "quality.json"
-_JUDGED = "| | style | palette | content | swing | short RMSE | loss left | steps |\n|---|---|---|---|---|---|---|---|"
+_JUDGED = (
+    "| | style | color distance | content | background sensitivity | short RMSE | loss left | steps |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
 
 
 def main() -> None:
@@ -54,7 +57,7 @@ def read_run(folder: Path) -> dict[str, Any]:
 def judged(outcomes: list[dict[str, Any]]) -> str:
     """A table: what AlexNet says of each outcome, the best style and palette of stylized ones in bold."""
     stylized = [outcome for outcome in outcomes if outcome["name"] != UNSTYLIZED]
-    best = {figure: min(outcome[figure] for outcome in stylized) for figure in ("style", "palette")}
+    best = {figure: min(outcome[figure] for outcome in stylized) for figure in ("style", "color_distance")}
 
     def cell(outcome: dict[str, Any], figure: str, digits: int) -> str:
         text = f"{outcome[figure]:.{digits}f}"
@@ -66,7 +69,7 @@ def judged(outcomes: list[dict[str, Any]]) -> str:
         cells = [
             outcome["name"],
             cell(outcome, "style", 3),
-            cell(outcome, "palette", 1),
+            cell(outcome, "color_distance", 1),
             f"{outcome['content']:.3f}",
             f"{outcome['background_sensitivity']:.3f}",
             f"{short['rmse']:.3f}" if short else "",

@@ -172,7 +172,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
         "warm_start": [True, False],
         "position_weights": ["on", "off"],
         "clamp_aware_gradient": [False],
-        "unseen": ["keep"],
+        "unseen": ["freeze"],
         "prune_weight": [_size(rng, 1e-6, 1.0)],
         "views_per_step": [2, 3],
         "cached_weights": ["float32", "half", "none"],

@@ -2,10 +2,10 @@
 
 python -m benchmarks.training_background SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
 
-A way is a surround (background, random, palette), with "+warm" from the style's distribution of colors. All of them
-have the same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`) on
-views between those. Rows are added to the file benchmarks/results/training_background.json, under NAME; the figures of more seeds
-are means.
+A way is a training background (background, random, palette), with "+warm" from the style's distribution of colors. All
+of them have the same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`)
+on novel views. Rows are added to benchmarks/results/training_background.json, under NAME; the figures of more seeds are
+means.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sgsst_core.stylizing.evaluation import mean_loss
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
 #: Views that are judged, and those of each way on the sheet.
 JUDGED, SHOWN = 6, 3
-COLUMNS = ("style", "palette", "background_sensitivity", "content", "saturated", "loss", "seconds")
+COLUMNS = ("style", "color_distance", "background_sensitivity", "content", "saturated", "loss", "seconds")
 
 
 def main() -> None:

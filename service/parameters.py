@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Option
+from sgsst_core.options import RENAMED, Option
 from sgsst_core.settings import checked
 from worker.options import StylizeOptions
 from worker.regions import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
@@ -62,14 +62,24 @@ class JobParameters(StylizeOptions):
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
-    """Parameters of a job that may have been stored by an earlier version.
+    """Return the parameters of a job that an earlier version may have stored, under former names too.
 
     Raises:
-        SettingsError: this version does not take them.
+        SettingsError: If this version does not take them.
     """
     try:
-        return checked(JobParameters, values)
+        return checked(JobParameters, _with_present_names(values))
     except SettingsError as error:
         raise SettingsError(
             f"{error} The job was stored by a version of the service that took this. Submit it anew without."
         ) from error
+
+
+def _with_present_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return stored parameters, of a job or of a region, under their present names."""
+    found = {RENAMED.get(name, name): value for name, value in values.items()}
+    if found.get("regions"):
+        found["regions"] = [_with_present_names(region) for region in found["regions"]]
+    if "unseen" in found:
+        found["unseen"] = {"neighbours": "neighbors", "keep": "freeze"}.get(found["unseen"], found["unseen"])
+    return found

@@ -16,6 +16,30 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+#: Former names of options and parameters, with their present ones. Only error messages and stored jobs use them.
+RENAMED = {
+    "keep": "freeze",
+    "keep_colours": "preserve_colors",
+    "keep_everything": "compute_everything",
+    "kept_weights": "cached_weights",
+    "region_keep": "region_freeze",
+    "revive": "clamp_aware_gradient",
+    "sh_fade": "sh_attenuation",
+    "surround": "training_background",
+}
+
+
+def renamed_hint(name: str) -> str:
+    """Return what to write instead of a former option or parameter; empty if the name was never one.
+
+    Args:
+        name: Parameter ("sh_fade", "regions.0.keep") or flag ("--sh-fade", "--no-revive").
+    """
+    flag = name.startswith("--")
+    plain = name.removeprefix("--").removeprefix("no-").replace("-", "_").rpartition(".")[2]
+    new = RENAMED.get(plain, "")
+    return f"it is called {'--' + new.replace('_', '-') if flag else new} now" if new else ""
+
 
 @dataclass(frozen=True)
 class Option:

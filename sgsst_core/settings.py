@@ -19,7 +19,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, Option
+from sgsst_core.options import Declared, Option, renamed_hint
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
@@ -189,7 +189,7 @@ class Settings(BaseModel):
     memory_limit: Annotated[int | None, Option(unit="bytes", default="40 % of all, at most")] = Field(
         None, gt=0, le=2**50, description="Bytes of memory to plan with."
     )
-    unseen: Literal["neighbors", "keep"] = Field(
+    unseen: Literal["neighbors", "freeze"] = Field(
         "neighbors", description="Colors of Gaussians that no view sees: their neighbors' change, or kept."
     )
     coarsest_side: Annotated[int, Option(unit="pixels", metavar="N")] = Field(
@@ -252,9 +252,10 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
-#: colors below 0 on their way and therefore need `clamp_aware_gradient` (docs/performance.md, "The standard preset"), and begin with
-#: the style's colors, which steps alone reach slowly (docs/quality.md, "What colors begin with"). Phase 1 pays on
-#: large views, and has given what it can after some 80 steps (docs/performance.md, "At the photos' own size").
+#: colors below 0 on their way and therefore need `clamp_aware_gradient` (docs/performance.md, "The standard preset"),
+#: and begin with the style's colors, which steps alone reach slowly (docs/quality.md, "What colors begin with").
+#: Phase 1 pays on large views and has given what it can after some 80 steps (docs/performance.md, "At the photos' own
+#: size").
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,
@@ -283,7 +284,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "position_weights": "off",
         "training_background": "background",
         "warm_start": False,
-        "unseen": "keep",
+        "unseen": "freeze",
     },
 }
 
@@ -313,7 +314,7 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        raise SettingsError(f"Setting {name} = {first['input']!r}: {first['msg']}.") from error
+        raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or first['msg']}.") from error
 
 
 def default_text(setting: Declared) -> str:

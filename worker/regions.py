@@ -65,14 +65,14 @@ class RegionRequest:
         selection: None for the rest.
         styles: pictures of its style; empty for the job's own.
         weight: of its style in the loss.
-        keep: leave its Gaussians as they are.
+        freeze: Whether its Gaussians keep their colors.
     """
 
     name: str
     selection: Selection | None = None
     styles: tuple[StyleFile, ...] = ()
     weight: float = 1.0
-    keep: bool = False
+    freeze: bool = False
 
 
 class RegionOptions(BaseModel):
@@ -106,7 +106,7 @@ class RegionOptions(BaseModel):
         examples=["wave.jpg"],
     )
     weight: float = Field(1.0, gt=0, le=1e12, allow_inf_nan=False, description="Of its style in the loss.")
-    keep: bool = Field(False, description="Leave its Gaussians as they are, to the last bit.")
+    freeze: bool = Field(False, description="Leave the colors of its Gaussians unchanged, bit for bit.")
 
     @property
     def style_texts(self) -> list[str]:
@@ -124,7 +124,7 @@ class RegionOptions(BaseModel):
         """
         selection = None if self.select is None else parse_selection(self.select, f"region {self.name}")
         styles = tuple(parse_style(text, exists) for text in self.style_texts)
-        return RegionRequest(self.name, selection, styles, self.weight, self.keep)
+        return RegionRequest(self.name, selection, styles, self.weight, self.freeze)
 
 
 def parse_selection(text: str, where: str) -> Selection:
@@ -174,7 +174,7 @@ def _number(text: str, whole: str, where: str) -> float:
 
 
 def region_options(
-    regions: Sequence[str], styles: Sequence[str], weights: Sequence[str], keeps: Sequence[str]
+    regions: Sequence[str], styles: Sequence[str], weights: Sequence[str], frozen: Sequence[str]
 ) -> tuple[RegionOptions, ...]:
     """Regions from the command line's texts.
 
@@ -182,7 +182,7 @@ def region_options(
         regions: NAME:SPEC each.
         styles: NAME=FILE[:WEIGHT] each; several of one name are mixed.
         weights: NAME=WEIGHT each.
-        keeps: NAME each.
+        frozen: One NAME each.
 
     Raises:
         SettingsError: they make no sense.
@@ -216,8 +216,8 @@ def region_options(
         if not 0 < weight <= 1e12:
             raise SettingsError(f"--region-weight {text}: the weight is not above 0, or too large. Give another.")
         found[name] = region.model_copy(update={"weight": weight})
-    for name in keeps:
-        found[name] = known(name, f"--region-freeze {name}").model_copy(update={"keep": True})
+    for name in frozen:
+        found[name] = known(name, f"--region-freeze {name}").model_copy(update={"freeze": True})
     return tuple(found.values())
 
 
@@ -241,8 +241,8 @@ def region_requests(
         if (region.name == REST) != (region.selection is None):
             why = "needs a SPEC" if region.name != REST else "is what no other region has, and takes no SPEC"
             raise SettingsError(f"Region {region.name!r} {why}. {_HOW}")
-        if region.keep and (region.styles or region.weight != 1):
-            raise SettingsError(f"Region {region.name!r} is kept as it is, and has no style or weight. Leave one out.")
+        if region.freeze and (region.styles or region.weight != 1):
+            raise SettingsError(f"Region {region.name!r} is frozen and takes no style or weight. Leave one out.")
     if len([name for name in names if name != REST]) > MOST_REGIONS:
         raise SettingsError(f"There are {len(found)} regions; {MOST_REGIONS} may be.")
     rest = next((region for region in found if region.name == REST), None)

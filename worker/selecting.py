@@ -51,11 +51,13 @@ def select_regions(
     for request in requests:
         style = load(request.styles) if request.styles else None
         if request.selection is None:
-            every[0] = Region(REST, "", style, request.weight, request.keep)
+            every[0] = Region(REST, "", style, request.weight, request.freeze)
             continue
         own = select(request.selection, file, cameras, near)
         labels[own] = len(every)
-        every.append(Region(request.name, request.selection.text, style, request.weight, request.keep, int(own.sum())))
+        every.append(
+            Region(request.name, request.selection.text, style, request.weight, request.freeze, int(own.sum()))
+        )
     regions = Regions(tuple(every), labels)
     check_regions(regions, sh_attenuation)
     return regions

@@ -140,7 +140,7 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
 def quality_table(quality: Quality) -> Table:
     """Outcomes against what they were judged by; a star for those on the front."""
-    figures = ("style", "palette", "content", "features", "background_sensitivity", "saturated")
+    figures = ("style", "color_distance", "content", "features", "background_sensitivity", "saturated")
     columns = (*figures, "short RMSE", "long RMSE", "loss left", "steps")
     table = Table(
         Column("", no_wrap=True),
@@ -153,7 +153,7 @@ def quality_table(quality: Quality) -> Table:
         table.add_row(
             outcome.name + (" *" if outcome in front else ""),
             f"{one.style:.3f}",
-            f"{one.palette:.0f}",
+            f"{one.color_distance:.0f}",
             *(f"{value:.3f}" for value in (one.content, one.features, one.background_sensitivity)),
             f"{one.saturated:.1%}",
             *(_number(found.rmse if found else None) for found in (outcome.short, outcome.long)),

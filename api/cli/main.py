@@ -19,7 +19,8 @@ from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_options
 from api.cli.progress_bars import clock, job_bar, live_bar
 from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
-from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError
+from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError
+from sgsst_core.options import renamed_hint
 from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
 from worker.regions import region_options, region_requests
@@ -537,6 +538,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; every expected error becomes one message on stderr and an exit code, without traceback."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
+        _check_names(arguments)
         app(args=arguments, prog_name="sgsst", obj=arguments)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -554,6 +556,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error_console.print("error: out of memory. Give a smaller --resolution or fewer --views, or --memory-limit.")
         return FAILURE
     return 0
+
+
+def _check_names(arguments: Sequence[str]) -> None:
+    """Raise a SettingsError if an option is given by a former name."""
+    for argument in arguments:
+        flag = argument.partition("=")[0]
+        if flag.startswith("--") and (hint := renamed_hint(flag)):
+            raise SettingsError(f"{flag}: {hint}.")
 
 
 def _out_of_memory(error: Exception) -> bool:

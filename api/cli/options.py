@@ -55,7 +55,7 @@ def with_options(
 
 
 def flags(option: Declared) -> str:
-    """The names of an option on the command line, such as "--seed" or "--clamp-aware-gradient/--no-clamp-aware-gradient"."""
+    """Return the command-line flags of an option, such as "--seed" or "--bounded/--no-bounded"."""
     plain = "--" + option.name.replace("_", "-")
     if option.option.flags or not is_switch(option):
         return option.option.flags or plain

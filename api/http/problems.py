@@ -14,6 +14,7 @@ from starlette.routing import Match
 
 from service.errors import ServiceError
 from sgsst_core.errors import InvalidInputError
+from sgsst_core.options import renamed_hint
 
 MEDIA_TYPE = "application/problem+json"
 #: 460 is the tus protocol's own.
@@ -121,7 +122,10 @@ async def _invalid_input(request: Request, error: Exception) -> JSONResponse:
 async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError | ValidationError)
     errors = [
-        {"at": ".".join(str(part) for part in entry["loc"])[:_SHOWN], "message": entry["msg"]}
+        {
+            "at": (at := ".".join(str(part) for part in entry["loc"])[:_SHOWN]),
+            "message": renamed_hint(at) or entry["msg"],
+        }
         for entry in error.errors()[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}

@@ -22,15 +22,15 @@ export class RegionList {
     };
     const name = h("input", { type: "text", placeholder: "face", pattern: "[A-Za-z][A-Za-z0-9_\\-]{0,31}", autocomplete: "off" });
     const select = h("input", { type: "text", placeholder: "sphere=0,1.4,0,0.3", autocomplete: "off" });
-    const style = h("select"), keep = h("input", { type: "checkbox" });
+    const style = h("select"), freeze = h("input", { type: "checkbox" });
     const setStyles = (/** @type {string[]} */ names) => {
       const before = style.value;
       put(style, h("option", { value: "" }, say.ownStyle), names.map((each) => h("option", { value: each }, each)));
       style.value = names.includes(before) ? before : "";
     };
     setStyles(this.styles);
-    const value = () => ({ name: name.value.trim(), ...(select.value.trim() ? { select: select.value.trim() } : {}), ...(style.value && !keep.checked ? { style: style.value } : {}), ...(keep.checked ? { keep: true } : {}) });
-    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), field("Select", select), field(say.style, style), h("label.check", keep, h("span", "Keep")));
+    const value = () => ({ name: name.value.trim(), ...(select.value.trim() ? { select: select.value.trim() } : {}), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
+    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), field("Select", select), field(say.style, style), h("label.check", freeze, h("span", "Keep")));
     const row = { element, value, setStyles };
     const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(this.rows.length + 1)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove()) }, icon("close"));
     element.append(remove);

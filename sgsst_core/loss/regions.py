@@ -28,7 +28,7 @@ class Region:
         select: which Gaussians it was to have, in words; empty for the rest.
         style: None for the job's own.
         weight: of its style in the loss, above 0.
-        keep: its Gaussians stay as they are.
+        freeze: Whether its Gaussians keep their colors.
         selected: Gaussians that its own selection names, of which later regions may have taken some.
     """
 
@@ -36,7 +36,7 @@ class Region:
     select: str = ""
     style: StyleMixture | None = None
     weight: float = 1.0
-    keep: bool = False
+    freeze: bool = False
     selected: int = 0
 
 
@@ -48,24 +48,24 @@ class Regions:
         every: the rest, then the others in the order in which they were given.
         labels: [N] uint8, the place among them of the region that a Gaussian belongs to.
         active: places of those that have a loss of their own; known from `resolved` on.
-        kept_in_view: a view sees Gaussians that are kept; likewise.
+        frozen_in_view: a view sees Gaussians that are kept; likewise.
     """
 
     every: tuple[Region, ...]
     labels: Tensor
     active: tuple[int, ...] = ()
-    kept_in_view: bool = False
+    frozen_in_view: bool = False
 
     @property
-    def kept(self) -> Tensor:
-        """[N] bool, Gaussians that stay as they are."""
-        keeps = torch.tensor([region.keep for region in self.every])
-        return keeps[self.labels.long()]
+    def frozen(self) -> Tensor:
+        """Mask [N] bool of the Gaussians whose colors must not change."""
+        by_region = torch.tensor([region.freeze for region in self.every])
+        return by_region[self.labels.long()]
 
     @property
     def mapped(self) -> bool:
         """Whether views need a map of each active region; one region that is everything is an ordinary job."""
-        return len(self.active) > 1 or self.kept_in_view or self.every[self.active[0]].weight != 1
+        return len(self.active) > 1 or self.frozen_in_view or self.every[self.active[0]].weight != 1
 
     def members(self, place: int) -> Tensor:
         """[N] bool, Gaussians of the region at a place."""
@@ -84,19 +84,21 @@ class Regions:
             weights: [N] float64, total blend weights.
 
         Raises:
-            SettingsError: every Gaussian that a view sees is kept.
+            SettingsError: every Gaussian that a view sees is frozen.
         """
         labels = self.labels.clone()
         for place, region in enumerate(self.every):
             own = labels == place
-            if place and not region.keep and not bool((weights[own] > 0).any()):
+            if place and not region.freeze and not bool((weights[own] > 0).any()):
                 labels[own] = 0
         seen = torch.bincount(labels[weights > 0].long(), minlength=len(self.every)) > 0
-        active = tuple(place for place, region in enumerate(self.every) if seen[place] and not region.keep)
+        active = tuple(place for place, region in enumerate(self.every) if seen[place] and not region.freeze)
         if not active:
-            raise SettingsError("Every Gaussian that a view sees is kept, so that nothing would change. Keep less.")
-        kept = any(bool(seen[place]) for place, region in enumerate(self.every) if region.keep)
-        return replace(self, labels=labels, active=active, kept_in_view=kept)
+            raise SettingsError(
+                "Every Gaussian that a view sees is frozen: nothing would change. Freeze fewer regions."
+            )
+        kept = any(bool(seen[place]) for place, region in enumerate(self.every) if region.freeze)
+        return replace(self, labels=labels, active=active, frozen_in_view=kept)
 
 
 def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:
@@ -106,12 +108,13 @@ def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:
         sh_attenuation: by which spherical harmonics fade.
 
     Raises:
-        SettingsError: every Gaussian is kept, or some are and all are to fade.
+        SettingsError: every Gaussian is frozen, or some are and all are to fade.
     """
-    if sh_attenuation and bool(regions.kept.any()):
+    if sh_attenuation and bool(regions.frozen.any()):
         raise SettingsError(
-            f"--sh-attenuation {sh_attenuation:g} would change Gaussians of every region, and some are kept. Leave one of both out."
+            f"--sh-attenuation {sh_attenuation:g} changes the Gaussians of every region, and some are frozen. "
+            "Leave out one of the two."
         )
-    if bool(regions.kept.all()):
-        names = ", ".join(region.name for region in regions.every if region.keep)
-        raise SettingsError(f"Every Gaussian is kept ({names}), so that nothing would change. Keep less.")
+    if bool(regions.frozen.all()):
+        names = ", ".join(region.name for region in regions.every if region.freeze)
+        raise SettingsError(f"Every Gaussian is frozen ({names}): nothing would change. Freeze fewer regions.")

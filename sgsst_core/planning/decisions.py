@@ -34,7 +34,7 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
     scene = probe.scene
     pruned = int(pruned_gaussians(plan.survey, plan.seen).sum())
     unseen = int((~plan.seen).sum()) - pruned
-    change = "keep their colors" if settings.unseen == "keep" else "take their neighbors' color change at the end"
+    change = "keep their colors" if settings.unseen == "freeze" else "take their neighbors' color change at the end"
     decisions = []
     if unseen:
         decisions.append(
@@ -257,7 +257,7 @@ def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[
         what = f"{count:,} of {len(weights):,} Gaussians, {share:.1%} of what the views show,"
         if place and not bool(own.any()):
             done = f"warning: left out, because it has no Gaussians{' of its own' if taken > 0 else ''}"
-        elif region.keep:
+        elif region.freeze:
             done = f"{int(own.sum()):,} Gaussians stay as they are"
         elif place and place not in resolved.active:
             done = f"warning: left out, because no view sees its {int(own.sum()):,} Gaussians: they are of the rest"

@@ -106,7 +106,7 @@ def _decide(
     if regions is not None:
         own = [regions.every[place].style or style for place in regions.active]
         count = sum(len(each.pictures) if each else 1 for each in own)
-        probe = replace(probe, kept=regions.kept, styles=count)
+        probe = replace(probe, kept=regions.frozen, styles=count)
     elif style is not None:
         probe = replace(probe, styles=len(style.pictures))
     plan = decide(probe, settings, measured=measured)

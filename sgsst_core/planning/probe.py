@@ -1,7 +1,7 @@
 """What is measured before anything is decided, on the rasterizer and the device that will do the work.
 
-A `Probe` holds plain facts; `decide` makes a plan of them. What measuring builds is a `PlanningContext`, which the job goes on
-to use.
+A `Probe` holds plain facts; `decide` makes a plan of them. What measuring builds is a `PlanningContext`, which the job
+continues to use.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class Judgment:
     Attributes:
         style: mean over AlexNet's five layers of |G - G_style| / |G_style|, Frobenius norms of Gram matrices (mean over
             positions of F F^T); 0 is the style's texture.
-        palette: Frechet distance of the RGB colors, in levels of 8 bits: sqrt(|m - m_style|^2 + tr(C + C_style -
+        color_distance: Frechet distance of the RGB colors, in levels of 8 bits: sqrt(|m - m_style|^2 + tr(C + C_style -
             2 (C C_style)^1/2)); 0 is the style's mean and covariance.
         content: LPIPS (AlexNet) against the unstylized scene; 0 is the same picture.
         features: mean over the layers of 1 - cosine of AlexNet's features against the unstylized scene's.
@@ -57,7 +57,7 @@ class Judgment:
     """
 
     style: float
-    palette: float
+    color_distance: float
     content: float
     features: float
     background_sensitivity: float
@@ -70,7 +70,8 @@ class Judge:
     Args:
         lpips: with AlexNet.
         style: a picture [H, W, 3] in 0..1, or several with their weights: the mixture's Gram matrices and palette. Of
-            regions, `style` and `palette` are means of each region's by their shares of a view; kept ones have none.
+            regions, `style` and `color_distance` are means of each region's by their shares of a view; frozen ones have
+            none.
         scene: unstylized.
         rasterizer: of the scene.
         cameras: of the views; larger ones than `JUDGED_SIDE` are judged at that size. Those that see next to nothing
@@ -115,11 +116,11 @@ class Judge:
             return None
         sh_dc = sh_dc.detach().to(self._rasterizer.device)
         views = [self._view(camera, sh_dc) for camera in self.cameras]
-        style, palette, content, features = (
+        style, color_distance, content, features = (
             fmean(fmean(one[place] for one in view) for view in views) for place in range(4)
         )
         background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        return Judgment(style, palette, content, features, background_sensitivity, saturated(sh_dc))
+        return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc))
 
     @torch.no_grad()
     def pictures(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
@@ -128,7 +129,7 @@ class Judge:
         return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
 
     def _view(self, camera: Camera, sh_dc: Tensor) -> list[tuple[float, float, float, float]]:
-        """(style, palette, content, features) on black and on white."""
+        """(style, color_distance, content, features) on black and on white."""
         image, coverage = self._render(sh_dc, camera)
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
@@ -141,7 +142,7 @@ class Judge:
             found.append(
                 (
                     sum(share * judge.distance(own, part) for judge, part, share in parts),
-                    sum(share * judge.palette(picture, part) for judge, part, share in parts),
+                    sum(share * judge.color_distance(picture, part) for judge, part, share in parts),
                     _weighted_mean(distance, weights),
                     fmean(_turned(x, y, weights) for x, y in zip(own, theirs, strict=True)),
                 )
@@ -185,7 +186,7 @@ class _StyleJudge:
         self._palette = mixed_moments(moments, style.weights)
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
 
-    def palette(self, picture: Tensor, weights: Tensor) -> float:
+    def color_distance(self, picture: Tensor, weights: Tensor) -> float:
         """Frechet distance of the colors of a picture [H, W, 3] with position weights [H, W]."""
         return frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette)
 

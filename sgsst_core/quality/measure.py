@@ -34,7 +34,7 @@ class Measurements:
     """Measures a job; pass an object of this as `loop.Callbacks.measure`.
 
     Everything is built at first use. Results go to `Stylizer.measured`, one entry a moment, ready for JSON: "step",
-    "novel_views" and "approximation" (None where there is nothing to measure), the "seconds" it took. The moment of step 0
+    "novel_views" and "approximation" (None if there is nothing to measure), "seconds". The moment of step 0
     is measured together with the one after it, from the unstylized colors, so that the first step need not wait. How
     much is measured is the plan's, or less where the first view takes longer than it thought: decided once, by the
     first rank, and kept in the first entry with what a moment takes after it ("level", "again"). The last entry holds

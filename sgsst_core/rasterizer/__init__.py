@@ -72,8 +72,8 @@ def make_rasterizer(
         scene: its geometry must not change while the rasterizer lives.
         background: three values added where Gaussians leave pixels uncovered.
         near: near plane in world units.
-        device: for `cached`, `triton` and `cuda`; None is the CPU for the first (or what its option `uncached` runs on) and
-            the current GPU for the others.
+        device: for `cached`, `triton` and `cuda`; None is the CPU for the first, or the device of its option
+            `uncached`, and the current GPU for the others.
         options: of the implementation's own constructor.
 
     Raises:

@@ -59,14 +59,14 @@ class CachedRasterizer:
         alpha_max: clamp of alpha.
         precision: of the kept weights. `half` takes half the memory; each weight then has a relative error of at most
             2^-11.
-        max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `uncached`, which keeps
-            those that weights leave room for, and lets go of a view's once its weights are kept.
+        max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `uncached`, which
+            keeps those that weights leave room for, and lets go of a view's once its weights are kept.
         least_list_bytes: memory for these lists beside it, however much is taken by weights.
         at_first_use: keep what comes; False keeps what `keep` is called for alone, so that looks at other views in
             between, as many as there may be, change no bit of what follows.
         device: where weights are kept and applied, and where results lie.
-        uncached: computes weights, and what is not kept: of the same scene. Its lists, device, background, near plane and
-            clamp of alpha take the place of those given here; None makes one.
+        uncached: Rasterizer of the same scene that computes weights, and what is not kept. Its lists, device,
+            background, near plane and clamp of alpha take the place of those given here; None makes one.
 
     Raises:
         SettingsError: Triton cannot run on `device`, which is not the CPU.

@@ -167,7 +167,7 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
             "share": float(weights[regions.members(place)].sum() / weights.sum()),
             "style": region.style and region.style.text,
             "weight": region.weight,
-            "keep": region.keep,
+            "freeze": region.freeze,
             "stylized": place in regions.active,
         }
         for place, region in enumerate(regions.every)

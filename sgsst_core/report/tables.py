@@ -63,7 +63,7 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
 #: What a result is judged by, and how it is written.
 _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "style": ("distance to the style", number),
-    "palette": ("distance to its colors, in levels of 8 bits", number),
+    "color_distance": ("distance to its colors, in levels of 8 bits", number),
     "content": ("content lost (LPIPS)", number),
     "features": ("features turned (1 - cosine)", number),
     "background_sensitivity": ("style on black against white", number),

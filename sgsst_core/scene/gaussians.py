@@ -60,9 +60,9 @@ class Scene:
         return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
 
     def attenuated(self, attenuation: float) -> Scene:
-        """The same scene with all SH bands above degree 0 times 1 - fade; of degree 0 where that leaves nothing.
+        """Return the scene with all SH bands above degree 0 times 1 - attenuation; without them if that is 0.
 
-        Coefficients are multiplied in float32 by the factor rounded to float32: files hold the same (`attenuation_factor`).
+        Coefficients are multiplied in float32 by the factor rounded to float32, as in files (`attenuation_factor`).
         """
         if not attenuation or not self.sh_degree:
             return self

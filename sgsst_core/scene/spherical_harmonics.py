@@ -204,8 +204,8 @@ def view_colors_gradient(
 ) -> Tensor:
     """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolors` where the clamp let the color through, 0 where it did not.
 
-    With `clamp_aware_gradient`, colors that the clamp holds at 0 also take a gradient that would raise them. It is not the
-    derivative: it lets colors that a large step has thrown below 0 come back, which otherwise never move again.
+    With `clamp_aware_gradient`, colors that the clamp holds at 0 also take a gradient that would raise them. It is not
+    the derivative: it lets colors that a large step has thrown below 0 come back, which otherwise never move again.
     """
     passes = (colors > 0) | (color_gradient < 0) if clamp_aware_gradient else colors > 0
     return torch.where(passes, SH_C0 * color_gradient, torch.zeros_like(color_gradient))

@@ -176,7 +176,7 @@ def _add_regions(digest: Any, regions: Regions) -> None:
     digest.update(regions.labels.contiguous().numpy().data)
     for region in regions.every:
         pictures, weights = (region.style.pictures, region.style.weights) if region.style else ((), ())
-        digest.update(repr((region.keep, region.weight, weights)).encode())
+        digest.update(repr((region.freeze, region.weight, weights)).encode())
         for picture in pictures:
             digest.update(repr(tuple(picture.shape)).encode() + picture.contiguous().numpy().tobytes())
 

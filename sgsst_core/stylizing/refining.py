@@ -72,7 +72,7 @@ def refine(
         return None
     fitted = fit_cameras(cameras, settings)
     planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
-    kept = None if regions is None else regions.kept
+    kept = None if regions is None else regions.frozen
     return _Refining(planning_context, StyleMixture.of(style), collectives, kept, show).run()
 
 

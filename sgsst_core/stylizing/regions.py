@@ -164,7 +164,7 @@ def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, r
         weights: [N] float64, total blend weights of the optimized Gaussians; 0 for all others.
     """
     result = torch.zeros_like(change)
-    kept = regions.kept
+    kept = regions.frozen
     for place in regions.labels[~kept].unique().tolist():
         members = regions.members(place)
         voters = torch.where(members, weights, 0.0)

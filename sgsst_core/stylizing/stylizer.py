@@ -140,7 +140,7 @@ class Stylizer:
         # Made once: another processor may round it otherwise, and ranks begin with the same bits.
         start = self.collectives.broadcast(self.transferred) if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
-        kept = regions.kept[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
+        kept = regions.frozen[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
         #: Of the Gaussians that are rendered, those that stay as they are; None where none do.
         self._kept = kept.to(rasterizer.device)[:, None] if kept.any() else None
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
@@ -616,7 +616,7 @@ class Stylizer:
                 weights = torch.where(self.plan.optimized, self.plan.survey.total_blend_weights, 0.0)
                 change = result - self.scene.sh_dc
                 regions = self.regions
-                takes = weights <= 0 if regions is None else (weights <= 0) & ~regions.kept
+                takes = weights <= 0 if regions is None else (weights <= 0) & ~regions.frozen
                 if regions is None:
                     change = neighbors_change(self.scene.means, change, weights)
                 else:

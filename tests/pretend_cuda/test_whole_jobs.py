@@ -122,7 +122,7 @@ def test_regions_wait_for_nothing_more(counts: Counts, tmp_path: Path) -> None:
     stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
     assert stylizer.plan.device == "cuda"
     assert stylizer.regions is not None
-    kept, before = stylizer.regions.kept[stylizer.plan.seen], stylizer.sh_dc.detach().cpu().clone()
+    kept, before = stylizer.regions.frozen[stylizer.plan.seen], stylizer.sh_dc.detach().cpu().clone()
     seen: set[int] = set()
     for _ in range(stylizer.total):
         counts.clear()

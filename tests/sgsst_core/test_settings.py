@@ -13,7 +13,7 @@ def test_paper_is_the_published_schedule() -> None:
     assert settings.content_weight == 1
     assert settings.position_weights == "off"
     assert settings.max_resolution is None
-    assert settings.unseen == "keep"
+    assert settings.unseen == "freeze"
     assert not (settings.clamp_aware_gradient)
     assert not (settings.early_stop)
     assert settings.warm_start is False

@@ -65,7 +65,7 @@ def test_the_command_lines_texts_come_together(tmp_path: Path) -> None:
     rest, first, second = region_requests(options)
     assert (rest.name, rest.selection, rest.styles, rest.weight) == (REST, None, (StyleFile(Path("y=z.jpg")),), 0.5)
     assert first.styles == (StyleFile(Path("x.jpg"), 0.5), StyleFile(odd))
-    assert (first.weight, first.keep, second.keep, second.styles) == (3, False, True, ())
+    assert (first.weight, first.freeze, second.freeze, second.styles) == (3, False, True, ())
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_the_command_lines_texts_come_together(tmp_path: Path) -> None:
         ((["a:sphere=0,0,0,1"], [], ["a=0"], []), "not above 0"),
         ((["a:sphere=0,0,0,1"], [], ["a=x"], []), "no finite number"),
         ((["a:sphere=0,0,0,1"], ["a=x.jpg:0"], [], []), "the weight 0 is no finite number above 0"),
-        ((["a:sphere=0,0,0,1"], ["a=x.jpg"], [], ["a"]), "is kept as it is, and has no style or weight"),
+        ((["a:sphere=0,0,0,1"], ["a=x.jpg"], [], ["a"]), "is frozen and takes no style or weight"),
         ((["rest:sphere=0,0,0,1"], [], [], []), "takes no SPEC"),
         ((["a:" + "x" * 1001], [], [], []), "at most 1000 characters"),
         (([f"a{n}:sphere=0,0,0,1" for n in range(MOST_REGIONS + 1)], [], [], []), f"; {MOST_REGIONS} may be"),
@@ -95,4 +95,4 @@ def test_a_region_of_json_needs_a_selection() -> None:
     with pytest.raises(SettingsError, match="needs a SPEC"):
         region_requests([RegionOptions(name="a")])
     with pytest.raises(SettingsError, match="two regions 'rest'"):
-        region_requests([RegionOptions(name=REST, keep=True)] * 2)
+        region_requests([RegionOptions(name=REST, freeze=True)] * 2)

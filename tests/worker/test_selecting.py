@@ -152,8 +152,8 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile) -
 
 
 def test_nothing_left_to_do(file: SceneFile) -> None:
-    everything = region("a", "half-space=1,0,0,-100", keep=True)
-    with pytest.raises(SettingsError, match=r"Every Gaussian is kept \(a\)"):
+    everything = region("a", "half-space=1,0,0,-100", freeze=True)
+    with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a\)"):
         labels_of(file, everything)
     assert select_regions((), file, cameras(), 0.2, load_styles) is None
 

@@ -117,7 +117,7 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
         "share": 0,
         "style": "other.png",
         "weight": 2.0,
-        "keep": False,
+        "freeze": False,
         "stylized": True,
     }
     assert found["left"]["gaussians"] == kept.sum()
@@ -134,7 +134,7 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
         (["--region", "a:cube=1"], "selects nothing that is known"),
         (["--region", "a:mask=nowhere.npy"], "cannot be read as .npy"),
         (["--region", "a:property=color>1"], "no property 'color'"),
-        (["--region-freeze", "rest"], "Every Gaussian is kept (rest)"),
+        (["--region-freeze", "rest"], "Every Gaussian is frozen (rest)"),
         (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),
     ],
 )

@@ -16,9 +16,9 @@ from api.cli.main import app, main
 from api.cli.options import flags, help_text, kind_of
 from api.cli.options_table import reference
 from api.cli.values import parse_strength
-from service.parameters import JobParameters
+from service.parameters import JobParameters, stored_parameters
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, declared
+from sgsst_core.options import RENAMED, Declared, declared
 from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
 from worker.request import SceneRequest
@@ -164,3 +164,20 @@ def test_a_content_weight_is_a_number_or_a_strength(text: str, weight: float) ->
 def test_another_word_than_a_strength_is_refused() -> None:
     with pytest.raises(typer.BadParameter, match="light, balanced, strong"):
         parse_strength("weak")
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_former_names_are_refused_with_the_present_one(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
+    flag = "--" + old.replace("_", "-")
+    assert main(["stylize", "scene.ply", flag, "x"]) == 2
+    assert f"{flag}: it is called --{new.replace('_', '-')} now" in capsys.readouterr().err
+    if old in {"keep", "region_keep"}:
+        return
+    with pytest.raises(SettingsError, match=f"it is called {new} now"):
+        checked(JobParameters, {old: "x"})
+
+
+def test_a_stored_job_is_read_under_former_names() -> None:
+    stored = {"sh_fade": 0.5, "unseen": "neighbours", "regions": [{"name": "rest", "keep": True}]}
+    found = stored_parameters(stored).model_dump()
+    assert (found["sh_attenuation"], found["unseen"], found["regions"][0]["freeze"]) == (0.5, "neighbors", True)

@@ -243,7 +243,7 @@ def test_regions_have_styles_by_their_files_names(client: httpx.Client, files: d
         return client.post("/v1/jobs?dry_run=true", files=files, data=told)
 
     right = {"name": "right", "select": "half-space=1,0,0,0", "style": "night sky.png", "weight": 2}
-    good = answer(right, {"name": "left", "select": "box=-9,-9,-9,-1,9,9", "keep": True}, style_weights=[1])
+    good = answer(right, {"name": "left", "select": "box=-9,-9,-9,-1,9,9", "freeze": True}, style_weights=[1])
     assert good.status_code == 200, good.text
     decisions = {each["item"]: each["decision"] for each in good.json()["plan"]["decisions"]}
     assert "take night sky.png, with weight 2" in decisions["region right"]
@@ -258,7 +258,7 @@ def test_regions_have_styles_by_their_files_names(client: httpx.Client, files: d
         (answer({"name": "a", "select": "sphere=1"}), "invalid-settings"),
         (answer({"name": "a"}), "invalid-settings"),
         (answer({"name": "a", "select": "property=nothing>1"}), "invalid-scene"),
-        (answer({"name": "a", "select": "half-space=0,0,1,-99", "keep": True}), "invalid-settings"),
+        (answer({"name": "a", "select": "half-space=0,0,1,-99", "freeze": True}), "invalid-settings"),
     ]
     for refusal, code in wrong:
         refused(refusal, 422, code)

@@ -478,7 +478,7 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     parameters = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]
     assert parameters["style_weights"] == [3.0, 1.0]
     (kept,) = parameters["regions"]
-    assert (kept["name"], kept["select"], kept["keep"]) == ("left", "half-space=1,0,0,0", True)
+    assert (kept["name"], kept["select"], kept["freeze"]) == ("left", "half-space=1,0,0,0", True)
     result = tmp_path / "stylized.ply"
     result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     before, after = read_scene(files["scene"]).scene, read_scene(result).scene

@@ -33,7 +33,7 @@ def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> N
     assert [outcome.name for outcome in variants] == ["standard", "one-scale"]
     assert [curve.variant.name for curve in quality.curves if curve.left_out] == ["tf32"]  # there is no GPU for it
     assert before.judgment.content == 0
-    assert transfer.judgment.palette < before.judgment.palette
+    assert transfer.judgment.color_distance < before.judgment.color_distance
     for outcome in variants:
         assert outcome.loss is not None
         assert outcome.loss < 1

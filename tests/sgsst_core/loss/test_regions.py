@@ -125,9 +125,9 @@ def test_statistics_of_two_regions_together_are_merged_statistics():
 # --- which Gaussians -----------------------------------------------------------------------------------------------
 
 
-def regions(labels, **keeps):
+def regions(labels, **frozen):
     names = ("rest", "a", "b")
-    every = tuple(Region(name, keep=keeps.get(name, False)) for name in names)
+    every = tuple(Region(name, freeze=frozen.get(name, False)) for name in names)
     return Regions(every, torch.tensor(labels, dtype=torch.uint8))
 
 
@@ -140,8 +140,8 @@ def test_regions_that_no_view_sees_become_the_rest():
 
 def test_kept_regions_stay_kept_where_no_view_sees_them():
     found = regions([0, 1, 2, 2], a=True).resolved(torch.tensor([1.0, 0, 1, 2]))
-    assert found.kept.tolist() == [False, True, False, False]
-    assert not found.kept_in_view
+    assert found.frozen.tolist() == [False, True, False, False]
+    assert not found.frozen_in_view
 
 
 def test_a_region_of_all_that_is_seen_needs_no_map():
@@ -152,11 +152,11 @@ def test_a_region_of_all_that_is_seen_needs_no_map():
 
 def test_nothing_to_do_is_an_error():
     kept = regions([1, 1, 2], a=True, b=True)
-    with pytest.raises(SettingsError, match=r"Every Gaussian is kept \(a, b\)"):
+    with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a, b\)"):
         check_regions(kept)
     partly = regions([0, 1, 2], a=True, b=True)
     check_regions(partly)
-    with pytest.raises(SettingsError, match=r"--sh-attenuation 0\.5 would change Gaussians of every region"):
+    with pytest.raises(SettingsError, match=r"--sh-attenuation 0\.5 changes the Gaussians of every region"):
         check_regions(partly, 0.5)
-    with pytest.raises(SettingsError, match="that a view sees is kept"):
+    with pytest.raises(SettingsError, match="that a view sees is frozen"):
         partly.resolved(torch.tensor([0.0, 1, 1]))

@@ -79,7 +79,7 @@ def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
     assert plan.seen.tolist() == plan.optimized.tolist() == [False, True, True, True, True, True]
     assert said(plan, "unseen Gaussians").startswith("1 of 6 are not rendered and not optimized; they take their neigh")
     assert line(plan, "unseen Gaussians").bytes == OPTIMIZER_BYTES  # type: ignore[union-attr]
-    assert "they keep their colors" in said(plan_of(probe(), unseen="keep"), "unseen Gaussians")
+    assert "they keep their colors" in said(plan_of(probe(), unseen="freeze"), "unseen Gaussians")
     everything = plan_of(probe(), keep=("unseen",))
     assert everything.seen.all()
     assert not everything.optimized.all()

@@ -88,7 +88,7 @@ def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> Non
     styles, palette, content, features = plain(scene, other, view, style())
     assert found.style == pytest.approx(sum(styles) / 2, rel=1e-4)
     assert found.background_sensitivity == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
-    assert found.palette == pytest.approx(palette, rel=1e-4)
+    assert found.color_distance == pytest.approx(palette, rel=1e-4)
     assert found.content == pytest.approx(content, rel=1e-3)
     assert found.features == pytest.approx(features, rel=1e-3)
 
@@ -111,7 +111,7 @@ def test_a_scene_of_the_style_is_near_the_style(alex: Lpips) -> None:
     judge = judge_of(alex, scene, [view], picture)
     noise, like = judged(judge, scene.sh_dc), judged(judge, (painted - 0.5) / SH_C0)
     assert like.style < 0.6 * noise.style
-    assert like.palette < 0.4 * judged(judge, torch.full_like(scene.sh_dc, 1.5)).palette
+    assert like.color_distance < 0.4 * judged(judge, torch.full_like(scene.sh_dc, 1.5)).color_distance
     assert like.content > 0.1
 
 
@@ -150,11 +150,11 @@ def test_colors_that_no_screen_shows_are_saturated() -> None:
     assert saturated((colors - 0.5) / SH_C0) == 0.5
 
 
-def regions_of(scene: Scene, left: Tensor, right: Tensor, *, keep: bool = False) -> JobStyles:
-    every = (Region("rest", keep=keep), Region("right"))
+def regions_of(scene: Scene, left: Tensor, right: Tensor, *, freeze: bool = False) -> JobStyles:
+    every = (Region("rest", freeze=freeze), Region("right"))
     labels = (scene.means[:, 0] > 0).to(torch.uint8)
     regions = Regions(every, labels).resolved(torch.ones(len(scene)).double())
-    each = (right,) if keep else (left, right)
+    each = (right,) if freeze else (left, right)
     return JobStyles(StyleMixture.of(left), regions, tuple(map(StyleMixture.of, each)))
 
 
@@ -167,8 +167,8 @@ def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
         judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors)
         for styles in (regions_of(scene, dark, bright), regions_of(scene, bright, dark))
     ]
-    assert found[0].palette < 60  # colors run into each other at the border
-    assert found[1].palette > 150
+    assert found[0].color_distance < 60  # colors run into each other at the border
+    assert found[1].color_distance > 150
     assert found[0].content == found[1].content
 
 
@@ -177,9 +177,9 @@ def test_what_is_kept_has_no_style_to_be_judged_by(alex: Lpips) -> None:
     bright = torch.full((64, 64, 3), 0.9)
     right = (scene.means[:, 0] > 0)[:, None]
     colors = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
-    styles = regions_of(scene, bright, bright, keep=True)
-    assert judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors).palette < 60
-    assert judged(judge_of(alex, scene, views, bright), colors).palette > 80
+    styles = regions_of(scene, bright, bright, freeze=True)
+    assert judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors).color_distance < 60
+    assert judged(judge_of(alex, scene, views, bright), colors).color_distance > 80
 
 
 def test_equal_pictures_are_judged_as_one(alex: Lpips) -> None:
@@ -189,4 +189,4 @@ def test_equal_pictures_are_judged_as_one(alex: Lpips) -> None:
         judged(Judge(alex, each, scene, CpuRasterizer(scene), views), scene.sh_dc) for each in (style(), mixture)
     )
     assert two.style == pytest.approx(one.style, rel=1e-6)
-    assert two.palette == pytest.approx(one.palette, rel=1e-6)
+    assert two.color_distance == pytest.approx(one.color_distance, rel=1e-6)

@@ -125,5 +125,5 @@ def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _judged(style: float, content: float) -> dict[str, float]:
-    found = {"style": style, "palette": 40 * style, "content": content, "features": content / 2}
+    found = {"style": style, "color_distance": 40 * style, "content": content, "features": content / 2}
     return {**found, "background_sensitivity": 0.25, "saturated": 0.02}

@@ -41,7 +41,7 @@ def bright_wall() -> Scene:
     [
         {},
         {"clamp_aware_gradient": False},
-        {"unseen": "keep"},
+        {"unseen": "freeze"},
         {"training_background": "palette", "warm_start": True},
         {"views_per_step": 2},
     ],
@@ -60,7 +60,7 @@ def test_no_color_that_changes_leaves_what_screens_show(
     changed = (found != scene.sh_dc).any(dim=1)
     assert saturated(free.stylized()) > 0.1
     assert saturated(found[changed]) == 0
-    if values.get("unseen") != "keep":
+    if values.get("unseen") != "freeze":
         assert saturated(found) == 0
         assert bool(changed.all())
 
@@ -81,11 +81,11 @@ def test_luminance_alone_keeps_chroma_within_the_bounds(tiny_weights: BackboneWe
 def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeights) -> None:
     scene = bright_wall()
     right = (scene.means[:, 0] > 0).to(torch.uint8)
-    regions = Regions((Region("rest"), Region("right", keep=True)), right)
+    regions = Regions((Region("rest"), Region("right", freeze=True)), right)
     stylizer = make(tiny_weights, scene, regions, bounded=True)
     run(stylizer)
     found = stylizer.stylized()
-    kept = regions.kept
+    kept = regions.frozen
     assert saturated(scene.sh_dc[kept]) > 0.1
     assert torch.equal(found[kept].view(torch.int32), scene.sh_dc[kept].view(torch.int32))
     assert saturated(found[~kept]) == 0

@@ -25,7 +25,7 @@ def halves() -> Regions:
     labels = torch.zeros(len(across), dtype=torch.uint8)
     labels[across < -0.5], labels[across > 0.5] = 1, 2
     own = StyleMixture.weighted([style().flip(0), style().flip(2)], [1, 3])
-    return Regions((Region("rest"), Region("left", keep=True), Region("right", style=own, weight=2.0)), labels)
+    return Regions((Region("rest"), Region("left", freeze=True), Region("right", style=own, weight=2.0)), labels)
 
 
 def job(weights: BackboneWeights, **values: object) -> Stylizer:
@@ -46,8 +46,8 @@ def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_we
     made = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights, regions=regions)
     assert free is not None
     assert made is not None
-    assert bool((piece_counts(free.pieces)[regions.kept] > 1).any()), "nothing is proved"
-    assert bool((piece_counts(made.pieces)[regions.kept] == 1).all())
+    assert bool((piece_counts(free.pieces)[regions.frozen] > 1).any()), "nothing is proved"
+    assert bool((piece_counts(made.pieces)[regions.frozen] == 1).all())
     assert made.split
     assert torch.equal(regions.refined(made).labels, regions.labels[parents_of(made.pieces)])
 
@@ -60,7 +60,7 @@ def test_all_at_once(tiny_weights: BackboneWeights, colors: str) -> None:
     found = stylized(stylizer)
     assert len(found) > len(large_wall())
     assert stylizer.regions is not None
-    kept = stylizer.regions.kept
+    kept = stylizer.regions.frozen
     assert torch.equal(found[kept], before[kept])
     assert not torch.equal(found[~kept], before[~kept])
     assert bool(found.isfinite().all())

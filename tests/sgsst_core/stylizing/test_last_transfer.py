@@ -98,7 +98,7 @@ def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(ti
     labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
     labels[scene.means[:, 1] > 1] = 2
     regions = Regions(
-        (Region("rest", style=dark), Region("right", style=bright), Region("low", keep=True)),
+        (Region("rest", style=dark), Region("right", style=bright), Region("low", freeze=True)),
         labels,
     )
     stylizer = make(tiny_weights, scene, regions)
@@ -112,7 +112,7 @@ def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(ti
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeights, bounded: bool) -> None:
-    stylizer = make(tiny_weights, preserve_colors="luminance", warm_start=True, bounded=bounded, unseen="keep")
+    stylizer = make(tiny_weights, preserve_colors="luminance", warm_start=True, bounded=bounded, unseen="freeze")
     run(stylizer)
     rows, before = stylizer.plan.optimized, stylizer.scene.sh_dc
     found = stylizer.stylized()

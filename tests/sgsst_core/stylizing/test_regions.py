@@ -90,22 +90,22 @@ def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
 def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str, values: dict[str, Any]) -> None:
     scene = wall(60, 40, sh_degree=1)  # reaches beyond the views
     scene.sh_dc[::7] = -0.0
-    keep = {"left": Region("rest", keep=True)} if kept == "rest" else {"right": Region("right", keep=True)}
+    keep = {"left": Region("rest", freeze=True)} if kept == "rest" else {"right": Region("right", freeze=True)}
     regions = halves(scene, **keep)
     stylizer = make(tiny_weights, scene, regions, **values)
     assert run(stylizer) == "finished"
     bits, before = stylizer.stylized().view(torch.int32), scene.sh_dc.view(torch.int32)
-    assert torch.equal(bits[regions.kept], before[regions.kept])
+    assert torch.equal(bits[regions.frozen], before[regions.frozen])
     changed = (bits != before).any(dim=1)
     assert bool(changed[stylizer.plan.optimized].all())
-    assert bool(changed[~regions.kept].all()) == (values.get("unseen") != "keep")
-    assert not bool((stylizer.plan.optimized & regions.kept).any())
+    assert bool(changed[~regions.frozen].all()) == (values.get("unseen") != "freeze")
+    assert not bool((stylizer.plan.optimized & regions.frozen).any())
 
 
 def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
     near = (scene.means[:, 0].abs() < 2.35) & (scene.means[:, 1].abs() < 1.8)
-    regions = Regions((Region("rest"), Region("middle", keep=True)), near.to(torch.uint8))
+    regions = Regions((Region("rest"), Region("middle", freeze=True)), near.to(torch.uint8))
     assert bool((~near).any())
     with pytest.raises(SettingsError, match="Every Gaussian that a view sees is kept"):
         make(tiny_weights, scene, regions)
@@ -188,7 +188,7 @@ def test_unseen_gaussians_follow_their_own_region() -> None:
     change = torch.tensor([[1.0] * 3, [2.0] * 3, [0.0] * 3, [0.0] * 3, [0.0] * 3])
     weights = torch.tensor([1.0, 1, 0, 0, 0]).double()
     labels = torch.tensor([0, 1, 0, 1, 2], dtype=torch.uint8)
-    regions = Regions((Region("rest"), Region("a"), Region("b", keep=True)), labels)
+    regions = Regions((Region("rest"), Region("a"), Region("b", freeze=True)), labels)
     found = neighbors_change_by_region(means, change, weights, regions)
     assert found[2:, 0].tolist() == [1.0, 2.0, 0.0]
     without = replace(regions, labels=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8))
@@ -216,7 +216,7 @@ def test_the_fingerprint_knows_regions() -> None:
     regions = halves(scene)
     moved = replace(regions, labels=1 - regions.labels)
     right = regions.every[1]
-    others = [replace(right, weight=2.0), replace(right, style=None), replace(right, keep=True)]
+    others = [replace(right, weight=2.0), replace(right, style=None), replace(right, freeze=True)]
     every = [None, regions, moved, *(replace(regions, every=(regions.every[0], other)) for other in others)]
     found = [fingerprint(scene, views, style(), settings, "w", "", each) for each in every]
     assert len(set(found)) == len(every)

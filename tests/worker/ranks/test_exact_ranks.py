@@ -119,7 +119,7 @@ def test_regions_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> Non
     """On three ranks, of which some have no pixel of a region; one of the regions is kept."""
     scene, camera = wall(), cameras(1, 128, 96)[0]
     other = StyleMixture.of(picture(64, 80, seed=5, dtype=torch.float64))
-    every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", keep=True))
+    every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", freeze=True))
     labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
     regions = Regions(every, labels.clamp(max=2))
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss, regions
