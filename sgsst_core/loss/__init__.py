@@ -1,1 +1,1 @@
-"""The SOS loss and its gradient, its float64 reference, and the rule that tells when it has stopped falling."""
+"""SOS loss and its gradient, the float64 reference, and the test for convergence."""

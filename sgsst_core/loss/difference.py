@@ -1,4 +1,4 @@
-"""How far a gradient is from the exact one."""
+"""Error of an approximate gradient relative to the exact one."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Difference:
-    """Of two gradients.
+    """Difference between two gradients.
 
     Attributes:
-        relative_error: |found - exact| / |exact|, Euclidean; where the exact one is 0, 0 if the other is too, else 1.
-        cosine: of the angle between the two; where one of them is 0, 1 if both are, else 0.
+        relative_error: |found - exact| / |exact| in the Euclidean norm. If the exact gradient is 0: 0 if the other is 0
+            too, else 1.
+        cosine: Cosine of the angle between the two. If either is 0: 1 if both are, else 0.
     """
 
     relative_error: float
@@ -22,7 +23,7 @@ class Difference:
 
     @staticmethod
     def of(found: Tensor, exact: Tensor) -> Difference:
-        """Compare two gradients of one shape; float64 inside. What is not finite differs infinitely."""
+        """Compare two gradients of the same shape in float64. Non-finite values give an infinite error."""
         error, length = (found - exact).double().norm(), exact.double().norm()
         product = float((found.double() * exact.double()).sum())
         lengths = float(found.double().norm() * length)

@@ -1,12 +1,12 @@
-"""How large a network's features are, and factors that change it layer by layer.
+"""Per-layer scale of a network's features.
 
-Of a layer whose features are s times as large, the loss of the Gram matrix is s^4 times as large, those of mean,
-standard deviation and content s^2 times: how much each layer and each term counts follows from the size of features.
-The paper's network is the original VGG19 (`vgg_conv.pth` of Gatys et al.); torchvision's networks were trained anew,
-and their layers are of other sizes. A network of ReLUs is positively homogeneous: its weights times the ratio of two
-layers' factors, and its biases times the layer's own, give the same features times these factors.
+If the features of a layer are s times as large, its Gram loss is s^4 times as large, and its mean, standard deviation
+and content losses are s^2 times as large. The feature scale therefore decides how much each layer and term counts. The
+paper uses the original VGG19 (`vgg_conv.pth` of Gatys et al.); torchvision's networks were trained separately, and
+their layers have other scales. ReLU networks are positively homogeneous: multiplying a layer's weights by the ratio of
+its factor to the previous layer's, and its biases by its own factor, scales its features by exactly that factor.
 
-A factor of `PIXELS` also has the pixels themselves compared, which the paper does not do.
+A factor for `PIXELS` adds the pixels themselves to the comparison, which the paper does not do.
 """
 
 from __future__ import annotations
@@ -26,18 +26,20 @@ from sgsst_core.features.vgg import PIXELS, FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale, Settings
 
-#: Of every layer but the first, `even`: Gram matrix, mean and standard deviation then count about alike at the start.
+#: Factor of every layer except the first for `even`. Gram matrix, mean and standard deviation then contribute about
+#: equally at the start.
 EVEN_SCALE = 8.0
-#: Of the first layer, `even`. It alone knows colors as such, and with the others' factor its share of the loss is less
-#: than a hundredth: palettes came out better with this one, and styles no worse (docs/quality.md).
+#: Factor of the first layer for `even`. Only this layer sees color as such; with the factor of the others it would
+#: contribute less than a hundredth of the loss. This value brings colors closer to the style, and the style itself is
+#: no worse (docs/quality.md).
 EVEN_COLOR_SCALE = 16.0
-#: Of the pixels, `even`. Colors that begin as the style's would be given up for strokes: with this factor palettes
-#: came out nearer by 3 to 16 levels on six pairs, for up to 0.02 of style (docs/quality.md).
+#: Factor of the pixels for `even`. Without it, colors that start out like the style's are given up for strokes. On six
+#: pairs it brought colors closer by 3 to 16 levels, at a cost of up to 0.02 in style (docs/quality.md).
 EVEN_PIXEL_SCALE = 28.0
-#: What the original VGG19 logs in the first iteration of a published run (installation guide of J. Johnson,
-#: "neural-style", its default pictures at 512 pixels), divided by the run's weights of 100 and 5. The run starts from
-#: noise that is nothing to the network. Style layers: the mean squared difference of Gram / (c h w) from a painting's;
-#: the content layer: that of the features from a photograph's.
+#: Losses that the original VGG19 logs in the first iteration of a published run (installation guide of J. Johnson's
+#: "neural-style", default images at 512 pixels), divided by that run's weights of 100 and 5. The run starts from noise
+#: that the network hardly responds to. Style layers: mean squared difference of Gram / (c h w) from a painting's.
+#: Content layer: mean squared difference of features from a photo's.
 PUBLISHED = {
     "relu1_1": 300.2129,
     "relu2_1": 7003.4956,
@@ -47,14 +49,14 @@ PUBLISHED = {
     "relu5_1": 6.568603,
 }
 _CONTENT = "relu4_2"
-#: Longer side of the pictures of that run.
+#: Longer side in pixels of the images of that run.
 _SIDE = 512
 
 
 def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
-    """The same network with features of a scale; those that have been scaled already stay as they are.
+    """Return the network with its features scaled as requested.
 
-    `vgg_conv.pth` is the paper's network itself and stays as it is with either.
+    Networks that are already scaled, and `vgg_conv.pth`, which is the paper's own network, are returned unchanged.
     """
     if weights.scales or is_original(weights):
         return weights
@@ -62,27 +64,29 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
 
 
 def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
-    """The network as a job with these settings uses it: at its scale, and shown luminance alone where colors stay."""
+    """Return the network for a job: at the feature scale of its settings, and on luminance alone if colors are kept."""
     scaled = at_scale(weights, settings.feature_scale)
     return replace(scaled, gray=True) if settings.preserve_colors == "luminance" else scaled
 
 
 def even_scales(weights: BackboneWeights) -> dict[str, float]:
-    """Factors of layers, `even`: of features powers of two, so that they change by them and by no rounding."""
+    """Return the layer factors for `even`. Those of features are powers of two, so scaling adds no rounding error."""
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
     return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
 
 
 def is_original(weights: BackboneWeights) -> bool:
-    """Whether they are those of the original network, which takes colors of 0 to 255 as they are."""
+    """Return whether the weights are those of the original network, which takes input of 0 to 255 without
+    normalization.
+    """
     return bool((weights.input_scale == 255).all())
 
 
 def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict[str, float]:
-    """Factors of layers that give a picture, The Starry Night unless told otherwise, the published statistics.
+    """Return the layer factors at which an image, by default The Starry Night, has the published losses.
 
-    To two digits: rounding does not show. The painting of the published run is another one; two others give factors
-    within 25 % of this one's (docs/quality.md).
+    Factors are rounded to two digits, which makes no visible difference. The published run used another painting; two
+    other paintings give factors within 25 % of these (docs/quality.md).
     """
     with Image.open(picture) as painting:
         size = [round(side * _SIDE / max(painting.size)) for side in painting.size]
@@ -102,9 +106,10 @@ def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict
 
 
 def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> BackboneWeights:
-    """A network whose features of some layers are so many times as large; other layers have the factor before them.
+    """Return the network with the features of some layers multiplied by a factor.
 
-    `PIXELS` have none before them, and are compared where they are given one.
+    Layers without a factor take that of the layer before them. `PIXELS` has no layer before it; it is compared only if
+    it has a factor.
     """
     convolutions: dict[str, tuple[Tensor, Tensor]] = {}
     before = 1.0
@@ -116,12 +121,12 @@ def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> Backbo
 
 
 def _features(weights: BackboneWeights, picture: Tensor) -> dict[str, Tensor]:
-    """Features [h, w, c] of the published layers, of a picture [H, W, 3]."""
+    """Return the features [h, w, c] of the published layers for an image [H, W, 3]."""
     network = FeatureNetwork(weights, tuple(PUBLISHED), torch.float32)
     return network.forward(picture, keep=False).features
 
 
 def _gram(features: Tensor) -> Tensor:
-    """Gram matrix / (h w c) of features [h, w, c], float64."""
+    """Return the Gram matrix / (h w c) of features [h, w, c] in float64."""
     values = features.flatten(0, 1).double()
     return values.T @ values / values.numel()

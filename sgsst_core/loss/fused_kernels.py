@@ -1,9 +1,9 @@
-"""GPU kernels of a layer's style loss and of its gradient with respect to the features.
+"""GPU kernels for the style loss of a layer and its gradient with respect to the features.
 
-Run in Triton's interpreter on the CPU too (TRITON_INTERPRET=1 before the first import).
+They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ def compare(
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """`terms.style_loss`, in float64; ROWS channels a program, and COLUMNS, all channels at least.
+    """Compute `terms.style_loss` in float64, for ROWS channels per program against all channels (at most COLUMNS).
 
     Args:
-        count, mean, centered: of the view's statistics.
-        target_gram, target_mean, target_std: of the style.
-        terms: [CHANNELS, 5] float64, what each channel adds to each term.
-        matrix, own_mean, offset: [CHANNELS, CHANNELS], [CHANNELS], [CHANNELS] float32, of `terms.StyleGradient`.
+        count, mean, centered: Statistics of the view.
+        target_gram, target_mean, target_std: Statistics of the style.
+        terms: Output [CHANNELS, 5] float64, contribution of each channel to each term.
+        matrix, own_mean, offset: Outputs [CHANNELS, CHANNELS], [CHANNELS] and [CHANNELS] float32, the fields of
+            `terms.StyleGradient`.
     """
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     j = tl.arange(0, COLUMNS)
@@ -48,7 +49,7 @@ def compare(
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
-    # Features are centered about the rounded mean: what it leaves out is a part of the offset.
+    # Features are centered about the float32 mean. Its rounding error goes into the offset.
     drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * share
     tl.store(matrix + entry, (line * share).to(tl.float32), mask=both)
     tl.store(own_mean + i, own.to(tl.float32), mask=row)
@@ -69,14 +70,16 @@ def add_style_gradient(
     CHANNELS: tl.constexpr, TILE: tl.constexpr, K: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """gradient_p += a_p (matrix (F_p - mean) + offset), for P positions and TILE channels a program, K at a time.
+    """Compute gradient_p += a_p (matrix (F_p - mean) + offset).
+
+    Each program handles P positions and TILE output channels; it sums over the input channels in steps of K.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
-        weights: [h, width] position weights, or anything where WEIGHTED is false.
-        gradient: [h, width, CHANNELS], in the features' type, changed in place.
-        matrix, mean, offset: of `compare`; the matrix is symmetric.
-        positions: h * width.
+        weights: Position weights [h, width]; ignored if WEIGHTED is false.
+        gradient: [h, width, CHANNELS] in the dtype of the features, updated in place.
+        matrix, mean, offset: Outputs of `compare`; the matrix is symmetric.
+        positions: Number of positions, h * width.
     """
     position = tl.program_id(0) * P + tl.arange(0, P)
     there = position < positions

@@ -1,4 +1,7 @@
-"""`style_loss` and `StyleGradient.add_to` on a GPU, one launch each. Their float64 twins are those of `terms`."""
+"""GPU versions of `style_loss` and `StyleGradient.add_to`, one kernel launch each.
+
+The float64 references are the CPU versions in `terms`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from sgsst_core.features.fused_statistics import (
 )
 from sgsst_core.features.statistics import LayerStatistics
 
-#: Positions that a program of the gradient takes, and channels of theirs at a time: with more, registers spill.
+#: Positions per program of the gradient kernel, and channels per step. Larger values spill registers.
 POSITIONS, STEP = 64, 32
 
 
@@ -24,12 +27,16 @@ def fused_style_loss(
     weights: tuple[float, float, float],
     feature_eps: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What `terms.style_loss` gives: terms [5] float64; matrix [c, c], mean [c] and offset [c] float32.
+    """Compute `terms.style_loss` on a GPU.
 
     Args:
+        statistics: Statistics of the view's features.
         target: Gram matrix, mean and standard deviation of the style, float64.
         weights: c^2 w_G, w_m and w_s.
-        feature_eps: as for `terms.style_loss`.
+        feature_eps: Relative rounding error of the features, as in `terms.style_loss`.
+
+    Returns:
+        Terms [5] float64, and the gradient's matrix [c, c], mean [c] and offset [c] in float32.
     """
     from sgsst_core.loss import fused_kernels as kernels
 
@@ -56,12 +63,15 @@ def fused_add_style_gradient(
     offset: Tensor,
     position_weights: Tensor | None = None,
 ) -> None:
-    """Add a_p (matrix (F_p - mean) + offset) to a gradient [h, w, c] in place.
+    """Add a_p (matrix (F_p - mean) + offset) to a gradient in place.
 
     Args:
-        features: [h, w, c], of the gradient's type.
-        matrix, mean, offset: of `fused_style_loss`.
-        position_weights: [h, w].
+        gradient: [h, w, c].
+        features: [h, w, c], same dtype as the gradient.
+        matrix: [c, c] from `fused_style_loss`.
+        mean: [c] from `fused_style_loss`.
+        offset: [c] from `fused_style_loss`.
+        position_weights: [h, w]; None for equal weights.
     """
     from sgsst_core.loss import fused_kernels as kernels
 

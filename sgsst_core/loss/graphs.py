@@ -1,7 +1,7 @@
-"""The loss of a view as a CUDA graph: some 400 small kernels in one launch.
+"""CUDA graphs of the loss of a view: some 400 small kernels in one launch.
 
-On small views a GPU waits for the program to launch one kernel after the other. A graph holds them all, with the places
-in memory that they work on: what changes from view to view is copied to those places first.
+On small views, launching kernels one by one keeps the GPU waiting. A graph replays all of them on fixed memory
+addresses, so whatever differs between views is first copied to these addresses.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from sgsst_core.loss.terms import TERMS
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.timing import Timer
 
-#: Graphs that are kept at most. One takes about a megabyte beside the memory that all of them share.
+#: Maximum number of cached graphs. Each takes about a megabyte in addition to the memory that all of them share.
 MOST_GRAPHS = 256
-#: Visits that make nothing faster: one that prepares what kernels need, and the one that is captured.
+#: Visits that are no faster: one warms up the kernels, and one is captured.
 FIRST_VISITS = 2
 
 
 def has_graphs(device: torch.device | str) -> bool:
-    """Whether a device replays graphs: NVIDIA's. ROCm has them too, but nobody has tried ours there."""
+    """Return whether a device supports CUDA graphs. Only NVIDIA GPUs do; graphs are untested on ROCm."""
     return torch.device(device).type == "cuda" and torch.version.hip is None
 
 
 def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
-    """Whether the loss of a view, whose partition tiles have so many pixels, may become a graph.
+    """Return whether the loss of a view can be captured as a graph.
 
-    Its activations have a place of their own in memory, which nothing else can use: the same work without the graph
-    must fit beside it.
+    A graph reserves memory for its activations, so the same work without a graph must still fit beside it.
 
     Args:
-        areas: of every scale's only tile.
+        tiling: Partitioning rules of the loss.
+        areas: Pixels of the only partition tile of each scale.
     """
     return tiling.keep_activations and 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
 
 
 @dataclass(frozen=True)
 class _Key:
-    """What is the same at every replay of a graph, beside the style's targets themselves."""
+    """Properties that all replays of a graph have in common, apart from the style targets themselves."""
 
     size: tuple[int, ...]
     dtype: torch.dtype
@@ -57,12 +57,12 @@ class _Key:
 
 @dataclass(frozen=True)
 class _Graph:
-    """A captured evaluation, with the tensors that it reads and writes.
+    """Captured evaluation with its input and output tensors.
 
     Attributes:
-        graph: a `torch.cuda.CUDAGraph`.
-        image, view: what it reads.
-        result: what it writes.
+        graph: The `torch.cuda.CUDAGraph`.
+        image, view: Inputs.
+        result: Output.
     """
 
     graph: Any
@@ -71,7 +71,7 @@ class _Graph:
     result: SosResult
 
     def replay(self, image: Tensor, view: ViewTarget) -> SosResult:
-        """The result of an image and a view of the same kind."""
+        """Evaluate another image and view with the same key."""
         scales = self.result.scales
         for place, value in zip(_inputs(self.image, self.view, scales), _inputs(image, view, scales), strict=True):
             place.copy_(value)
@@ -80,17 +80,18 @@ class _Graph:
 
 
 class LossGraphs:
-    """Evaluates the SOS loss of views as `SosLoss.evaluate` does, from a graph where one can be had.
+    """Evaluator of the SOS loss that replays CUDA graphs where it can, and otherwise calls `SosLoss.evaluate`.
 
-    The first evaluation of a kind (size, scales, tiles, style) runs as ever, which compiles kernels and lets cuDNN try
-    its algorithms; the second one is captured. Where that fails, all go on as ever.
+    The first evaluation with a given key (size, scales, tiles, style) runs in eager mode, which compiles kernels and
+    lets cuDNN benchmark its algorithms. The second one is captured. If capturing fails, all evaluations fall back to
+    eager mode.
 
     Args:
-        loss: of one rank, on a device that `has_graphs`.
-        most: graphs that are kept.
+        loss: Loss on one rank, on a device with `has_graphs`.
+        most: Maximum number of cached graphs.
 
     Attributes:
-        problem: why no graph could be captured; None as long as none has failed.
+        problem: Reason why capturing failed; None if it has not.
     """
 
     def __init__(self, loss: SosLoss, most: int = MOST_GRAPHS) -> None:
@@ -99,7 +100,7 @@ class LossGraphs:
         self.loss = loss
         self.problem: str | None = None
         self._most = most
-        #: Style targets by kind, which they keep from becoming another's: their number is part of it.
+        #: Style targets by key. A key contains the targets' id; holding them here keeps the id from being reused.
         self._visited: dict[_Key, Mapping[int, ScaleTarget]] = {}
         self._graphs: dict[_Key, _Graph] = {}
         self._static: dict[tuple[object, ...], Tensor] = {}
@@ -108,7 +109,7 @@ class LossGraphs:
 
     @property
     def captured(self) -> int:
-        """How many graphs there are."""
+        """Number of captured graphs."""
         return len(self._graphs)
 
     def evaluate(
@@ -120,9 +121,9 @@ class LossGraphs:
         *,
         image_scale: int = 0,
     ) -> SosResult:
-        """As `SosLoss.evaluate`, with the gradient.
+        """Evaluate the loss and its gradient, as `SosLoss.evaluate` does.
 
-        The image gradient keeps its values until the next evaluation; `style` must never change in place.
+        The image gradient is valid until the next evaluation. `style` must never be changed in place.
         """
         key = self._key(image, style, view, scales, image_scale)
         graph = self._graphs.get(key) if key else None
@@ -144,7 +145,7 @@ class LossGraphs:
         scales: Sequence[int],
         image_scale: int,
     ) -> _Key | None:
-        """The kind of an evaluation; None where it cannot be captured."""
+        """Return the key of an evaluation; None if it cannot be captured."""
         share = view.share
         if share is None or share.tiles.keys() != set(scales) or any(len(own) != 1 for own in share.tiles.values()):
             return None
@@ -158,10 +159,10 @@ class LossGraphs:
         return _Key(tuple(image.shape), image.dtype, image_scale, tiles, coverage, regions, id(style))
 
     def _captured(self, key: _Key, image: Tensor, style: Mapping[int, ScaleTarget], view: ViewTarget) -> _Graph | None:
-        """The graph of a kind of evaluations; None where it fails."""
+        """Return the graph for a key; None if capturing fails."""
         try:
             found = self._graphs[key] = self._capture(key, image, style, view)
-        except Exception as error:  # whatever it is, there is another way
+        except Exception as error:  # any failure falls back to eager mode
             self.problem = f"{type(error).__name__}: {error}"
             self._graphs.clear()
             self._static.clear()
@@ -176,17 +177,17 @@ class LossGraphs:
         dtype = torch.promote_types(loss.network.dtype, torch.float32)
         gradient = self._place("gradient", torch.empty(image.shape, dtype=dtype, device=device))
         graph = torch.cuda.CUDAGraph()
-        timer, loss.timer = loss.timer, Timer()  # a graph holds no events that time could be read from
+        timer, loss.timer = loss.timer, Timer()  # events inside a graph cannot be timed
         try:
-            # The outer block leaves the stream again even where the capture has failed. Other threads may go on with
-            # what no graph can hold.
+            # The outer block restores the current stream even if capturing fails. `thread_local` lets other threads
+            # keep calling functions that cannot be captured.
             with (
                 torch.cuda.stream(self._stream),
                 torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
                 found = loss.evaluate(own_image, style, own_view, scales, image_scale=key.image_scale)
                 assert found.image_gradient is not None
-                # Into memory that no other graph takes for its activations.
+                # Copy to memory that other graphs do not reuse for activations.
                 values.copy_(found.values)
                 gradient.copy_(found.image_gradient)
         finally:
@@ -194,7 +195,7 @@ class LossGraphs:
         return _Graph(graph, own_image, own_view, SosResult(found.scales, values, gradient, found.weights))
 
     def _places(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
-        """Where an image and what it is compared with are copied to."""
+        """Return the static tensors for an image and for the targets of its view."""
         content = {
             scale: {tile: self._place(("content", scale), view.content[scale][tile])}
             for scale, tile in key.tiles
@@ -209,7 +210,7 @@ class LossGraphs:
         return self._place("image", image), ViewTarget(None, content, coverage, Share({}, tiles), regions)
 
     def _place(self, name: object, like: Tensor) -> Tensor:
-        """A tensor that stays where it is. All graphs take the same one for the same purpose, shape and layout."""
+        """Return a tensor at a fixed address. Graphs share it for the same purpose, shape and layout."""
         key = (name, like.shape, like.stride(), like.dtype)
         if key not in self._static:
             self._static[key] = torch.empty_like(like, device=self.loss.network.device)
@@ -217,7 +218,7 @@ class LossGraphs:
 
 
 def _inputs(image: Tensor, view: ViewTarget, scales: Sequence[int]) -> list[Tensor]:
-    """Everything that changes from one evaluation of a kind to the next, in a fixed order."""
+    """Return all tensors that differ between evaluations with the same key, in a fixed order."""
     features = [part for scale in scales if scale in view.content for part in view.content[scale].values()]
     regions = [level for pyramid in view.regions or [] for level in pyramid]
     return [image, *features, *(view.coverage or []), *regions]

@@ -1,11 +1,11 @@
-"""Several style pictures as one style: a mixture, of which each picture is a share.
+"""Style mixtures: several weighted style images used as one style.
 
-What a mixture asks for are the moments of its features, taken over all pictures at once with each picture's share:
+The targets of a mixture are the moments of the features of all images together, each image weighted by its share:
 
     G = sum_i w_i G_i,  mu = sum_i w_i mu_i,  sigma^2 = sum_i w_i (sigma_i^2 + (mu_i - mu)^2),  sum_i w_i = 1
 
-The variance is a sum of terms that are not negative: nothing cancels, as it would in diag(G) - mu^2. One picture alone
-is itself, to the bit.
+The variance is a sum of non-negative terms, so nothing cancels, as it would in diag(G) - mu^2. The mixture of a single
+image is bit-identical to the image.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from sgsst_core.loss.terms import LayerTarget
 
 @dataclass(frozen=True)
 class StyleMixture:
-    """The pictures of a style, with their shares.
+    """Style images with their weights.
 
     Attributes:
-        pictures: [H_i, W_i, 3] in 0..1 each.
-        weights: shares, above 0; they add up to 1.
-        names: of the pictures, for people; empty where nobody gave any.
+        pictures: Images, [H_i, W_i, 3] in 0..1 each.
+        weights: Weights above 0 that add up to 1.
+        names: Display names of the images; empty if they have none.
     """
 
     pictures: tuple[Tensor, ...]
@@ -37,20 +37,20 @@ class StyleMixture:
 
     @staticmethod
     def of(style: Tensor | StyleMixture) -> StyleMixture:
-        """A picture [H, W, 3] as the mixture of itself alone; a mixture as it is."""
+        """Wrap a single image [H, W, 3] as a mixture; return a mixture unchanged."""
         return style if isinstance(style, StyleMixture) else StyleMixture((style,))
 
     @staticmethod
     def weighted(pictures: Sequence[Tensor], weights: Sequence[float], names: Sequence[str] = ()) -> StyleMixture:
-        """Pictures with weights of any sum.
+        """Create a mixture from weights that need not add up to 1.
 
         Raises:
-            SettingsError: no pictures, or weights that are no shares.
+            SettingsError: If there are no images, or a weight is not a finite number above 0.
         """
         return StyleMixture(tuple(pictures), normalized(weights), tuple(names))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> StyleMixture:
-        """Every picture changed; itself where none is."""
+        """Apply a function to every image. Return `self` if no image changes."""
         pictures = tuple(change(picture) for picture in self.pictures)
         if all(new is old for new, old in zip(pictures, self.pictures, strict=True)):
             return self
@@ -58,7 +58,7 @@ class StyleMixture:
 
     @property
     def text(self) -> str:
-        """Names, and shares where there are several, for people."""
+        """Display text: the names, with percentages if there are several images."""
         names = self.names or [f"picture {number}" for number in range(1, len(self.pictures) + 1)]
         if len(names) == 1:
             return names[0]
@@ -67,24 +67,24 @@ class StyleMixture:
 
 
 def normalized(weights: Sequence[float]) -> tuple[float, ...]:
-    """Weights of style pictures as shares that add up to 1; that of one picture alone is exactly 1.
+    """Normalize weights of style images so that they add up to 1. A single weight becomes exactly 1.
 
     Raises:
-        SettingsError: there are none, or one is not finite, or not above 0.
+        SettingsError: If there are no weights, or one is not a finite number above 0.
     """
     if not weights:
         raise SettingsError("There is no style picture. Give one.")
     for weight in weights:
         if not (math.isfinite(weight) and weight > 0):
             raise SettingsError(f"The weight {weight:g} of a style picture is no finite number above 0.")
-    largest = max(weights)  # so that the sum of finite weights is finite
+    largest = max(weights)  # dividing by it keeps the sum of finite weights finite
     shares = [weight / largest for weight in weights]
     total = math.fsum(shares)
     return tuple(share / total for share in shares)
 
 
 def mixed_target(targets: Sequence[LayerTarget], weights: Sequence[float]) -> LayerTarget:
-    """What a mixture asks of a layer, from what each picture asks, with weights that add up to anything above 0."""
+    """Combine the layer targets of several images into that of their mixture. Weights may have any positive sum."""
     if len(targets) == 1:
         return targets[0]
     total = math.fsum(weights)
@@ -101,7 +101,7 @@ def mixed_target(targets: Sequence[LayerTarget], weights: Sequence[float]) -> La
 
 
 def mixed_moments(moments: Sequence[tuple[Tensor, Tensor]], weights: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Mean [c] and covariance [c, c] of a mixture from those of its parts."""
+    """Compute mean [c] and covariance [c, c] of a mixture from those of its components."""
     if len(moments) == 1:
         return moments[0]
     mean = _sum([weight * own for (own, _), weight in zip(moments, weights, strict=True)])
@@ -115,9 +115,10 @@ def mixed_moments(moments: Sequence[tuple[Tensor, Tensor]], weights: Sequence[fl
 
 
 def shares_of(counts: Sequence[int], weights: Sequence[float], most: int) -> list[int]:
-    """How many of each picture's positions are taken: all where that is no more than `most`, else by the weights.
+    """Return how many positions to take from each image.
 
-    Each picture that has any gives one at least.
+    All are taken if they number at most `most`, otherwise a fraction by weight. At least one is taken from every image
+    that has any.
     """
     if sum(counts) <= most:
         return list(counts)

@@ -2,13 +2,13 @@
 
 E_nearest = w_n / n sum_p a_p (1 - max_k u_p . s_k)
 
-u_p: features of all layers of the third block at a position, one after another in one vector, of unit length; s_k: the
-same of the style; a_p: position weights, n: their sum. The gradient takes the nearest style vector k(p) as given:
+u_p: unit vector of the concatenated features of all layers of the third block at position p; s_k: the same for the
+style; a_p: position weights; n: their sum. The gradient treats the nearest style vector k(p) as constant:
 
 dE/dF_p = -(w_n / n) a_p (s_k(p) - cos_p u_p) / |F_p|
 
-A sum over positions: a partition tile needs no other tile, and ranks add up what they find. The search is a product of
-matrices, block by block. As in ARF, features are not centered.
+The term is a sum over positions, so partition tiles are independent and ranks add up their results. The search is a
+blocked matrix product. As in ARF, features are not centered.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from torch import Tensor
 
 from sgsst_core.features.partition import Rectangle
 
-#: Vectors of a style that are searched at most. There are more in styles of more than 360 x 360 pixels: then they are
-#: thinned, evenly. Neighboring ones see nearly the same pixels, and with more the search would take longer than the
-#: passes of the network.
+#: Maximum number of style vectors that are searched. Styles larger than 360 x 360 pixels have more and are subsampled
+#: evenly: neighboring vectors see nearly the same pixels, and a larger search would take longer than the passes of the
+#: network.
 MOST_VECTORS = 1 << 13
-#: Positions and style vectors that are compared at a time: their similarities stay in a processor's cache, or make a
-#: quarter of a gigabyte on a GPU.
+#: Positions and style vectors per block of the search. Their similarities fit in a CPU cache; on a GPU they take a
+#: quarter of a gigabyte.
 _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
-#: Bytes of what is kept of a position that was matched.
+#: Bytes stored per matched position.
 MATCH_BYTES = 8 + 4 + 4
-#: The golden ratio's fractional part: its multiples fill every interval evenly.
+#: Fractional part of the golden ratio; its multiples modulo 1 fill the unit interval evenly.
 _GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
 class StyleVectors:
-    """What positions of a view are matched with.
+    """Style vectors that positions of a view are matched with.
 
     Attributes:
-        units: [k, c], float32 at least, of unit length; 0 where the style's features are 0.
-        parts: layer to its channels among the c, in the order of the layers.
-        length: of the longest one before it was brought to unit length, scalar.
+        units: Unit vectors [k, c], float32 or float64; 0 where the style's features are 0.
+        parts: Slice of the c channels for each layer, in layer order.
+        length: Scalar, largest norm before normalization.
     """
 
     units: Tensor
@@ -50,7 +50,7 @@ class StyleVectors:
 
     @staticmethod
     def of(features: Mapping[str, Tensor]) -> StyleVectors:
-        """Of features [k, c_l] by layer, at the same k > 0 positions."""
+        """Create style vectors from features [k, c_l] by layer, all at the same k > 0 positions."""
         vectors = torch.cat([_at_least_float32(part) for part in features.values()], dim=1)
         lengths = vectors.norm(dim=1)
         units = vectors * torch.where(lengths > 0, lengths, torch.inf).reciprocal()[:, None]
@@ -62,10 +62,12 @@ class StyleVectors:
 
 
 def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
-    """At most so many of `count` places, evenly spread, int64 in rising order; all where there are no more.
+    """Return at most `most` of `count` indices, evenly spread, int64 in ascending order; all of them if there are no
+    more.
 
-    One of each part of equal length, at another place of every part: a style with a regular pattern, such as stripes,
-    is not met at the same phase again and again. A place may come twice.
+    The range is divided into `most` equal parts, and one index is taken from each, at an offset that varies. Otherwise
+    a style with a regular pattern, such as stripes, would be sampled at the same phase throughout. An index may appear
+    twice.
     """
     if count <= most:
         return torch.arange(count)
@@ -74,7 +76,11 @@ def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
 
 
 def places_in(places: Tensor, width: int, cells: Rectangle) -> tuple[Tensor, Tensor, Tensor]:
-    """Which of some places, counted row by row in a map of a width, lie in a rectangle: [k] bool; rows and columns."""
+    """Select the row-major positions in a feature map of the given width that lie inside a rectangle.
+
+    Returns:
+        Mask [k] bool of those inside, and their rows and columns relative to the rectangle.
+    """
     row, column = places // width, places % width
     inside = (row >= cells.top) & (row < cells.bottom) & (column >= cells.left) & (column < cells.right)
     return inside, row[inside] - cells.top, column[inside] - cells.left
@@ -82,12 +88,12 @@ def places_in(places: Tensor, width: int, cells: Rectangle) -> tuple[Tensor, Ten
 
 @dataclass(frozen=True)
 class Matches:
-    """Positions [h, w] of a view and the style vectors that they are nearest to.
+    """Positions [h, w] of a view and their nearest style vectors.
 
     Attributes:
-        nearest: int64, place among the style vectors: the first of those that are equally near.
-        cosine: of the angle between the two; 0 where a position's features are 0.
-        inverse: 1 / |F_p|; 0 where that is no more than the rounding of features, so that nothing is divided by it.
+        nearest: Index of the nearest style vector, int64; the first one if several are equally near.
+        cosine: Cosine of the angle between the two; 0 where the features of the position are 0.
+        inverse: 1 / |F_p|; 0 where |F_p| is within the rounding error of the features, which avoids dividing by it.
     """
 
     nearest: Tensor
@@ -98,11 +104,13 @@ class Matches:
     def of(
         features: Mapping[str, Tensor], style: StyleVectors, rounding: float, position_weights: Tensor | None = None
     ) -> Matches:
-        """Of features [h, w, c_l] by layer.
+        """Match features with the style.
 
         Args:
-            rounding: of the features, relative (`FeatureNetwork.rounding`).
-            position_weights: [h, w]; on a CPU nothing is searched for positions of weight 0.
+            features: Features [h, w, c_l] by layer.
+            style: Style vectors to search.
+            rounding: Relative rounding error of the features (`FeatureNetwork.rounding`).
+            position_weights: [h, w]; positions of weight 0 are not searched on a CPU. None for equal weights.
         """
         height, width = next(iter(features.values())).shape[:2]
         units = style.units
@@ -114,7 +122,7 @@ class Matches:
             part = slice(top, min(top + rows, height))
             block = torch.cat([_at_least_float32(features[layer][part]) for layer in style.parts], dim=2)
             lengths = block.norm(dim=2)
-            # Compared this way round, features that are not numbers keep a length that is none.
+            # NaN fails this comparison, so NaN features keep a NaN norm.
             inverse[part] = torch.where(lengths <= rounding * style.length, torch.inf, lengths).reciprocal()
             block *= inverse[part][:, :, None]
             if position_weights is not None and units.device.type == "cpu":
@@ -126,8 +134,8 @@ class Matches:
         return Matches(nearest, cosine, inverse)
 
     def distance(self, position_weights: Tensor | None = None) -> Tensor:
-        """Sum of a_p (1 - cos_p), float64 scalar."""
-        away = (1 - self.cosine.double()).clamp_min(0)  # rounding may take a cosine above 1
+        """Return the sum of a_p (1 - cos_p), float64 scalar."""
+        away = (1 - self.cosine.double()).clamp_min(0)  # rounding can push a cosine above 1
         return (away if position_weights is None else away * position_weights).sum()
 
     def add_gradient(
@@ -139,11 +147,15 @@ class Matches:
         factor: Tensor,
         position_weights: Tensor | None = None,
     ) -> None:
-        """Add factor times the gradient of `distance` with respect to a layer's features [h, w, c_l], in place.
+        """Add factor times the gradient of `distance` with respect to the features of a layer, in place.
 
         Args:
             gradient: [h, w, c_l].
-            factor: scalar.
+            features: Features that were matched, [h, w, c_l].
+            layer: Name of their layer.
+            style: Style vectors that were searched.
+            factor: Scalar.
+            position_weights: [h, w]; None for equal weights.
         """
         units = style.units[:, style.parts[layer]]
         rows = max(1, _BLOCK[units.device.type][0] // max(features.shape[1], 1))
@@ -158,9 +170,12 @@ class Matches:
 
 
 def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
-    """For unit vectors [p, c] the largest product with one of [k, c], and the first that has it: [p], [p] int64.
+    """Find the style vector [k, c] with the largest dot product for each unit vector [p, c].
 
-    Products are computed block by block: p x k of them never exist together.
+    Products are computed in blocks; the full p x k matrix never exists.
+
+    Returns:
+        Largest product [p], and the first index that attains it [p] int64.
     """
     rows, columns = _BLOCK[units.device.type]
     best = units.new_full((len(units),), -torch.inf)
@@ -176,22 +191,25 @@ def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def working_bytes(channels: int, value: int, device: str) -> int:
-    """Bytes that the search needs at a time beside features and style vectors of so many channels.
+    """Return the peak memory of the search in bytes, not counting features and style vectors.
 
     Args:
-        value: bytes of a value.
+        channels: Length of a style vector.
+        value: Bytes per value.
+        device: "cpu" or "cuda".
     """
     rows, columns = _BLOCK[device]
     return rows * (2 * columns + 3 * channels) * value
 
 
 def nearest_reference(features: Sequence[Tensor], style: Sequence[Tensor], weights: Tensor | None = None) -> Tensor:
-    """Mean distance to the nearest style vector by its definition, float64, in one step and differentiable.
+    """Compute the mean distance to the nearest style vector from its definition, in float64, unblocked and
+    differentiable.
 
     Args:
-        features: of each layer [h, w, c_l].
-        style: of each layer [h', w', c_l]; no vector of either may be 0.
-        weights: [h, w].
+        features: Features of each layer, [h, w, c_l].
+        style: Style features of each layer, [h', w', c_l]. No vector of either may be 0.
+        weights: [h, w]; None for equal weights.
     """
     own, other = (torch.cat([part.double() for part in parts], dim=2).flatten(0, 1) for parts in (features, style))
     cosine = (own / own.norm(dim=1, keepdim=True)) @ (other / other.norm(dim=1, keepdim=True)).T

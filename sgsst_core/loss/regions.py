@@ -1,10 +1,10 @@
-"""Regions of a scene, each with a style of its own, or kept as it is.
+"""Regions of a scene, each with its own style or frozen.
 
-Every Gaussian belongs to one region; those that no selection names are the rest. The loss of a view is the sum over its
-regions of the SOS loss with the region's style, where positions weigh as much as the region's Gaussians have of their
-blend weights: blending is linear in the colors, so that these weights are rendered, with 1 as the color of the
-region's Gaussians and 0 as that of all others. Statistics of one region hold nothing of another, but for what features
-see beyond its border.
+Every Gaussian belongs to one region; those without a selection form the rest. The loss of a view is the sum of the SOS
+losses of its regions, each with its own style. Within a region, a position weighs as much as the region's fraction of
+the blend weights there. Blending is linear in the colors, so this fraction is a rendering with color 1 for the region's
+Gaussians and 0 for all others. The statistics of a region contain nothing of another, except where receptive fields
+reach across the border.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from sgsst_core.scene.split import Refinement, parents_of
 
 @dataclass(frozen=True)
 class Region:
-    """One region, as it was asked for.
+    """Single region as requested by the user.
 
     Attributes:
-        name: for people.
-        select: which Gaussians it was to have, in words; empty for the rest.
-        style: None for the job's own.
-        weight: of its style in the loss, above 0.
-        freeze: Whether its Gaussians keep their colors.
-        selected: Gaussians that its own selection names, of which later regions may have taken some.
+        name: Display name.
+        select: Selection as text; empty for the rest.
+        style: Style of the region; None for the style of the job.
+        weight: Weight of its style in the loss, above 0.
+        keep: Whether its Gaussians are frozen.
+        selected: Number of Gaussians in its own selection, some of which later regions may have taken.
     """
 
     name: str
@@ -42,13 +42,13 @@ class Region:
 
 @dataclass(frozen=True)
 class Regions:
-    """The regions of a scene.
+    """All regions of a scene.
 
     Attributes:
-        every: the rest, then the others in the order in which they were given.
-        labels: [N] uint8, the place among them of the region that a Gaussian belongs to.
-        active: places of those that have a loss of their own; known from `resolved` on.
-        frozen_in_view: a view sees Gaussians that are kept; likewise.
+        every: The rest, followed by the other regions in the order given.
+        labels: [N] uint8, index in `every` of each Gaussian's region.
+        active: Indices of regions with a loss of their own; set by `resolved`.
+        kept_in_view: Whether some view sees frozen Gaussians; set by `resolved`.
     """
 
     every: tuple[Region, ...]
@@ -57,34 +57,37 @@ class Regions:
     frozen_in_view: bool = False
 
     @property
-    def frozen(self) -> Tensor:
-        """Mask [N] bool of the Gaussians whose colors must not change."""
-        by_region = torch.tensor([region.freeze for region in self.every])
-        return by_region[self.labels.long()]
+    def kept(self) -> Tensor:
+        """Mask [N] bool of frozen Gaussians."""
+        keeps = torch.tensor([region.keep for region in self.every])
+        return keeps[self.labels.long()]
 
     @property
     def mapped(self) -> bool:
-        """Whether views need a map of each active region; one region that is everything is an ordinary job."""
-        return len(self.active) > 1 or self.frozen_in_view or self.every[self.active[0]].weight != 1
+        """Whether views need a weight map per active region.
+
+        A single region that covers everything is an ordinary job.
+        """
+        return len(self.active) > 1 or self.kept_in_view or self.every[self.active[0]].weight != 1
 
     def members(self, place: int) -> Tensor:
-        """[N] bool, Gaussians of the region at a place."""
+        """Return the mask [N] bool of the Gaussians in the region at an index."""
         return self.labels == place
 
     def refined(self, refinement: Refinement | None) -> Regions:
-        """Of the scene as it was refined: the parts of a Gaussian are in its region."""
+        """Return the regions after refinement: the parts of a split Gaussian stay in its region."""
         if refinement is None:
             return self
         return replace(self, labels=self.labels[parents_of(refinement.pieces)])
 
     def resolved(self, weights: Tensor) -> Regions:
-        """With the Gaussians of regions that no view sees added to the rest, but for those that are kept.
+        """Move the Gaussians of unseen regions to the rest, unless they are frozen.
 
         Args:
             weights: [N] float64, total blend weights.
 
         Raises:
-            SettingsError: every Gaussian that a view sees is frozen.
+            SettingsError: If every Gaussian that a view sees is frozen.
         """
         labels = self.labels.clone()
         for place, region in enumerate(self.every):
@@ -102,13 +105,14 @@ class Regions:
 
 
 def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:
-    """Prove that there is something to stylize, as far as that is known without a look at the views.
+    """Check that there is something to stylize, as far as this is known without looking at the views.
 
     Args:
-        sh_attenuation: by which spherical harmonics fade.
+        regions: Regions of the scene.
+        sh_attenuation: SH attenuation, 0 to 1.
 
     Raises:
-        SettingsError: every Gaussian is frozen, or some are and all are to fade.
+        SettingsError: If every Gaussian is frozen, or some are frozen while SH attenuation would change all of them.
     """
     if sh_attenuation and bool(regions.frozen.any()):
         raise SettingsError(

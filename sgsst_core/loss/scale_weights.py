@@ -1,7 +1,6 @@
-"""Which scales of the pyramid count, and how much: E = sum_s w_s E_transfer(s) / sum_s w_s over the scales of a view.
+"""Weights of the pyramid's scales: E = sum_s w_s E_transfer(s) / sum_s w_s over the scales of a view.
 
-With equal weights of all scales, as always if nothing else was asked for, this is the paper's mean. A scale of weight 0
-is not computed at all.
+By default all weights are equal, which is the paper's mean. A scale of weight 0 is not computed at all.
 """
 
 from __future__ import annotations
@@ -16,29 +15,30 @@ from sgsst_core.scene.pyramid import scale_count
 
 @dataclass(frozen=True)
 class ScaleWeights:
-    """Weights of a pyramid's scales.
+    """Weights of the scales of a pyramid.
 
     Attributes:
-        values: from full size on, finite and not negative; scales beyond them have none. Empty: all count alike.
+        values: Weights from full size downwards, finite and non-negative; further scales have weight 0. Empty for equal
+            weights.
     """
 
     values: tuple[float, ...] = ()
 
     def of(self, scale: int) -> float:
-        """The weight of a scale, 0 being full size."""
+        """Return the weight of a scale; scale 0 is full size."""
         if not self.values:
             return 1.0
         return self.values[scale] if scale < len(self.values) else 0.0
 
     def chosen(self, count: int) -> list[int]:
-        """The scales that count of a view that has so many, the finest first."""
+        """Return the scales with a positive weight among the first `count`, finest first."""
         return [scale for scale in range(count) if self.of(scale) > 0]
 
     def shares(self, scales: Iterable[int]) -> dict[int, float]:
-        """What each of some scales counts of their loss; the shares add up to 1.
+        """Return the weights of some scales, normalized to add up to 1.
 
         Raises:
-            ValueError: none of them has a weight.
+            ValueError: If none of them has a positive weight.
         """
         weights = {scale: self.of(scale) for scale in scales}
         total = sum(weights.values())
@@ -47,25 +47,25 @@ class ScaleWeights:
         return {scale: weight / total for scale, weight in weights.items()}
 
     def mean(self, losses: Mapping[int, float]) -> float:
-        """E from the losses of scales. Only those that have a weight may be among them."""
+        """Return E, the weighted mean of losses by scale. Only scales with a positive weight may be passed."""
         total = sum(self.of(scale) for scale in losses)
         return sum(self.of(scale) * loss for scale, loss in losses.items()) / total
 
 
-#: All scales count alike: the paper's loss.
+#: Equal weights, as in the paper's loss.
 EVEN = ScaleWeights()
 
 
 def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: int) -> None:
-    """Prove that the views have the scales that were asked for, and each view one of them.
+    """Check that the views have all requested scales, and that every view has at least one of them.
 
     Args:
-        weights: see `ScaleWeights`; at least one is positive.
-        cameras: at the sizes that they are stylized at.
-        coarsest: pixels of the coarsest scale's shorter side at most.
+        weights: Weights from full size downwards, at least one of them positive.
+        cameras: Cameras at the sizes used for stylization.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
 
     Raises:
-        SettingsError: otherwise.
+        SettingsError: If a requested scale does not exist, or a view has none of them.
     """
     asked = ScaleWeights(tuple(weights))
     if not asked.values:

@@ -1,8 +1,9 @@
-"""The SOS loss of one view, E = (1/n_s) sum_s E_transfer(scale s), and its gradient with respect to the pixels.
+"""SOS loss of one view, E = (1/n_s) sum_s E_transfer(scale s), and its gradient with respect to the pixels.
 
-Each scale goes through the network in partition tiles, in two passes: statistics of the whole scale first, then
-back-propagation of the loss that they give. Activations of the first pass are kept as far as the memory budget
-reaches; only tiles beyond it are computed twice. Of several ranks, each has its share of the tiles (`division`).
+Each scale goes through the network in partition tiles, in two passes: the first collects statistics of the whole scale,
+the second back-propagates the loss computed from them. Activations of the first pass are cached as far as the memory
+budget allows; only the remaining tiles are computed twice. With several ranks, each processes its own tiles
+(`division`).
 """
 
 from __future__ import annotations
@@ -54,18 +55,18 @@ from sgsst_core.scene.pyramid import (
 from sgsst_core.settings import StyleLossName
 from sgsst_core.timing import Timer
 
-#: Bytes for activations where the caller names no budget: leaves most of a laptop to others.
+#: Default memory budget for activations in bytes; leaves most of a laptop's memory free.
 DEFAULT_MEMORY = 4 << 30
 
 
 @dataclass(frozen=True)
 class ScaleTarget:
-    """What the style asks of a scale.
+    """Style target of one scale.
 
     Attributes:
-        layers: layer to its statistics, for those that are compared and have a cell at this scale.
-        vectors: that positions are matched with; None where nothing is matched.
-        regions: in place of both, what each region of the scene is compared with; empty where it has none.
+        layers: Statistics by layer, for layers that are compared and have at least one cell at this scale.
+        vectors: Vectors that positions are matched with; None if nothing is matched.
+        regions: Targets of the scene's regions, which replace both of the above; empty if the scene has no regions.
     """
 
     layers: Mapping[str, LayerTarget]
@@ -75,7 +76,7 @@ class ScaleTarget:
 
 @dataclass(frozen=True)
 class RegionTarget:
-    """What one region's style asks of a scale, and how much that counts."""
+    """Style target of one region at one scale, and the weight of its loss."""
 
     style: ScaleTarget
     weight: float = 1.0
@@ -83,14 +84,14 @@ class RegionTarget:
 
 @dataclass(frozen=True)
 class SosResult:
-    """What one evaluation gives.
+    """Result of one evaluation.
 
     Attributes:
-        scales: that were evaluated.
-        values: [scales, 5] float64, each scale's loss split into `TERMS`, still on the device.
-        image_gradient: dE/dimage [H, W, 3], of which every rank has a part: they add up to the whole. None if only the
-            loss was asked for.
-        weights: of the scales in the loss.
+        scales: Evaluated scales.
+        values: [scales, 5] float64, the loss of each scale split into `TERMS`, still on the device.
+        image_gradient: This rank's summand of dE/dimage, [H, W, 3]; the sum over all ranks is the gradient. None if
+            only the loss was requested.
+        weights: Weights of the scales in the loss.
     """
 
     scales: tuple[int, ...]
@@ -100,52 +101,52 @@ class SosResult:
 
     @property
     def terms(self) -> dict[int, LossTerms]:
-        """The split loss of each scale. Waits for the device."""
+        """Loss of each scale, split into terms. Synchronizes with the device."""
         return self.terms_from(self.values.flatten().tolist())
 
     def terms_from(self, values: Sequence[float]) -> dict[int, LossTerms]:
-        """The split loss of each scale, from `values` as they were read, row by row."""
+        """Return the loss of each scale, split into terms, from `values` flattened row by row."""
         count = len(TERMS)
         return {s: LossTerms.of(values[place * count :][:count]) for place, s in enumerate(self.scales)}
 
     @property
     def loss(self) -> float:
-        """E, the weighted mean over the scales that were evaluated. Waits for the device."""
+        """E, the weighted mean over the evaluated scales. Synchronizes with the device."""
         return self.weights.mean({scale: part.total for scale, part in self.terms.items()})
 
 
 @dataclass(frozen=True)
 class Share:
-    """How some scales of a view are shared out.
+    """Distribution of some scales of a view over the ranks.
 
     Attributes:
-        pieces: scale to every rank's pieces of it; the same on every rank.
-        tiles: scale to the partition tiles of this rank.
+        pieces: Pieces of every rank by scale; identical on all ranks.
+        tiles: Partition tiles of this rank by scale.
     """
 
     pieces: dict[int, tuple[tuple[Piece, ...], ...]]
     tiles: dict[int, list[PartitionTile]]
 
     def cost(self, rank: int, halo: int) -> int:
-        """Pixels through the network on a rank."""
+        """Return the number of pixels that a rank passes through the network."""
         return sum(piece.cost(halo) for every in self.pieces.values() for piece in every[rank])
 
 
-#: Content features [h, w, 512] of the cells that each of this rank's partition tiles owns.
+#: Content features [h, w, 512] of the cells owned by each partition tile of this rank.
 ContentFeatures = dict[PartitionTile, Tensor]
 
 
 @dataclass
 class ViewTarget:
-    """What a view is compared with, apart from the style.
+    """Targets of a view, apart from the style.
 
     Attributes:
-        content: scale to content features, as far as they are kept.
-        content_image: [H, W, 3], from which they can be computed again.
-        coverage: position weights at powers of two, [H >> k, W >> k] each; None for equal weights.
-        share: for which the content was prepared; None for one rank, whose share is always everything.
-        regions: position weights of each region, as `coverage`: its Gaussians' share of the blend weights. In the order
-            of `ScaleTarget.regions`; None where the scene has none.
+        content_image: Content image [H, W, 3], for recomputing features that are not cached.
+        content: Cached content features by scale.
+        coverage: Position weights [H >> k, W >> k] for each power of two; None for equal weights.
+        share: Distribution for which the content was prepared; None for a single rank, which has everything.
+        regions: Position weights of each region, in the format of `coverage` and the order of `ScaleTarget.regions`:
+            the region's fraction of the blend weights. None if the scene has no regions.
     """
 
     content_image: Tensor | None = None
@@ -157,12 +158,12 @@ class ViewTarget:
 
 @dataclass(frozen=True)
 class _Part:
-    """A share of a scale's positions, and what they are compared with.
+    """Weighted set of positions of a scale, and the style they are compared with.
 
     Attributes:
-        weights: of the positions, at powers of two; None for equal ones.
-        style: what they are compared with; None where only their statistics are wanted.
-        factor: of the loss.
+        weights: Position weights for each power of two; None for equal weights.
+        style: Target; None if only statistics are needed.
+        factor: Factor of the loss.
     """
 
     weights: Sequence[Tensor] | None
@@ -171,7 +172,7 @@ class _Part:
 
     @staticmethod
     def of(view: ViewTarget, style: ScaleTarget) -> list[_Part]:
-        """All of a view's positions, or those of each region."""
+        """Return one part for all positions of a view, or one per region."""
         if not style.regions:
             return [_Part(view.coverage, style)]
         if view.regions is None or len(view.regions) != len(style.regions):
@@ -181,24 +182,26 @@ class _Part:
 
 
 class SosLoss:
-    """Evaluates the SOS loss of views against one style.
+    """SOS loss of views against one style.
 
     Args:
-        network: the feature network; it must report the style layers, and the content layer if it is used. Statistics
-            are compared of those style layers, and of `PIXELS`, that it reports.
-        content_weight: lambda_c; 0 leaves the content branch out.
-        style_loss: what is compared with the style; see `style_losses`.
-        memory: bytes that activations may take.
-        tile_size: side of partition tiles, multiple of 16; None lets the memory budget decide.
-        coarsest: pixels of the coarsest scale's shorter side at most.
-        scales: weights of the pyramid's scales; what has none is not computed.
-        leave_out: pixels without weight do not go through the network; False for comparison.
-        keep_activations: as many as fit between the two passes; False computes each tile twice, for comparison.
-        timer: receives the seconds of `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
-        collectives: of the ranks that evaluate each view together; all call the same methods with the same arguments.
+        network: Feature network. It must report the style layers, and the content layer if that is used. Statistics are
+            compared on the style layers, and on `PIXELS`, as far as it reports them.
+        content_weight: lambda_c; 0 disables the content branch.
+        style_loss: Kind of comparison with the style; see `style_losses`.
+        memory: Memory budget for activations in bytes.
+        tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
+        style_scale: Magnification of the style image relative to its default size.
+        scales: Weights of the pyramid's scales; those of weight 0 are not computed.
+        leave_out: Whether pixels without weight skip the network; False for comparison.
+        keep_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
+            twice, for comparison.
+        timer: Timer for `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
+        collectives: Ranks that evaluate each view together; all must call the same methods with the same arguments.
 
     Attributes:
-        speeds: of these ranks, in any unit: work is shared out in proportion.
+        speeds: Relative speeds of these ranks; work is divided in proportion.
     """
 
     def __init__(
@@ -237,15 +240,15 @@ class SosLoss:
         self.nearest_weight = nearest_weight(style_loss, network.unit)
 
     def scale_count(self, height: int, width: int) -> int:
-        """n_s of views of a size."""
+        """Return n_s for views of a size."""
         return self.tiling.scale_count((height, width))
 
     def scales(self, height: int, width: int) -> list[int]:
-        """The scales that count of views of a size, the finest first."""
+        """Return the scales with a positive weight for views of a size, finest first."""
         return self.tiling.scales((height, width))
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
-        """The partition of a scaled view; what has no weight (coverage [h, w] of 0) belongs to no tile."""
+        """Return the partition of a scaled view. Pixels of coverage [h, w] 0 may belong to no tile."""
         return self._partition(self._piece(0, (height, width), coverage), coverage)
 
     def share(
@@ -254,13 +257,14 @@ class SosLoss:
         coverage: Sequence[Tensor] | None = None,
         region: Rectangle | None = None,
     ) -> Share:
-        """Share out the work on some scales of a view.
+        """Divide the work on some scales of a view among the ranks.
 
         Args:
             sizes: (height, width) of each scale.
-            coverage: from `position_weights`.
-            region: of the full-size view, that holds every covered pixel. Where it is given, the coverage is not looked
-                at, for which a device would have to be waited for: regions of coarser scales may be some cells larger.
+            coverage: Result of `position_weights`; None for equal weights.
+            region: Rectangle of the full-size view that contains every covered pixel. If given, the coverage is not
+                read, which avoids synchronizing with the device; regions of coarser scales may then be a few cells
+                larger.
         """
         look = coverage if region is None else None
         weights = {scale: look[scale] if look else None for scale in sizes}
@@ -279,26 +283,30 @@ class SosLoss:
         )
 
     def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
-        """All of a scale that has to go through the network."""
+        """Return everything that has to go through the network at one scale."""
         if coverage is None or not self.leave_out:
             return Piece(scale, size, Rectangle(0, 0, *size))
         return Piece(scale, size, covered_region(coverage))
 
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
-        """The partition tiles of a piece, as large as the memory allows."""
+        """Return the partition tiles of a piece, as large as the memory budget allows."""
         tiles = self.tiling.tiles(piece.size, piece.region)
         if coverage is None or not self.leave_out:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
     def style_targets(self, style: Tensor | StyleMixture, view_size: Size) -> dict[int, ScaleTarget]:
-        """Targets of every scale that counts, for views of view_size (height, width), from pictures [H, W, 3] in 0..1.
+        """Compute the style targets of all scales with a positive weight.
 
-        A layer that has no cell at a scale of a very small style is missing there and is left out of the loss; of
-        several pictures, those that have cells stand for all.
+        If a very small style image has no cell of a layer at some scale, the layer is left out there. In a mixture, the
+        images that do have cells represent all.
+
+        Args:
+            style: Image [H, W, 3] in 0..1, or a mixture of images.
+            view_size: (height, width) of the views.
 
         Raises:
-            ImageError: features are to be matched, and the style is too small to have any.
+            ImageError: If features are to be matched and the style is too small to have any.
         """
         mixture = StyleMixture.of(style)
         pyramids = [self._style_pyramid(picture, view_size) for picture in mixture.pictures]
@@ -308,7 +316,7 @@ class SosLoss:
             for scale in pyramids[0]
         }
         if self.nearest_layers and all(found is None for found in vectors.values()):
-            height, width = _size(pyramids[0][min(pyramids[0])])  # of the scales that count
+            height, width = _size(pyramids[0][min(pyramids[0])])  # from the scales with a positive weight
             raise ImageError(
                 f"The style is used at {width} x {height} pixels, too few to match features with. "
                 "Give a larger picture, or larger views, or leave --style-loss at sos."
@@ -316,7 +324,7 @@ class SosLoss:
         return {scale: ScaleTarget(layers.get(scale, {}), found) for scale, found in vectors.items()}
 
     def _style_pyramid(self, picture: Tensor, view_size: Size) -> dict[int, Tensor]:
-        """A picture of the style at every scale of views of a size, on the network's device."""
+        """Return a style image at every scale of views of a size, on the network's device."""
         size = style_size(_size(picture), view_size, self.style_scale)
         image = resize_area(picture, size).to(self.network.device)
         return {scale: downscale(image, scale) for scale in self.scales(*view_size)}
@@ -324,7 +332,7 @@ class SosLoss:
     def _mixed_layers(
         self, pyramids: Sequence[Mapping[int, Tensor]], weights: Sequence[float]
     ) -> dict[int, dict[str, LayerTarget]]:
-        """What pictures with their weights ask of each layer at each scale."""
+        """Compute the layer targets of a mixture at each scale."""
         every = [self._style_statistics(pyramid) for pyramid in pyramids]
         mixed: dict[int, dict[str, LayerTarget]] = {}
         for scale in pyramids[0]:
@@ -337,7 +345,7 @@ class SosLoss:
         return mixed
 
     def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
-        """Statistics of a style image [h, w, 3] at some scales, shared out over the ranks."""
+        """Compute the layer targets of a style image [h, w, 3] given at some scales; ranks share the work."""
         share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
         for scales in rounds(list(scaled), self.collectives.size):
@@ -350,10 +358,13 @@ class SosLoss:
         return targets
 
     def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
-        """Vectors of pictures [h, w, 3] with weights at one scale; None where nothing is matched, or there is none.
+        """Compute the style vectors of weighted images [h, w, 3] at one scale.
 
-        They are those of all pictures together. Where that is too many, each has its share by weight. They are too many
-        to be sent: every rank computes them all.
+        The vectors of all images are pooled; if there are too many, each image contributes in proportion to its weight.
+        They are too large to send, so every rank computes all of them.
+
+        Returns:
+            Style vectors; None if nothing is matched or the images are too small to have any.
         """
         if not self.nearest_layers:
             return None
@@ -372,7 +383,7 @@ class SosLoss:
         )
 
     def _vectors_of(self, image: Tensor, places: Tensor) -> dict[str, Tensor]:
-        """Features [k, c] of a picture [h, w, 3] at some places of the layers that are matched, on the CPU."""
+        """Return the features [k, c] of an image [h, w, 3] at some positions of the matched layers, on the CPU."""
         size = _size(image)
         width = size[1] // layer_stride(self.nearest_layers[0])
         vectors = {
@@ -388,7 +399,13 @@ class SosLoss:
         return vectors
 
     def view_target(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
-        """Prepare a view: content image [H, W, 3] in 0..1 and coverage [H, W] in 0..1 (None: equal weights)."""
+        """Prepare the targets of a view.
+
+        Args:
+            content: Content image [H, W, 3] in 0..1.
+            coverage: [H, W] in 0..1; None for equal weights.
+            keep_content: Whether to compute the content features now and cache them.
+        """
         weights = None if coverage is None else self.position_weights(coverage)
         share = self.share(self._sizes(_size(content)), weights)
         target = ViewTarget(content_image=content, coverage=weights, share=share)
@@ -400,28 +417,35 @@ class SosLoss:
         return target
 
     def _sizes(self, size: Size, scales: Sequence[int] | None = None, image_scale: int = 0) -> dict[int, Size]:
-        """(height, width) of scales of a view, whose size is given at one of them; None for all that count."""
+        """Return (height, width) of some scales of a view, given its size at `image_scale`.
+
+        `scales` is None for all scales with a positive weight.
+        """
         scales = self.scales(*size) if scales is None else scales
         return {scale: (size[0] >> scale - image_scale, size[1] >> scale - image_scale) for scale in scales}
 
     def position_weights(self, coverage: Tensor) -> list[Tensor]:
-        """Coverage [H, W] in 0..1 at every power of two that a layer of a scale needs."""
+        """Downscale coverage [H, W] in 0..1 by every power of two that a layer needs at some scale."""
         coarsest = self.scales(coverage.shape[0], coverage.shape[1])[-1]
         levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
         return coverage_pyramid(coverage.to(self.network.device, _gradient_dtype(self.network)), levels)
 
     def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
-        """Features of the content layer on the cells that some tiles own, of a content image [H, W, 3] at a scale."""
+        """Compute the content layer on the cells owned by some tiles, for a content image [H, W, 3] at a scale."""
         image = downscale(content.to(self.network.device), scale)
         result = {}
         for tile in tiles:
             own = tile.owned_cells(CONTENT_LAYER, _size(image))[1]
-            # A copy: a slice would keep the features of the halo in memory too.
+            # Copy: a slice would keep the features of the halo alive too.
             result[tile] = self._forward(image, tile, keep=False).features[CONTENT_LAYER][own.slices].clone()
         return result
 
     def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
-        """What `content_features` of a scale takes on the rank that holds most, from every rank's pieces of it."""
+        """Return the size in bytes of `content_features` of a scale, on the rank that holds most.
+
+        Args:
+            pieces: Pieces of the scale for every rank.
+        """
         value = torch.finfo(self.network.dtype).bits // 8 * self.network.channels(CONTENT_LAYER)
         cells = [sum(part.cells(CONTENT_LAYER) for part in own) for own in pieces]
         return max(cells) * value
@@ -436,16 +460,16 @@ class SosLoss:
         gradient: bool = True,
         image_scale: int = 0,
     ) -> SosResult:
-        """Loss of an image [H, W, 3] (0..1, not clamped), and dE/dimage.
+        """Compute the loss of an image [H, W, 3] (0..1, not clamped) and dE/dimage.
 
         Args:
-            image: of the view at its scale `image_scale`.
-            style: targets by scale, from `style_targets`.
-            view: from `view_target`.
-            scales: which scales, all with a weight and none of them finer than the image; None for all that count
-                (SOS), of a full-size image. Phase 1 passes the coarsest alone.
-            gradient: False evaluates the loss only.
-            image_scale: 0 for full size.
+            image: Image of the view at scale `image_scale`.
+            style: Targets by scale, from `style_targets`.
+            view: Targets from `view_target`.
+            scales: Scales to evaluate, each with a positive weight and none finer than the image; phase 1 passes only
+                the coarsest. None for the full SOS loss of a full-size image.
+            gradient: Whether to compute the gradient.
+            image_scale: Scale of the image; 0 is full size.
         """
         sizes = self._sizes(_size(image), scales, image_scale)
         share, weights = self._share_of(view, sizes), self.weights.shares(sizes)
@@ -473,7 +497,7 @@ class SosLoss:
         share: Share,
         gradient: bool,
     ) -> Iterator[tuple[_ScalePass, Tensor | None]]:
-        """Loss (in the pass) and pixel gradient [h, w, 3] of some scales, whose statistics travel together."""
+        """Yield the pass of each scale with its pixel gradient [h, w, 3]; statistics are exchanged together."""
         passes = [
             _ScalePass(
                 self,
@@ -501,13 +525,13 @@ class SosLoss:
             return merged()
 
     def _compare(self, pass_: _ScalePass, part: _Part, statistics: Mapping[str, LayerStatistics]) -> None:
-        """Style loss of a part of a scale, added to its terms, and gradient maps; statistics are of the whole scale."""
+        """Add the style loss of one part, and its gradient maps, to the pass. Statistics cover the whole scale."""
         style = part.style.layers if part.style else {}
         for layer, found in statistics.items():
             if layer in style:
                 rounding, weights = self.network.rounding_of(layer), term_weights(layer, self.network.pixel_weight)
                 layer_terms, gradient = style_loss(found, style[layer], feature_eps=rounding, weights=weights)
-                if layer == PIXELS and gradient.matrix.dtype == torch.float64:  # kernels have done so
+                if layer == PIXELS and gradient.matrix.dtype == torch.float64:  # the GPU kernels already do this
                     gradient = gradient.about_rounded_mean()
                 if part.factor != 1:
                     layer_terms, gradient = part.factor * layer_terms, gradient.times(part.factor)
@@ -515,7 +539,10 @@ class SosLoss:
                 pass_.maps.setdefault(layer, []).append((gradient, part))
 
     def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:
-        """Pixel gradient [h, w, 3] of each scale: first of what was kept, which makes room for what was not."""
+        """Return the pixel gradient [h, w, 3] of each scale.
+
+        Tiles with cached activations go first, which frees memory for those that have to be recomputed.
+        """
         dtype = _gradient_dtype(self.network)
         results = [torch.zeros(pass_.image.shape, dtype=dtype, device=pass_.image.device) for pass_ in passes]
         again = [[tile for tile in pass_.tiles if tile not in own] for pass_, own in zip(passes, kept, strict=True)]
@@ -544,7 +571,11 @@ class SosLoss:
     def _first_passes(
         self, passes: Sequence[_ScalePass], *, keep: bool
     ) -> tuple[list[Merged], list[dict[PartitionTile, Activations]]]:
-        """For each scale, the merge of its statistics and terms under way, and the activations that fit."""
+        """Run the first pass of some scales.
+
+        Returns:
+            For each scale, the pending merge of its statistics and terms, and the cached activations.
+        """
         merged: list[Merged] = []
         kept: list[dict[PartitionTile, Activations]] = []
         fits = iter(self.tiling.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
@@ -566,7 +597,7 @@ class SosLoss:
         return merged, kept
 
     def _no_statistics(self, device: torch.device) -> list[LayerStatistics]:
-        """Of a scale of which no tile is this rank's."""
+        """Return empty statistics, for a scale of which this rank has no tile."""
         return [LayerStatistics.zero(self.network.channels(layer), device) for layer in self.style_layers]
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
@@ -575,9 +606,9 @@ class SosLoss:
 
 
 class _ScalePass:
-    """What the tiles of one scale share: pixels, position weights, content; loss and gradient maps once known.
+    """State shared by the tiles of one scale: pixels, weights, content, and later the loss and its gradient maps.
 
-    Each of its parts is compared with a style of its own; content belongs to all positions.
+    Each part is compared with its own style; the content term covers all positions.
     """
 
     def __init__(
@@ -604,18 +635,18 @@ class _ScalePass:
         if content is not None:
             count = self._all_positions(CONTENT_LAYER, view.coverage)
             self._content_factor = content_factor(count, loss.network.channels(CONTENT_LAYER), loss.content_weight)
-        #: Of each part with features to be matched: the vectors, the factor of its distances, and the part.
+        #: For each part with matched features: style vectors, factor of its distances, and the part.
         self._matched: list[tuple[StyleVectors, Tensor, _Part]] = []
         for part in parts if loss.nearest_layers else ():
             if part.style is not None and part.style.vectors is not None:
-                self._nearest_layer = loss.nearest_layers[0]  # the others' cells are the same
+                self._nearest_layer = loss.nearest_layers[0]  # all matched layers have the same cells
                 count = self._all_positions(self._nearest_layer, part.weights)
                 factor = part.factor * loss.nearest_weight / torch.where(count > 0, count, torch.inf)
                 self._matched.append((part.style.vectors, factor, part))
                 self._rounding = loss.network.rounding
 
     def _all_positions(self, layer: str, pyramid: Sequence[Tensor] | None) -> Tensor:
-        """How many cells of a layer the whole scale has, or the sum of their weights: float64 scalar."""
+        """Return the number of cells of a layer in the whole scale, or the sum of their weights, float64 scalar."""
         stride = layer_stride(layer)
         cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
         weights = self._weights(layer, cells, pyramid)
@@ -624,17 +655,20 @@ class _ScalePass:
         return torch.full((), cells.pixels, dtype=torch.float64, device=self.image.device)
 
     def _weights(self, layer: str, cells: Rectangle, pyramid: Sequence[Tensor] | None) -> Tensor | None:
-        """Weights [h, w] of some cells of a layer, box-averaged to the cells; None for equal weights."""
+        """Return the weights [h, w] of some cells of a layer, as box averages; None for equal weights."""
         if pyramid is None:
             return None
         return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
 
     def _is_nowhere(self, weights: Tensor | None) -> bool:
-        """Whether a region is known to have no share of some cells; a GPU is not waited for to be asked."""
+        """Return whether a region is known to have no weight in some cells.
+
+        Weights on a GPU count as unknown, because reading them would synchronize with the device.
+        """
         return len(self.parts) > 1 and weights is not None and not weights.is_cuda and not bool(weights.any())
 
     def statistics(self, layers: Sequence[str], tile: PartitionTile, activations: Activations) -> list[LayerStatistics]:
-        """Of the cells that a tile owns: for each part those of all layers."""
+        """Return the statistics of the cells that a tile owns, ordered by part and then by layer."""
         found = []
         for part in self.parts:
             for layer in layers:
@@ -649,7 +683,10 @@ class _ScalePass:
         return found
 
     def tile_terms(self, tile: PartitionTile, activations: Activations) -> Tensor:
-        """The tile's share [5] of the terms that are sums over positions; the others follow from the whole scale."""
+        """Return the tile's contribution [5] to terms that are sums over positions.
+
+        Other terms need the whole scale.
+        """
         content = self._content_difference(tile, activations.features.get(CONTENT_LAYER))
         nothing = torch.zeros_like(self.terms)
         sums = [None if content is None else content.loss(), self._match(tile, activations)]
@@ -658,9 +695,12 @@ class _ScalePass:
         return torch.cat([nothing[2:], *(nothing[:1] if found is None else found[None] for found in sums)])
 
     def _match(self, tile: PartitionTile, activations: Activations) -> Tensor | None:
-        """Match the cells that a tile owns; their share of the nearest-neighbor term, None where nothing is matched.
+        """Match the cells that a tile owns, and return their contribution to the nearest-neighbor term.
 
-        What was found is kept for the second pass: a few bytes a cell, and the search takes long.
+        The matches are stored for the second pass: they take a few bytes per cell, while the search is slow.
+
+        Returns:
+            Float64 scalar; None if nothing is matched.
         """
         if not self._matched:
             return None
@@ -677,7 +717,7 @@ class _ScalePass:
         return reduce(operator.add, sums)
 
     def _content_difference(self, tile: PartitionTile, features: Tensor | None) -> ContentDifference | None:
-        """On owned cells; features are those of all the tile's cells. None where content does not count."""
+        """Return the difference on owned cells, given features of the whole tile; None without a content term."""
         if self._content is None or features is None:
             return None
         view, own = tile.owned_cells(CONTENT_LAYER, self.size)
@@ -689,7 +729,7 @@ class _ScalePass:
         )
 
     def feature_gradient(self, tile: PartitionTile) -> FeatureGradient:
-        """Adds dE/dfeatures of one tile, which is zero on cells that it does not own."""
+        """Return a callback that adds dE/dfeatures of one tile, which is zero on cells that the tile does not own."""
 
         def add(layer: str, features: Tensor, gradient: Tensor) -> None:
             view, own = tile.owned_cells(layer, self.size)
@@ -710,7 +750,7 @@ class _ScalePass:
 
 
 def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Image [H, W, 3] brought down to size (height, width) with an antialiasing filter."""
+    """Downscale an image [H, W, 3] to size (height, width) with an antialiasing filter."""
     if (image.shape[0], image.shape[1]) == size:
         return image
     planes = image.permute(2, 0, 1).unsqueeze(0)

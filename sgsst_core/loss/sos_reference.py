@@ -1,4 +1,4 @@
-"""The SOS loss as the paper writes it: float64, untiled, gradient by autograd. The twin of `sos.SosLoss`, for tests."""
+"""Float64 reference of `sos.SosLoss`: the SOS loss as the paper writes it, untiled, with autograd. Used in tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sgsst_core.settings import StyleLossName
 
 @dataclass(frozen=True)
 class RegionReference:
-    """A region: its style [H', W', 3], its share [H, W] of a view (None: equal weights), and the weight of its loss."""
+    """Region with its style [H', W', 3], its fraction [H, W] of a view (None: equal weights), and its loss weight."""
 
     style: Tensor
     share: Tensor | None
@@ -30,7 +30,7 @@ class RegionReference:
 
 
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
-    """Layer name to features [h, w, c], float64, of rgb [H, W, 3] in 0..1; differentiable."""
+    """Compute float64 features [h, w, c] by layer from rgb [H, W, 3] in 0..1; differentiable."""
     rgb = rgb.double()
     if network_weights.gray:
         rgb = (rgb @ torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64))[..., None].expand(rgb.shape)
@@ -50,7 +50,7 @@ def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[st
 
 
 def box_average_reference(image: Tensor, side: int) -> Tensor:
-    """Box average of [H, W, c] over side x side blocks."""
+    """Box-average [H, W, c] over blocks of side x side."""
     return F.avg_pool2d(image.permute(2, 0, 1).unsqueeze(0), side)[0].permute(1, 2, 0)
 
 
@@ -61,13 +61,15 @@ def style_loss_reference(
     *,
     weights: TermWeights = PAPERS_WEIGHTS,
 ) -> Tensor:
-    """One layer's style loss by its definition, float64 and differentiable: the twin of `terms.style_loss`.
+    """Compute the style loss of one layer from its definition; reference of `terms.style_loss`.
+
+    Float64 and differentiable.
 
     Args:
         features: [h, w, c].
-        target: of the style.
+        target: Statistics of the style.
         position_weights: [h, w]; None for equal weights.
-        weights: of the terms.
+        weights: Weights of the terms.
     """
     found = _statistics(features, position_weights)
     loss = weights.gram / features.shape[-1] ** 2 * (found.gram - target.gram).square().mean()
@@ -82,8 +84,8 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
     mean = (a[:, None] * flat).sum(0) / a.sum()
     gram = (a[:, None] * flat).T @ flat / a.sum()
     variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
-    # The root of an exact zero (a dead channel) has no derivative, and that of a constant channel's rounding has a wild
-    # one; such a channel takes no part, as in the closed form.
+    # The square root of an exact zero (a dead channel) has no derivative, and that of a constant channel's rounding
+    # error has a huge one. Such a channel is excluded, as in the closed form.
     alive = variance > (1e-12 * mean).square()
     return LayerTarget(gram, mean, torch.where(alive, variance, 1.0).sqrt() * alive)
 
@@ -100,15 +102,19 @@ def sos_reference(
     coarsest: int = COARSEST_SHORTER_SIDE,
     scales: Sequence[float] = (),
 ) -> tuple[float, Tensor]:
-    """E and dE/dimage [H, W, 3] in float64.
+    """Compute E and dE/dimage [H, W, 3] in float64.
 
     Args:
-        image, content: [H, W, 3] in 0..1.
-        style: [H', W', 3], already at the size at which it is used (`pyramid.style_size`); or that of each region.
+        network_weights: Weights of the feature network.
+        image: [H, W, 3] in 0..1.
+        style: [H', W', 3], already resized (`pyramid.style_size`), or one reference per region.
+        content: [H, W, 3] in 0..1; None for no content term.
+        content_weight: lambda_c.
         coverage: [H, W] position weights; None for equal weights.
-        style_loss: see `style_losses`; with features that are matched, the style has at most `nearest.MOST_VECTORS`.
-        coarsest: pixels of the coarsest scale's shorter side at most.
-        scales: weight of each scale, from full size on; all alike where none is given.
+        style_loss: Kind of comparison; see `style_losses`. If features are matched, the style may have at most
+            `nearest.MOST_VECTORS` positions.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
+        scales: Weight of each scale from full size downwards; empty for equal weights.
     """
     parts = [RegionReference(style, coverage)] if isinstance(style, Tensor) else style
     x = image.double().clone().requires_grad_()
@@ -139,7 +145,7 @@ def _part_reference(
     side: int,
     style_loss: StyleLossName,
 ) -> Tensor:
-    """The style terms of a region at the scale of boxes of side x side pixels, from the view's features there."""
+    """Return the style terms of a region at the scale of side x side boxes, given the view's features at that scale."""
     wanted = features_reference(network_weights, box_average_reference(part.style.double(), side))
     loss = torch.zeros((), dtype=torch.float64)
     for layer in statistics_layers(style_loss, network_weights):

@@ -1,9 +1,10 @@
-"""What views are compared with a style by, and which layers of the feature network each of these losses reads.
+"""Available style losses, and the layers of the feature network that each of them reads.
 
-`sos` is the paper's: Gram matrices, means and standard deviations of `STYLE_LAYERS`. `nnfm` puts the nearest-neighbor
-term (`nearest`) in their place, `mixed` adds it to them. Every scale of the SOS loss has the same terms.
+`sos` is the paper's loss: Gram matrices, means and standard deviations of `STYLE_LAYERS`. `nnfm` replaces them with the
+nearest-neighbor term (`nearest`); `mixed` uses both. Every scale of the SOS loss has the same terms.
 
-Where weights have a factor for `PIXELS` (`feature_scale`), means and standard deviations of these are compared as well.
+If the weights have a factor for `PIXELS` (`feature_scale`), the mean and standard deviation of the pixels are compared
+too.
 """
 
 from __future__ import annotations
@@ -14,34 +15,38 @@ from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS
 from sgsst_core.loss.terms import MEAN_WEIGHT, PAPERS_WEIGHTS, STD_WEIGHT, TermWeights
 from sgsst_core.settings import StyleLossName
 
-#: What brings ImageNet-normalized features, in which ARF's weights are meant, to the units of a 0-255 input.
+#: Converts features of ImageNet-normalized input, the units of ARF's weights, to units of a 0-255 input.
 _FEATURE_UNITS = 255 * 0.226
-#: w_n: with content_weight 1, nearest neighbors and content are weighted as ARF does it for scenes seen from all sides
-#: (content weight 5e-3 in the units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
+#: w_n that, with content_weight 1, balances nearest neighbors and content as ARF does for scenes seen from all sides
+#: (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
 NNFM_WEIGHT = _FEATURE_UNITS**2 / 5e-3
-#: w_n beside the statistics, whose gradient falls to a tenth in 20 to 30 steps: with this weight the gradients
-#: of both, with respect to the colors, are as long as each other then. For four pairs of scene and painting that takes
-#: 1.8e8 to 1.7e9, of which this is the geometric mean: scenes are as different as that, but the same job has the same
-#: loss, whoever runs or resumes it.
+#: w_n next to the statistics, whose gradient falls to a tenth within 20 to 30 steps. With this weight, both gradients
+#: with respect to the colors then have the same length. Four pairs of scene and painting need 1.8e8 to 1.7e9; this is
+#: the geometric mean. It is a constant although scenes differ that much, so that a job has the same loss wherever it
+#: runs or resumes.
 MIXED_WEIGHT = 5e8
-#: w_n of each loss, for features in units of a 0-255 input; 0 where nothing is matched.
+#: w_n of each loss for features in units of a 0-255 input; 0 if nothing is matched.
 NEAREST_WEIGHTS: dict[StyleLossName, float] = {"sos": 0.0, "nnfm": NNFM_WEIGHT, "mixed": MIXED_WEIGHT}
 
 
 def nearest_weight(style_loss: StyleLossName, unit: float = 1.0) -> float:
-    """w_n: what it is weighed against grows with the square of the features' unit (`FeatureNetwork.unit`)."""
+    """Return w_n.
+
+    The terms that it is balanced against grow with the square of the features' unit (`FeatureNetwork.unit`).
+    """
     return NEAREST_WEIGHTS[style_loss] * unit**2
 
 
 def has_statistics(style_loss: StyleLossName) -> bool:
-    """Whether a loss compares Gram matrices, means and standard deviations."""
+    """Return whether a loss compares Gram matrices, means and standard deviations."""
     return style_loss != "nnfm"
 
 
 def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
-    """The layers whose features are matched, as ARF has it: all of the third block; none where nothing is matched.
+    """Return the layers whose features are matched: all of the third block, as in ARF, or none.
 
     Args:
+        style_loss: Style loss.
         network: "vgg16" or "vgg19".
     """
     count = BLOCKS[network][2] if NEAREST_WEIGHTS[style_loss] else 0
@@ -49,24 +54,26 @@ def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
 
 
 def statistics_layers(style_loss: StyleLossName, weights: BackboneWeights) -> tuple[str, ...]:
-    """The layers whose statistics are compared, by a loss on a network; none where it has none."""
+    """Return the layers whose statistics a loss compares; empty if it compares none."""
     if not has_statistics(style_loss):
         return ()
     return (PIXELS, *STYLE_LAYERS) if PIXELS in weights.scales else STYLE_LAYERS
 
 
 def term_weights(layer: str, pixel_weight: float) -> TermWeights:
-    """Weights of a layer's terms: the paper's, and of `PIXELS` no Gram matrix and the others times `pixel_weight`."""
+    """Return the weights of a layer's terms: the paper's, except that `PIXELS` has no Gram term and its own factor."""
     if layer != PIXELS:
         return PAPERS_WEIGHTS
     return TermWeights(0.0, MEAN_WEIGHT * pixel_weight, STD_WEIGHT * pixel_weight)
 
 
 def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:
-    """Every layer that a loss reads of a network.
+    """Return every layer that a loss reads from a network.
 
     Args:
-        content: it has a content term.
+        style_loss: Style loss.
+        weights: Weights of the network.
+        content: Whether the loss has a content term.
     """
     statistics = statistics_layers(style_loss, weights)
     nearest = nearest_layers(style_loss, weights.name)

@@ -1,11 +1,11 @@
-"""The transfer loss of one scale and its gradient with respect to the features, in closed form.
+"""Transfer loss of one scale and its gradient with respect to the features, in closed form.
 
 E_style = sum over layers of w_G mean((G - G_v)^2) + w_m mean((mu - mu_v)^2) + w_s mean((sigma - sigma_v)^2)
 E_content = lambda_c mean((F_42 - F_42^content)^2)
 E_nearest: see `nearest`
 
-with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025); means over the entries of each matrix or vector.
-With position weights a_p, n becomes their sum and the content mean is weighted in the same way.
+with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025). Means are over the entries of each matrix or vector. With
+position weights a_p, n becomes their sum, and the content mean is weighted in the same way.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from sgsst_core.features.fused_statistics import can_be_fused, has_kernels
 from sgsst_core.features.statistics import LayerStatistics, blocks_of, center
 from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 
-#: What the loss of a scale is the sum of: names, as files and reports have them, to what people read. The order is that
-#: in which they are added up, shown and given their colors.
+#: Terms whose sum is the loss of a scale: names in files and reports, and their display names. The order is that of
+#: summation, display and chart colors.
 TERMS = {
     "gram": "Gram matrix",
     "mean": "mean",
@@ -33,7 +33,7 @@ TERMS = {
     "nearest": "nearest neighbors",
 }
 
-#: w_G = GRAM_WEIGHT / c^2: the numerator.
+#: Numerator of w_G = GRAM_WEIGHT / c^2.
 GRAM_WEIGHT = 1e3
 #: w_m.
 MEAN_WEIGHT = 1e4
@@ -42,20 +42,20 @@ STD_WEIGHT = 1e4
 
 
 class TermWeights(NamedTuple):
-    """c^2 w_G, w_m and w_s of a layer."""
+    """Weights c^2 w_G, w_m and w_s of the terms of a layer."""
 
     gram: float = GRAM_WEIGHT
     mean: float = MEAN_WEIGHT
     std: float = STD_WEIGHT
 
 
-#: SGSST.
+#: Weights of the SGSST paper.
 PAPERS_WEIGHTS = TermWeights()
 
 
 @dataclass(frozen=True)
 class LayerTarget:
-    """What a layer is drawn to, float64: the style's Gram matrix [c, c], mean [c], standard deviation [c]."""
+    """Target of one layer: the style's Gram matrix [c, c], mean [c] and standard deviation [c], float64."""
 
     gram: Tensor
     mean: Tensor
@@ -63,18 +63,18 @@ class LayerTarget:
 
     @staticmethod
     def of(statistics: LayerStatistics) -> LayerTarget:
-        """The target that the statistics of a style image make."""
+        """Create the target from the statistics of a style image."""
         return LayerTarget(statistics.gram(), statistics.mean, statistics.std())
 
 
 class LossTerms(Mapping[str, float]):
-    """One scale's loss, split: every name in `TERMS` to its value, in that order; it does not change.
+    """Immutable mapping from every name in `TERMS` to its value: the loss of one scale, split into terms.
 
     Args:
-        values: by name; those that are not given are 0.
+        values: Values by name; missing terms are 0.
 
     Raises:
-        TypeError: there is no such term.
+        TypeError: If there is no such term.
     """
 
     __slots__ = ("_values",)
@@ -87,8 +87,8 @@ class LossTerms(Mapping[str, float]):
 
     @property
     def total(self) -> float:
-        """What is minimized: the sum of all terms."""
-        # `sum` would round otherwise from Python 3.12 on, and results would depend on the interpreter.
+        """Sum of all terms, which is what is minimized."""
+        # From Python 3.12 on, `sum` rounds differently, so results would depend on the interpreter.
         return reduce(operator.add, self._values.values())
 
     def __getitem__(self, name: str) -> float:
@@ -105,11 +105,11 @@ class LossTerms(Mapping[str, float]):
 
     @staticmethod
     def of(values: Sequence[float]) -> LossTerms:
-        """Of all terms' values, in the order of `TERMS`."""
+        """Create from the values of all terms, in the order of `TERMS`."""
         return LossTerms(**dict(zip(TERMS, values, strict=True)))
 
     def __truediv__(self, count: int) -> LossTerms:
-        """Each term divided by a count: the mean of a sum."""
+        """Divide every term by a count, which turns a sum into a mean."""
         return LossTerms(**{name: value / count for name, value in self.items()})
 
     def __repr__(self) -> str:
@@ -120,9 +120,9 @@ class LossTerms(Mapping[str, float]):
 class StyleGradient:
     """dE/dF of one layer as an affine map of centered features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
 
-    The map acts on centered features because at mean-to-sigma ratios of 1e4 the product matrix F and a separate
-    offset would cancel each other down to their last digits in float32. In float64, but float32 where a GPU's kernels
-    made it, which is what it is applied in to float32 features anyway.
+    The map acts on centered features because at mean-to-sigma ratios of 1e4, matrix @ F and a separate offset would
+    cancel down to their last digits in float32. Tensors are float64, or float32 if GPU kernels computed them; float32
+    features are multiplied in float32 in either case.
     """
 
     matrix: Tensor  # [c, c]
@@ -130,26 +130,26 @@ class StyleGradient:
     offset: Tensor  # [c]
 
     def times(self, factor: float) -> StyleGradient:
-        """The gradient of the loss times a factor."""
+        """Return the gradient of the loss times a factor."""
         return StyleGradient(self.matrix * factor, self.mean, self.offset * factor)
 
     def about_rounded_mean(self) -> StyleGradient:
-        """The same map about the mean as float32 has it, with what that leaves out in the offset.
+        """Return the same map about the mean rounded to float32, with the rounding error moved into the offset.
 
-        `add_to` takes the mean away in the features' precision. Where they lie nearer to each other than the rounding
-        of their mean, as pixels of one color do, that would be most of the result.
+        `add_to` subtracts the mean in the precision of the features. If the features differ by less than the rounding
+        error of their mean, as in an image of a single color, that error would dominate the result.
         """
         mean = self.mean.float().double()
         return StyleGradient(self.matrix, mean, self.offset + self.matrix @ (mean - self.mean))
 
     def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
-        """dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
+        """Return dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
         result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
         self.add_to(result, features, position_weights)
         return result
 
     def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
-        """Add `apply` to a gradient [h, w, c] in place, block by block: nothing as large as the features is made."""
+        """Add `apply` to a gradient [h, w, c] in place, in blocks; allocates nothing as large as the features."""
         if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
             fused_add_style_gradient(gradient, features, self.matrix, self.mean, self.offset, position_weights)
             return
@@ -174,19 +174,19 @@ def style_loss(
     feature_eps: float = 2.0**-23,
     weights: TermWeights = PAPERS_WEIGHTS,
 ) -> tuple[Tensor, StyleGradient]:
-    """One layer's style loss and its gradient with respect to the features. Both are 0 where there is no position.
+    """Compute the style loss of one layer and its gradient with respect to the features.
+
+    If sigma is zero, or within the rounding error of the mean, the channel is constant: its factor (F - mu)/sigma is
+    taken as 0. The loss keeps the term, and the gradient stays finite. Without any position, loss and gradient are 0.
 
     Args:
-        statistics: of the view's features.
-        target: of the style.
-        feature_eps: relative rounding of the features (2^-23 for float32, 2^-52 for float64).
-        weights: of the terms.
+        statistics: Statistics of the view's features.
+        target: Target from the style.
+        feature_eps: Relative rounding error of the features (2^-23 for float32, 2^-52 for float64).
+        weights: Weights of the terms.
 
     Returns:
-        [5] float64, what the layer adds to each of `TERMS`; and the gradient.
-
-    Where sigma is zero, or no more than the rounding of the mean, a channel is constant: its factor (F - mu)/sigma
-    is taken as 0. The loss keeps the term, the gradient stays finite.
+        Contribution of the layer to each of `TERMS`, [5] float64, and the gradient.
     """
     channels = statistics.mean.shape[0]
     if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
@@ -217,10 +217,11 @@ def style_loss(
 
 
 def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
-    """lambda_c / (n c) of a whole view, float64 scalar.
+    """Return lambda_c / (n c) of a whole view, float64 scalar.
 
     Args:
-        count: n, float64 scalar, positions or the sum of their weights; 0 gives no loss.
+        count: n, float64 scalar: number of positions or sum of their weights. 0 gives no loss.
+        channels: c.
         weight: lambda_c.
     """
     return weight / (torch.where(count > 0, count, torch.inf) * channels)
@@ -228,12 +229,12 @@ def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
 
 @dataclass(frozen=True)
 class ContentDifference:
-    """How far some cells' content features are from what they should be: the content loss follows from it.
+    """Difference between content features and their target on some cells.
 
     Attributes:
-        difference: [h, w, c], in float32 at least.
-        weighted: the same times the position weights.
-        factor: lambda_c / (n c), float64: the loss is a mean over the view's n positions (or their weights).
+        difference: [h, w, c], float32 or float64.
+        weighted: Difference times the position weights.
+        factor: lambda_c / (n c), float64. The loss is a mean over the n positions of the view, or over their weights.
     """
 
     difference: Tensor
@@ -244,11 +245,13 @@ class ContentDifference:
     def of(
         features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
     ) -> ContentDifference:
-        """Of features and content [h, w, c] at the same positions.
+        """Compare features with content [h, w, c] at the same positions.
 
         Args:
-            factor: of `content_factor`.
-            position_weights: [h, w].
+            features: [h, w, c].
+            content: [h, w, c].
+            factor: Result of `content_factor`.
+            position_weights: [h, w]; None for equal weights.
         """
         precision = torch.promote_types(features.dtype, torch.float32)
         difference = features.to(precision) - content.to(precision)
@@ -256,10 +259,10 @@ class ContentDifference:
         return ContentDifference(difference, weighted, factor)
 
     def loss(self) -> Tensor:
-        """These cells' share of the content loss, float64 scalar."""
-        # A dot product in float32 over a whole view would lose digits: rows first, then float64.
+        """Return the contribution of these cells to the content loss, float64 scalar."""
+        # A float32 dot product over a whole view would lose digits, so rows are summed first and then added in float64.
         return self.factor * (self.weighted * self.difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
 
     def gradient(self) -> Tensor:
-        """Its gradient with respect to the features, [h, w, c]."""
+        """Return the gradient with respect to the features, [h, w, c]."""
         return self.weighted * (2 * self.factor)

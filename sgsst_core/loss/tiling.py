@@ -1,4 +1,4 @@
-"""How scaled views are cut into partition tiles under a memory budget: the loss does it, the planner foresees it."""
+"""Partitioning of scaled views into tiles under a memory budget, as used by the loss and predicted by the planner."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from sgsst_core.scene.pyramid import scale_count
 
 @dataclass(frozen=True)
 class Tiling:
-    """The rules by which views are cut.
+    """Rules for partitioning views.
 
     Attributes:
-        halo: pixels around a partition tile.
-        held: pixels whose activations the memory holds.
-        working: memory that a tile needs in a pass beside its activations, as a share of them.
-        coarsest: pixels of the coarsest scale's shorter side at most.
-        tile_size: side of partition tiles, a multiple of 16; None lets the memory decide.
-        keep_activations: as many as fit between the two passes; False computes each tile twice.
-        weights: of the scales that count.
+        halo: Pixels around a partition tile.
+        held: Number of pixels whose activations fit in memory.
+        working: Additional memory of a tile during a pass, as a fraction of its activations.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
+        tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
+        keep_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
+            twice.
+        weights: Weights of the scales.
     """
 
     halo: int
@@ -34,22 +35,28 @@ class Tiling:
     weights: ScaleWeights = EVEN
 
     def scale_count(self, size: Size) -> int:
-        """n_s of views of a size (height, width)."""
+        """Return n_s for views of a size (height, width)."""
         return scale_count(*size, self.coarsest)
 
     def scales(self, size: Size) -> list[int]:
-        """The scales that count of views of a size (height, width), the finest first."""
+        """Return the scales with a positive weight for views of a size (height, width), finest first."""
         return self.weights.chosen(self.scale_count(size))
 
     def tiles(self, size: Size, region: Rectangle | None = None) -> list[PartitionTile]:
-        """The tiles of a region of a scaled view of size (height, width), as large as the memory allows."""
+        """Return the tiles of a region of a scaled view of size (height, width).
+
+        Tiles are as large as the memory budget allows.
+        """
         tile_size = self.tile_size
         if tile_size is None:
             tile_size = choose_tile_size(*size, self.halo, held=self.held, working=self.working, region=region)
         return partition(*size, tile_size, self.halo, region)
 
     def kept(self, areas: Sequence[int]) -> list[bool]:
-        """Which of the tiles with so many pixels keep their activations, if they are in memory at the same time."""
+        """Return which of the tiles with these pixel counts cache their activations.
+
+        All of them are assumed to be in memory at the same time.
+        """
         if not self.keep_activations:
             return [False] * len(areas)
         return kept_tiles(areas, self.held, self.working)
