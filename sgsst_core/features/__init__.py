@@ -1,1 +1,1 @@
-"""The feature network: its weights, the partition of a view that it takes, statistics of its features."""
+"""Feature network: weights, partition tiles and feature statistics."""

@@ -1,10 +1,10 @@
-"""GPU kernels of a layer's statistics: shifted moments of blocks of positions, and their sum in float64.
+"""GPU kernels for layer statistics: shifted moments of blocks of positions, and their sum in float64.
 
-Run in Triton's interpreter on the CPU too (TRITON_INTERPRET=1 before the first import). Nothing is added atomically:
-results repeat to the bit.
+They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import). There are no atomics,
+so results are reproducible bit for bit.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import triton.language as tl
 
 @triton.jit
 def places_of(there, channel, CHANNELS: tl.constexpr):
-    """Which of some positions and channels are there, [P, C]: a block may have more channels than a layer."""
+    """Return the load mask [P, C] of valid positions and channels; a block may have more channels than the layer."""
     return there[:, None] & (channel < CHANNELS)[None, :]
 
 
 @triton.jit
 def load_centered(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
-    """Features minus shift [P, C] float32 of some positions, row by row, and channels; minus shift where not there."""
+    """Load features minus shift [P, C] as float32, at row-major positions; invalid entries are minus the shift."""
     place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
     mask = places_of(there, channel, CHANNELS)
     values = tl.load(features + place[:, None] + channel[None, :], mask=mask, other=0.0).to(tl.float32)
@@ -30,7 +30,7 @@ def load_centered(features, shift, row_step, column_step, width, position, chann
 
 @triton.jit
 def load_weights(weights, row_step, column_step, width, position, there, WEIGHTED: tl.constexpr):
-    """Position weights [P] float32, 0 where no position is there."""
+    """Load position weights [P] as float32, 0 at invalid positions."""
     if WEIGHTED:
         place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
         return tl.load(weights + place, mask=there, other=0.0).to(tl.float32)
@@ -44,16 +44,18 @@ def shifted_moments(
     CHANNELS: tl.constexpr, TILE: tl.constexpr, SPAN: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Moments about the shift of SPAN positions, for TILE x TILE pairs of channels, of which the upper ones are made.
+    """Compute moments about the shift over SPAN positions, for one TILE x TILE block of channel pairs.
+
+    Only blocks on and above the diagonal are computed.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
-        weights: [h, width] position weights, or anything where WEIGHTED is false.
+        weights: Position weights [h, width]; ignored if WEIGHTED is false.
         shift: [CHANNELS] float32.
-        counts: [spans] float32, sum of a_p; written by the pair (0, 0).
-        firsts: [spans, CHANNELS] float32, sum of a_p x_p; written by pairs on the diagonal.
-        seconds: [spans, CHANNELS, CHANNELS] float32, sum of a_p x_p x_p^T; the lower pairs are not written.
-        positions: h * width.
+        counts: Output [spans] float32, sum of a_p; written by block (0, 0).
+        firsts: Output [spans, CHANNELS] float32, sum of a_p x_p; written by diagonal blocks.
+        seconds: Output [spans, CHANNELS, CHANNELS] float32, sum of a_p x_p x_p^T; lower blocks are not written.
+        positions: Number of positions, h * width.
     """
     tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
     span, pair = tl.program_id(0), tl.program_id(1)
@@ -89,16 +91,19 @@ def add_moments(
     counts, firsts, seconds, shift, count, mean, centered, spans,
     CHANNELS: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
-    """Count, mean and centered second moment of all spans, in float64; ENTRIES of the matrix a program.
+    """Sum count, mean and centered second moment over all spans in float64, for ENTRIES matrix entries per program.
 
     Args:
-        counts, firsts, seconds, shift: of `shifted_moments`.
-        count: [] float64; mean: [CHANNELS]; centered: [CHANNELS, CHANNELS]; all 0 where no position has weight.
+        counts, firsts, seconds, shift: Results and shift of `shifted_moments`.
+        count: Output [] float64. All outputs are 0 if no position has weight.
+        mean: Output [CHANNELS] float64.
+        centered: Output [CHANNELS, CHANNELS] float64.
+        spans: Number of spans.
     """
     entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
     inside = entry < CHANNELS * CHANNELS
     i, j = tl.where(inside, entry // CHANNELS, 0), entry % CHANNELS
-    # The lower pairs were not made: their mirror images were.
+    # Lower blocks are not computed; read their mirror images.
     place = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
     n = tl.zeros([S], tl.float64)
     down, across, second = (

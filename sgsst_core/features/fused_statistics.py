@@ -1,7 +1,7 @@
-"""`layer_statistics` on a GPU in three launches, whatever the size: nothing as large as the features is made.
+"""GPU version of `layer_statistics` in three launches at any size, without a temporary as large as the features.
 
-The shift, about which moments are summed in float32, is the mean of some of the rows: it only has to lie near the mean.
-`statistics.layer_statistics_reference` is the float64 twin.
+Moments are summed in float32 about a shift, the mean of some rows; it only has to be close to the true mean.
+`statistics.layer_statistics_reference` is the float64 reference.
 """
 
 from __future__ import annotations
@@ -12,50 +12,53 @@ from torch import Tensor
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.scene.spherical_harmonics import triton_runs_on
 
-#: Entries that are summed in float32 before float64 takes over, for each channel.
+#: Values per channel block of a span, which is summed in float32 before float64 takes over.
 SPAN_VALUES = 1 << 20
-#: Rows of features that the shift is the mean of, at least.
+#: Minimum number of feature rows averaged for the shift.
 _SHIFT_ROWS = 64
-#: Channels, positions and spans that a program takes at a time.
+#: Channels, positions and spans per step of a program.
 TILE, POSITIONS, SPANS = 64, 32, 4
-#: Entries of a layer's matrix, in whole rows, that a program takes at a time.
+#: Matrix entries per program, rounded to whole rows.
 ENTRIES = 1024
-#: Channels of a block at least: a matrix product takes no fewer. A layer of less fills a part of it.
+#: Minimum channels per block, which matrix products require. Layers with fewer channels fill part of a block.
 LEAST_CHANNELS = 16
 
 
 def matrix_precision(dtype: torch.dtype) -> str:
-    """How Triton multiplies matrices that hold features: bfloat16's 8 bits lose nothing to the 11 of TF32."""
+    """Return Triton's precision for matrix products with features. The 8 bits of bfloat16 fit in the 11 of TF32."""
     return "tf32" if dtype == torch.bfloat16 else "ieee"
 
 
 def block_of_positions(usual: int) -> int:
-    """Positions that a program takes at a time."""
+    """Return the number of positions per step of a program."""
     return 4096 if _is_interpreted() else usual
 
 
 def block_of_entries(channels: int) -> int:
-    """Entries of a layer's matrix, in whole rows, that a program takes at a time."""
+    """Return the number of matrix entries per program, in whole rows."""
     channels = max(channels, LEAST_CHANNELS)
     return min(channels**2, 1 << 18 if _is_interpreted() else max(ENTRIES, channels))
 
 
 def block_of_channels(channels: int, most: int | None = None) -> int:
-    """Channels that a program takes at a time, of a layer's so many; all of them, unless it takes fewer at most."""
+    """Return the number of channels per step: all of them, or at most `most`."""
     return min(max(channels, LEAST_CHANNELS), most or max(channels, LEAST_CHANNELS))
 
 
 def _is_interpreted() -> bool:
-    """Whether Triton interprets its kernels: it takes its time for every operation, however large, so few are best."""
+    """Return whether Triton runs in its interpreter.
+
+    There, every operation is slow whatever its size, so large blocks are best.
+    """
     import triton
 
     return bool(triton.knobs.runtime.interpret)
 
 
 def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
-    """Statistics of features [h, w, c], float32 or bfloat16, with optional position weights [h, w] >= 0.
+    """Compute the statistics of features [h, w, c] on a GPU, with optional position weights [h, w] >= 0.
 
-    c is less than 16 or a power of two, and channels lie side by side in memory.
+    Features are float32 or bfloat16 with contiguous channels, and c is below 16 or a power of two.
     """
     from sgsst_core.features import fused_kernels as kernels
 
@@ -87,12 +90,15 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 
 
 def can_be_fused(features: Tensor) -> bool:
-    """Whether Triton computes with features [h, w, c]: on GPUs where it works, in the layout of channels last."""
+    """Return whether there are kernels for features [h, w, c].
+
+    They need a supported GPU, contiguous channels and a dtype other than float64.
+    """
     side_by_side = features.stride(2) == 1 and features.dtype != torch.float64
     return side_by_side and has_kernels(features.device, int(features.shape[2]))
 
 
 def has_kernels(device: torch.device, channels: int) -> bool:
-    """Whether there are kernels for layers of so many channels on a device."""
+    """Return whether there are kernels on a device for layers with this number of channels."""
     taken = channels < LEAST_CHANNELS or channels.bit_count() == 1
     return device.type == "cuda" and taken and triton_runs_on(device)

@@ -1,8 +1,8 @@
-"""SPST partition: a scaled view cut into tiles that go through VGG one at a time, exactly.
+"""SPST partition: split a scaled view into tiles that go through VGG one at a time, with exact gradients.
 
-Each tile owns the features whose cells lie in its inner rectangle. Back-propagation starts from owned features
-only, and pixel gradients are added over the overlaps, so a halo of one receptive field is enough. (The published
-SPST keeps the inner part of each block's pixel gradient instead, which takes a margin several times as wide.)
+Each tile owns the features whose cells lie in its inner rectangle. Back-propagation starts from owned features only,
+and pixel gradients are added over the overlaps, so a halo of one receptive field is enough. (The published SPST instead
+keeps the inner part of each block's pixel gradient, which needs a margin several times as wide.)
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sgsst_core.features.vgg import ALIGNMENT, layer_stride
 
 @dataclass(frozen=True)
 class Rectangle:
-    """Half-open rectangle in pixels (or cells): rows top..bottom, columns left..right."""
+    """Half-open rectangle in pixels or cells: rows top..bottom, columns left..right."""
 
     top: int
     left: int
@@ -27,7 +27,7 @@ class Rectangle:
 
     @property
     def pixels(self) -> int:
-        """Area."""
+        """Area of the rectangle."""
         return (self.bottom - self.top) * (self.right - self.left)
 
     @property
@@ -38,17 +38,20 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class PartitionTile:
-    """A partition tile: `inner` is what it owns, `outer` is inner and halo, clipped to the view."""
+    """Partition tile: it owns the rectangle `inner`; `outer` is inner plus halo, clipped to the view."""
 
     inner: Rectangle
     outer: Rectangle
 
     def owned_cells(self, layer: str, size: tuple[int, int]) -> tuple[Rectangle, Rectangle]:
-        """The layer's cells that the tile owns: (in the view's feature map, in the tile's feature map).
+        """Return the cells of a layer that the tile owns.
 
         Args:
-            layer: such as "relu3_1".
-            size: (height, width) of the scaled view; cells that its border cuts off do not exist.
+            layer: Layer name, such as "relu3_1".
+            size: (height, width) of the scaled view. Cells cut off by its border do not exist.
+
+        Returns:
+            The cells as a rectangle in the view's feature map, and as one in the tile's feature map.
         """
         stride = layer_stride(layer)
         height, width = size[0] // stride, size[1] // stride
@@ -65,12 +68,14 @@ class PartitionTile:
 def partition(
     height: int, width: int, tile_size: int | None, halo: int, region: Rectangle | None = None
 ) -> list[PartitionTile]:
-    """Cut a view of height x width, or a region of it, into partition tiles, row by row.
+    """Split a view, or a region of it, into partition tiles, row by row.
 
     Args:
-        tile_size: side of the inner rectangles, a multiple of 16; None for one tile that is the whole region.
-        halo: pixels around the inner rectangle, a multiple of 16 no smaller than the receptive field's radius.
-        region: from `covered_region`; None for the whole view.
+        height: Height of the view in pixels.
+        width: Width of the view in pixels.
+        tile_size: Side of the inner rectangles, a multiple of 16; None for one tile that covers the whole region.
+        halo: Pixels around the inner rectangle: a multiple of 16, at least the radius of the receptive field.
+        region: Result of `covered_region`; None for the whole view.
     """
     region = region or Rectangle(0, 0, height, width)
     if tile_size is None:
@@ -89,7 +94,7 @@ def partition(
 
 
 def covered_region(coverage: Tensor) -> Rectangle:
-    """The smallest rectangle at multiples of 16 that holds every pixel with coverage [H, W] above 0; may be empty."""
+    """Return the smallest 16-aligned rectangle that contains every pixel of coverage [H, W] > 0; may be empty."""
     height, width = coverage.shape
     rows, columns = (coverage > 0).any(dim=1).nonzero(), (coverage > 0).any(dim=0).nonzero()
     if not len(rows):
@@ -99,7 +104,13 @@ def covered_region(coverage: Tensor) -> Rectangle:
 
 
 def scaled_region(region: Rectangle, scale: int, size: tuple[int, int]) -> Rectangle:
-    """`covered_region` at a scale of size (height, width), of a view whose covered pixels at full size are a region."""
+    """Return `covered_region` for a coarser scale, given the region at full size.
+
+    Args:
+        region: Covered region of the full-size view.
+        scale: Coarser scale; 0 is full size.
+        size: (height, width) of the view at that scale.
+    """
     side = 1 << scale
     bottom, right = min(-(-region.bottom // side), size[0]), min(-(-region.right // side), size[1])
     scaled = Rectangle(region.top // side, region.left // side, bottom, right)
@@ -109,7 +120,7 @@ def scaled_region(region: Rectangle, scale: int, size: tuple[int, int]) -> Recta
 
 
 def _aligned(region: Rectangle, size: tuple[int, int]) -> Rectangle:
-    """The smallest rectangle at multiples of 16, within a view of size (height, width), that holds a region."""
+    """Return the smallest 16-aligned rectangle that contains a region, within a view of size (height, width)."""
     return Rectangle(
         region.top // ALIGNMENT * ALIGNMENT,
         region.left // ALIGNMENT * ALIGNMENT,
@@ -119,7 +130,7 @@ def _aligned(region: Rectangle, size: tuple[int, int]) -> Rectangle:
 
 
 def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
-    """Equal spans of at most tile_size, at multiples of 16: equal ones balance better than a narrow last one."""
+    """Return equal spans of at most tile_size at multiples of 16; equal spans balance better than a narrow last one."""
     if first >= last:
         return []
     count = math.ceil((last - first) / tile_size)
@@ -128,13 +139,14 @@ def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
 
 
 def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
-    """Which tiles' activations stay in memory from the forward to the backward pass: the largest that fit.
+    """Return which tiles cache their activations between the forward and the backward pass: the largest that fit.
 
-    They must be back-propagated before the others, which find their memory free when they are computed again.
+    Cached tiles must be back-propagated first, so that their memory is free when the others are recomputed.
 
     Args:
-        areas: pixels of the tiles that wait for each other.
-        held, working: as for `choose_tile_size`.
+        areas: Pixels of the tiles that are in memory at the same time.
+        held: Number of pixels whose activations fit in the memory budget.
+        working: Additional memory of a tile during back-propagation, as a fraction of its activations.
     """
     kept = [False] * len(areas)
     room = held - working * max(areas, default=0)
@@ -146,27 +158,29 @@ def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
 
 
 def computed_twice(areas: Sequence[int], kept: Sequence[bool]) -> int:
-    """Pixels of the tiles that are not kept: they go forward a second time."""
+    """Return the number of pixels in tiles that are not cached and therefore go forward twice."""
     return sum(area for area, flag in zip(areas, kept, strict=True) if not flag)
 
 
-#: Tile sizes that are weighed against each other; below 64, the halo costs more than any memory saved is worth.
+#: Candidate tile sizes. Below 64, the halo costs more than the saved memory is worth.
 TILE_SIZES = (64, 128, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 
 
 def choose_tile_size(
     height: int, width: int, halo: int, *, held: float, working: float, region: Rectangle | None = None
 ) -> int | None:
-    """The tile size with the least work for a view under a memory budget; None where it fits as one tile.
+    """Return the tile size with the least work for a view under a memory budget; None if it fits as one tile.
 
-    Work is counted in pixels through the network: forward and backward over every outer rectangle, and a second
-    forward over those whose activations do not stay in memory. Small tiles pay for their halo, large ones leave
-    no room to keep anything.
+    Work is counted in pixels through the network: forward and backward over every outer rectangle, and a second forward
+    over those without cached activations. Small tiles pay for their halo; large ones leave no memory for caching.
 
     Args:
-        held: pixels whose activations the budget holds.
-        working: memory that a tile needs beside its activations while it is back-propagated, as a share of them.
-        region: as for `partition`.
+        height: Height of the view in pixels.
+        width: Width of the view in pixels.
+        halo: Pixels around the inner rectangle, a multiple of 16.
+        held: Number of pixels whose activations fit in the memory budget.
+        working: Additional memory of a tile during back-propagation, as a fraction of its activations.
+        region: Result of `covered_region`; None for the whole view.
     """
 
     def work(size: int | None) -> float:

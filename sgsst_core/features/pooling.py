@@ -1,7 +1,7 @@
-"""2x2 max pooling of ReLU outputs, and its backward pass together with the ReLU's.
+"""2x2 max pooling of ReLU outputs, and its backward pass combined with that of the ReLU.
 
-Positions of maxima are not kept but found again: on a CPU in the same pass that spreads the gradient, which reads the
-ReLU's output anyway. `max_pool_backward_reference` is the plain twin.
+Positions of maxima are not stored but recomputed; on a CPU the pass that distributes the gradient does so, because it
+reads the ReLU's output anyway. `max_pool_backward_reference` is the reference.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-#: Of as many bits.
+#: Integer types by bytes per value.
 _INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
 def max_pool(source: Tensor) -> Tensor:
-    """Maxima [1, c, h // 2, w // 2] of 2x2 windows of a ReLU's output [1, c, h, w], both channels last."""
+    """Return the maxima [1, c, h // 2, w // 2] of 2x2 windows of a ReLU output [1, c, h, w], both channels last."""
     if not _is_compiled_for(source):
         pooled: Tensor = F.max_pool2d(source, 2, return_indices=True)[0]
         return pooled
@@ -34,11 +34,11 @@ def max_pool(source: Tensor) -> Tensor:
 
 
 def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
-    """Gradient of what went into the ReLU, [1, c, h, w], channels last.
+    """Return the gradient with respect to the ReLU's input, [1, c, h, w], channels last.
 
     Args:
-        gradient: of the pool's maxima, [1, c, h // 2, w // 2].
-        source: the ReLU's output, [1, c, h, w]. The gradient goes to the first of equal maxima in each window.
+        gradient: Gradient of the maxima, [1, c, h // 2, w // 2].
+        source: ReLU output, [1, c, h, w]. The gradient goes to the first of equal maxima in each window.
     """
     if not _is_compiled_for(source):
         return max_pool_backward_reference(gradient, source)
@@ -54,7 +54,7 @@ def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
 
 
 def max_pool_backward_reference(gradient: Tensor, source: Tensor) -> Tensor:
-    """The same in operations of PyTorch, on any device."""
+    """Compute `max_pool_backward` with PyTorch operations, on any device."""
     spread: Tensor = torch.ops.aten.max_pool2d_with_indices_backward(
         gradient, source, [2, 2], [2, 2], [0, 0], [1, 1], False, max_positions(source)
     )
@@ -62,13 +62,13 @@ def max_pool_backward_reference(gradient: Tensor, source: Tensor) -> Tensor:
 
 
 def max_positions(source: Tensor) -> Tensor:
-    """Place of the first of each window's maxima in its plane, [1, c, h // 2, w // 2] int64."""
+    """Return the flat index within its plane of the first maximum of each window, [1, c, h // 2, w // 2] int64."""
     positions: Tensor = F.max_pool2d(source, 2, return_indices=True)[1]
     return positions
 
 
 def relu_backward(gradient: Tensor, output: Tensor) -> Tensor:
-    """A gradient [1, c, h, w], made 0 where a ReLU's output is; on a CPU in place, which needs no new memory."""
+    """Zero a gradient [1, c, h, w] where the ReLU's output is 0. Works in place on a CPU, to avoid an allocation."""
     if not _is_compiled_for(output):
         result: Tensor = torch.ops.aten.threshold_backward(gradient, output, 0)
         return result
@@ -81,15 +81,15 @@ def _is_compiled_for(values: Tensor) -> bool:
 
 
 def _cells(values: Tensor) -> Tensor:
-    """[h, w, c] of [1, c, h, w]: a view where channels lie last in memory."""
+    """Return [1, c, h, w] as [h, w, c]; a view if the memory layout is channels last."""
     return values[0].permute(1, 2, 0).contiguous()
 
 
 def _integers(values: Tensor) -> Any:
-    """A NumPy array of the same bits."""
+    """Return a NumPy array of integers with the same bits."""
     return values.view(_INTEGERS[values.element_size()]).numpy()
 
 
 def _all_but_sign(values: Any) -> Any:
-    """All bits but the sign's, in the type of some integers."""
+    """Return the integer of the same type with all bits set except the sign bit."""
     return values.dtype.type(np.iinfo(values.dtype).max)

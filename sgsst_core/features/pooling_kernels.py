@@ -1,11 +1,12 @@
-"""Compiled kernels of `pooling` on CPUs: one pass over what is pooled, on all cores.
+"""CPU kernels of `pooling`: a single pass over the input, on all cores.
 
-Values are ReLU outputs, seen as integers of the same bits: those of numbers that are not negative come in the same
-order, and integers are compared and chosen many at a time whatever the format, bfloat16 included. Their sign is masked
-out: a ReLU hands on -0, and NaN of either sign, which is then above all numbers and reaches the loss.
+Inputs are ReLU outputs, reinterpreted as integers with the same bits. Non-negative floats and their bit patterns have
+the same order, and integers can be compared and selected with SIMD in any format, including bfloat16. The sign bit is
+masked out, because a ReLU passes on -0 and NaN of either sign. A masked NaN is larger than all numbers, so it reaches
+the loss.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from sgsst_core.compiled import compiled
 
 @compiled(parallel=True)
 def max_pool(source, mask, out):
-    """Maxima [h // 2, w // 2, c] of 2x2 windows of source [h, w, c]. `mask` has all bits of the type but the sign."""
+    """Write the maxima of 2x2 windows of source [h, w, c] to out [h // 2, w // 2, c].
+
+    `mask` has all bits of the type set except the sign bit.
+    """
     rows, columns, channels = out.shape
     for i in numba.prange(rows):
         for j in range(columns):
@@ -30,15 +34,15 @@ def max_pool(source, mask, out):
 
 @compiled(parallel=True)
 def max_pool_backward(gradient, source, nothing, mask, out):
-    """Gradient [h, w, c] of what went into the ReLU, from that of the maxima [h // 2, w // 2, c]: all of `out`.
+    """Write the gradient with respect to the ReLU's input to out [h, w, c].
 
-    It goes to the first of equal maxima, and nowhere if they are not above 0. `nothing` is the type's 0, `mask`
-    as above.
+    `gradient` is that of the maxima [h // 2, w // 2, c]. It goes to the first of equal maxima, and nowhere if they are
+    not above 0. `nothing` is the type's 0; `mask` is as in `max_pool`.
     """
     rows, columns, channels = gradient.shape
     height, width = out.shape[0], out.shape[1]
     for i in numba.prange((height + 1) // 2):
-        if i == rows:  # the last of an odd number
+        if i == rows:  # last row if the height is odd
             out[2 * i] = nothing
             continue
         if width % 2:

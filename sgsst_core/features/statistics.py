@@ -1,11 +1,11 @@
 """Weighted second-order statistics of features, merged over partition tiles.
 
-A layer's features F [n, c] are summarized by (count, mean, C) with C = sum_p a_p (F_p - mean)(F_p - mean)^T.
-Gram matrix and standard deviation both follow from it: G = C / n + mean mean^T, sigma = sqrt(diag(C) / n).
-The reverse, sigma^2 = diag(G) - mean^2, cancels: at a mean-to-sigma ratio of a few thousand no digit is left in
-float32 and the root is taken of a negative number. Features are centered before they are multiplied (in their own
-precision, block by block) and everything is merged in float64 by the pairwise update of Chan, Golub and LeVeque,
-"Updating Formulae and a Pairwise Algorithm for Computing Sample Variances" (1979).
+The features F [n, c] of a layer are summarized by (count, mean, C) with C = sum_p a_p (F_p - mean)(F_p - mean)^T. Gram
+matrix and standard deviation follow from it: G = C / n + mean mean^T, sigma = sqrt(diag(C) / n). The reverse, sigma^2 =
+diag(G) - mean^2, cancels: at a mean-to-sigma ratio of a few thousand, float32 has no correct digit left and the
+difference may be negative. Features are therefore centered before they are multiplied (in their own precision, block by
+block), and everything is merged in float64 by the pairwise update of Chan, Golub and LeVeque, "Updating Formulae and a
+Pairwise Algorithm for Computing Sample Variances" (1979).
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-#: Values of a block: what is centered stays in a processor's cache until it has been multiplied.
+#: Values per block. Centered values stay in the CPU cache until they have been multiplied.
 BLOCK_VALUES = 1 << 18
-#: Positions that are summed in the features' precision before float64 takes over: a float32 sum over so few keeps six
-#: digits whatever the size of the tile.
+#: Positions that are summed in the features' precision before float64 takes over. A float32 sum over so few keeps six
+#: digits, whatever the size of the tile.
 SPAN_POSITIONS = 1 << 12
-#: Values of a block on a GPU, which has no such cache, and does better with few launches.
+#: Values per block on a GPU, which has no such cache and prefers few launches.
 _GPU_BLOCK_VALUES = 1 << 21
-#: Positions that the shift is the mean of, at least, where there are as many.
+#: Minimum number of positions averaged for the shift, if there are that many.
 _SHIFT_POSITIONS = 1024
-#: How many standard deviations a channel's mean may lie from the shift: the square of it is what cancels.
+#: Maximum distance of a channel's mean from the shift in standard deviations; cancellation grows with its square.
 _FAR = 8.0
 
 
@@ -35,7 +35,7 @@ class LayerStatistics:
     """Count, mean and centered second moment of one layer, float64.
 
     Attributes:
-        count: scalar tensor, number of positions or sum of their weights.
+        count: Scalar tensor, number of positions or sum of their weights.
         mean: [c].
         centered: [c, c], sum of a_p (F_p - mean)(F_p - mean)^T.
     """
@@ -46,7 +46,7 @@ class LayerStatistics:
 
     @staticmethod
     def zero(channels: int, device: torch.device | str = "cpu") -> LayerStatistics:
-        """The statistics of no positions at all: the neutral element of `merge`."""
+        """Return the statistics of no positions, the neutral element of `merge`."""
         return LayerStatistics(
             torch.zeros((), dtype=torch.float64, device=device),
             torch.zeros(channels, dtype=torch.float64, device=device),
@@ -55,29 +55,28 @@ class LayerStatistics:
 
     @property
     def empty(self) -> bool:
-        """True when no position has any weight, so that mean and Gram matrix do not exist. Waits for the device."""
+        """Whether no position has weight, so mean and Gram matrix do not exist. Synchronizes with the device."""
         return not float(self.count) > 0
 
     @property
     def divisor(self) -> Tensor:
-        """The count, or 1 where there is none: nothing divided by it is nothing, not NaN."""
+        """Count, or 1 if it is 0, so that dividing empty sums gives 0 instead of NaN."""
         return torch.where(self.count > 0, self.count, 1.0)
 
     def gram(self) -> Tensor:
-        """G = F^T F / n, [c, c]; zeros where there is no position."""
+        """Return G = F^T F / n, [c, c]; zeros if there is no position."""
         return self.centered / self.divisor + torch.outer(self.mean, self.mean)
 
     def std(self) -> Tensor:
-        """Population standard deviation, [c]; zeros where there is no position."""
-        # Rounding of the merge may leave -1e-30 where the exact value is 0.
+        """Return the population standard deviation, [c]; zeros if there is no position."""
+        # Rounding errors of the merge may leave -1e-30 where the exact value is 0.
         return (self.centered.diagonal().clamp_min(0) / self.divisor).sqrt()
 
 
 def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
-    """Statistics of two disjoint sets of positions together (Chan et al. 1979).
+    """Return the combined statistics of two disjoint sets of positions (Chan et al. 1979).
 
-    A set without positions, all of whose numbers are 0, adds nothing: no question of it, for which a device would have
-    to be waited for, is needed.
+    An empty set consists of zeros and adds nothing, so no branch, which would synchronize with the device, is needed.
     """
     count = first.count + second.count
     share = second.count / torch.where(count > 0, count, 1.0)
@@ -88,16 +87,17 @@ def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
 
 
 def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
-    """Statistics of all parts together, merged in the order given."""
+    """Return the combined statistics of all parts, merged in the given order."""
     return reduce(merge, parts)
 
 
 def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
-    """Statistics of features [h, w, c], with optional position weights [h, w] >= 0.
+    """Compute the statistics of features [h, w, c], with optional position weights [h, w] >= 0.
 
-    Products run in the features' precision (float32 for half-precision features) on centered blocks; sums over spans of
-    blocks are kept in float64. Blocks are centered at the mean of some positions. Should it turn out to lie far from
-    that of all of them, which on a GPU would be waited for, they are gone through again with the right one.
+    Products run on centered blocks in the features' precision (float32 for half-precision features); sums over spans of
+    blocks are kept in float64. Blocks are centered at a shift, the mean of some positions. On a CPU, if the shift turns
+    out to be far from the true mean, everything is recomputed about the true mean. On a GPU the shift is the mean of
+    all positions, because this check would synchronize with the device.
     """
     height, width, channels = features.shape
     if height * width == 0:
@@ -112,9 +112,9 @@ def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -
 
 
 def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Rows of features [h, w, c] that make a block, and a buffer [rows, w, c] for them in float32 at least.
+    """Yield the row slices of features [h, w, c] that form blocks, each with a buffer [rows, w, c].
 
-    The buffer is the same for all blocks.
+    The buffer is float32 or float64, and all blocks share it.
     """
     height, width, channels = features.shape
     on_cpu = features.device.type == "cpu"
@@ -128,14 +128,14 @@ def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 
 def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
-    """Near the mean [c], in float32 at least: that of some positions, or of those of them that have a weight.
+    """Return the mean [c] of some positions, of those with weight if any has, as float32 or float64.
 
-    Exactly the value of a channel that is constant.
+    For a constant channel it is exactly that constant.
     """
     height, width = features.shape[:2]
     positions = height * width
     count = min(positions, _SHIFT_POSITIONS)
-    # Spread evenly along the rows' order, so that their columns differ whatever the width.
+    # Evenly spaced in row-major order, so that their columns differ at any width.
     places = torch.arange(count) * positions // count
     row, column = places // width, places % width
     some = features[row, column]
@@ -147,14 +147,14 @@ def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
 
 
 def _is_far(shift: Tensor, found: LayerStatistics) -> bool:
-    """Whether digits canceled as the shift was taken out of sums about it. Waits for the device."""
+    """Return whether removing the shift from the sums canceled digits. Synchronizes with the device."""
     offset = (found.mean - shift).abs()
     rounding = torch.finfo(shift.dtype).eps * shift.abs()
     return bool(((offset > _FAR * found.std()) & (offset > _FAR * rounding)).any())
 
 
 def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor | None) -> LayerStatistics:
-    """Statistics from sums about a shift [c]."""
+    """Compute statistics from sums about a shift [c]."""
     channels = features.shape[-1]
     total = _ShiftedSums(channels, shift)
     for rows, block in blocks_of(features):
@@ -165,16 +165,16 @@ def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor 
 
 
 def center(features: Tensor, mean: Tensor, out: Tensor) -> Tensor:
-    """Features [n, w, c] less a mean [c], in the precision of `out` [n, w, c], which is returned."""
+    """Subtract a mean [c] from features [n, w, c], in the precision of `out` [n, w, c], which is returned."""
     if features.dtype == out.dtype:
         return torch.sub(features, mean, out=out)
     return out.copy_(features).sub_(mean)
 
 
 class _ShiftedSums:
-    """Sums about a shift that lies near the mean, so that taking the mean out afterwards cancels nothing.
+    """Sums about a shift close to the mean, so that subtracting the mean afterwards cancels no digits.
 
-    They are added up in the shift's precision over a span, and in float64 over spans.
+    Sums are in the shift's precision within a span, and in float64 across spans.
     """
 
     def __init__(self, channels: int, shift: Tensor) -> None:
@@ -182,23 +182,23 @@ class _ShiftedSums:
         self.total = LayerStatistics.zero(channels, shift.device)
         self._first = torch.zeros_like(shift)
         self._second = shift.new_zeros((channels, channels))
-        #: Channels whose products with themselves and all later ones are computed at a time. What lies below the
-        #: diagonal is left out, but for the blocks on it.
+        #: Channels per strip. Each strip is multiplied with itself and all later channels; the part below the diagonal
+        #: is skipped, except within the diagonal blocks.
         self._strip = max(32, channels // 8) if shift.device.type == "cpu" else channels
         self._positions = 0
 
     def add(self, centered: Tensor, position_weights: Tensor | None) -> None:
-        """Add positions centered [n, c], which are overwritten, with their weights [n]."""
+        """Add centered positions [n, c] with weights [n]; `centered` is overwritten."""
         if position_weights is None:
             self.total.count.add_(centered.shape[0])
             first = centered.sum(dim=0)
         else:
             self.total.count.add_(position_weights.sum(dtype=torch.float64))
-            # With the roots of the weights in both factors, the product is symmetric, and half of it is enough.
+            # With the square root of the weights in both factors, the product is symmetric and half of it is enough.
             roots = position_weights.sqrt()
             centered *= roots[:, None]
             first = (centered * roots[:, None]).sum(dim=0)
-        # A sum in pairs: a product with a vector may add up one position after the other, and lose two more digits.
+        # Pairwise summation. A product with a vector may add the positions one by one and lose two more digits.
         self._first.add_(first)
         for left in range(0, centered.shape[1], self._strip):
             strip = slice(left, left + self._strip)
@@ -215,7 +215,7 @@ class _ShiftedSums:
         self._positions = 0
 
     def statistics(self) -> LayerStatistics:
-        """Of everything that was added."""
+        """Return the statistics of all positions added so far."""
         self._end_span()
         count, first = self.total.count, self.total.mean
         some = count > 0
@@ -227,7 +227,7 @@ class _ShiftedSums:
 
 
 def layer_statistics_reference(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
-    """The same in float64 and in one step: the definition, against which `layer_statistics` is tested."""
+    """Compute the statistics from their definition in float64, unblocked; reference of `layer_statistics`."""
     flat = features.double().reshape(-1, features.shape[-1])
     equal = torch.ones(flat.shape[0], dtype=torch.float64)
     a = equal if position_weights is None else position_weights.double().reshape(-1)

@@ -1,9 +1,8 @@
-"""VGG feature networks as plain layers, with an explicit backward pass.
+"""VGG feature networks as plain layers with an explicit backward pass.
 
-The backward is written out, not left to autograd, for three reasons: only the gradient with respect to
-the pixels is wanted; saved activations are released as soon as they are used; and the discrete decisions
-(ReLU masks, max-pool positions) are plain data, so that a decision that flips under rounding can be told
-from an error.
+The backward pass is written out instead of using autograd for three reasons: only the gradient with respect to the
+pixels is needed; saved activations are released as soon as they are used; and the discrete decisions (ReLU masks,
+max-pool positions) are accessible, so that tests can tell a decision that flips under rounding from an error.
 """
 
 from __future__ import annotations
@@ -23,33 +22,34 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
 from sgsst_core.scene.luminance import gray, gray_gradient
 
-#: Layers whose Gram matrix, mean and standard deviation make up the style loss (Gatys et al.; SGSST).
+#: Layers whose Gram matrix, mean and standard deviation form the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
-#: The picture itself as a layer before the first, not the paper's: three channels, a cell for each pixel, its color
-#: times `PIXEL_UNIT`. That is about the units of a 0-255 input, and a power of two: nothing is rounded, so that the
-#: deviation of a picture of nearly one color is right, where the shift of the input would leave rounding of it.
+#: The image itself as an additional layer before the first, which the paper does not have: three channels, one cell per
+#: pixel, color times `PIXEL_UNIT`. The unit is close to that of a 0-255 input and a power of two, so nothing is
+#: rounded. This keeps the deviation of an image of nearly one color accurate; after the input shift it would be
+#: rounding error.
 PIXELS = "pixels"
 PIXEL_UNIT = 256.0
-#: Layer whose features make up the content loss.
+#: Layer whose features form the content loss.
 CONTENT_LAYER = "relu4_2"
-#: Receptive field of relu5_1 in pixels to either side (VGG19: 70, VGG16: 58), up to the next multiple of 16,
-#: the stride of its cells: with this margin, features owned by a partition tile are exact.
+#: Receptive field of relu5_1 in pixels to either side (VGG19: 70, VGG16: 58), rounded up to a multiple of 16, the
+#: stride of its cells. With this margin, features owned by a partition tile are exact.
 HALO = {"vgg16": 64, "vgg19": 80}
 #: Partition tiles start at multiples of the deepest layer's stride, so that every pooling window lies in one tile.
 ALIGNMENT = 16
-#: Its newer names are not declared.
+#: Untyped, because the stubs lack the newer attributes.
 _CUDNN: Any = torch.backends.cudnn
-#: Relative rounding of what is multiplied in TF32, as `torch.finfo` has those of other formats.
+#: Relative rounding error of TF32 multiplication, the counterpart of `torch.finfo(...).eps`.
 _TF32_EPS = 2.0**-10
-#: Values of a tensor up to which cuDNN's fused convolution, which knows no way around, can count in 32 bits.
+#: Size from which cuDNN's fused convolution would overflow its 32-bit indices; it has no fallback.
 _FUSED_VALUES = 2**31
-#: Side of the picture on which fused convolutions are tried, and by how much of their largest value they may differ
-#: from the parts, which in TF32 or bfloat16 round in other places.
+#: Side of the image used to test fused convolutions, and their tolerance relative to the largest value. In TF32 or
+#: bfloat16 the fused result rounds at other places than the separate operations.
 _TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
 
 
 def layer_stride(layer: str) -> int:
-    """Pixels from one cell of a layer to the next: 1 for `PIXELS` and relu1_*, up to 16 for relu5_*."""
+    """Return the pixels from one cell of a layer to the next: 1 for `PIXELS` and relu1_*, up to 16 for relu5_*."""
     return 1 if layer == PIXELS else 1 << (int(layer[4]) - 1)
 
 
@@ -58,17 +58,17 @@ FeatureGradient = Callable[[str, Tensor, Tensor], None]
 
 @dataclass
 class _Convolution:
-    """A 3x3 convolution with its ReLU."""
+    """3x3 convolution with its ReLU."""
 
     layer: str  # "relu1_1"
     weight: Tensor  # [out, in, 3, 3]
     bias: Tensor  # [out]
     backward_weight: Tensor  # [in, out, 3, 3], transposed and flipped
-    fused: bool = False  # convolution, bias and ReLU are one launch of cuDNN's
+    fused: bool = False  # cuDNN runs convolution, bias and ReLU in one launch
 
 
 class _Pool:
-    """A 2x2 max pool."""
+    """2x2 max pool."""
 
 
 _Step = _Convolution | _Pool
@@ -76,13 +76,13 @@ _Step = _Convolution | _Pool
 
 @dataclass
 class Activations:
-    """What one forward pass leaves behind: the features asked for and what the backward pass needs.
+    """Result of one forward pass: the requested features, and what the backward pass needs.
 
     Attributes:
-        features: layer name to [h, w, c] in the network's dtype (a view in NHWC order), `PIXELS` in float32 at least.
-        outputs: for each step, the ReLU's output [1, c, h, w]; nothing, [0], for a pool, the positions of whose maxima
-            are found again.
-        size: (height, width) of the pixels that went in.
+        features: Features [h, w, c] by layer, in the network's dtype (an NHWC view); `PIXELS` is float32 or float64.
+        outputs: ReLU output [1, c, h, w] of each convolution. A pool has an empty tensor [0], since the positions of
+            its maxima are recomputed.
+        size: (height, width) of the input.
     """
 
     features: dict[str, Tensor]
@@ -90,18 +90,18 @@ class Activations:
     size: tuple[int, int] = (0, 0)
 
     def decisions(self) -> list[Tensor]:
-        """What the backward pass takes from each step: where a ReLU lets through, where a pool's maxima are."""
+        """Return the discrete decisions of each step: ReLU masks, and positions of pooling maxima."""
         pairs = pairwise([*self.outputs[:1], *self.outputs])
         return [output > 0 if output.numel() else max_positions(source) for source, output in pairs]
 
 
 def use_whole_float32() -> None:
-    """Let convolutions and matrix products of float32 be float32 on GPUs too.
+    """Disable TF32 for float32 convolutions and matrix products on GPUs.
 
-    PyTorch lets cuDNN round their factors to the 10 bits of TF32 unless told otherwise: gradients would no longer be
-    exact, and those of a partition no longer those of the whole view.
+    By default, PyTorch lets cuDNN round factors to the 10 bits of TF32. Gradients would no longer be exact, and those
+    of a partition would differ from those of the whole view.
     """
-    # The older names are what other libraries read. They do not say no where the newer ones allow TF32 in general.
+    # Other libraries read the older names; they do not turn TF32 off where the newer settings allow it globally.
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
     _CUDNN.conv.fp32_precision = "ieee"
@@ -109,7 +109,7 @@ def use_whole_float32() -> None:
 
 
 def has_tf32(device: torch.device | str) -> bool:
-    """Whether a device multiplies in TF32: NVIDIA GPUs of compute capability 8.0 and above do."""
+    """Return whether a device supports TF32, as NVIDIA GPUs of compute capability 8.0 and above do."""
     if torch.device(device).type != "cuda" or torch.version.hip is not None:
         return False
     return torch.cuda.get_device_capability(device) >= (8, 0)
@@ -117,10 +117,15 @@ def has_tf32(device: torch.device | str) -> bool:
 
 @contextmanager
 def convolutions(device: torch.device, *, tf32: bool = False, search: bool = False) -> Iterator[None]:
-    """A block in which convolutions of float32 on a GPU are whole float32 or TF32.
+    """Set the precision of float32 convolutions on a GPU inside a `with` block.
 
-    With `search`, cuDNN tries all of its algorithms at the first convolution of each shape and stays with the fastest;
-    without, with the one that it expects to be. What holds outside is as before afterwards; on a CPU nothing changes.
+    Settings are restored afterwards. On a CPU nothing changes.
+
+    Args:
+        device: Device of the convolutions.
+        tf32: Whether to use TF32 instead of full float32.
+        search: Whether cuDNN benchmarks all of its algorithms at the first convolution of each shape. Otherwise it uses
+            its heuristics.
     """
     if device.type != "cuda":
         yield
@@ -134,23 +139,24 @@ def convolutions(device: torch.device, *, tf32: bool = False, search: bool = Fal
 
 
 class FeatureNetwork:
-    """VGG up to the deepest layer asked for.
+    """VGG up to the deepest requested layer.
 
     Args:
-        weights: convolutions and input normalization, in feature units of a 0-255 input.
-        layers: the layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`); what lies behind the
-            deepest of them is left out. One of them at least is a convolution's.
+        weights: Convolutions and input normalization, with features in units of a 0-255 input.
+        layers: Layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`), at least one of them a convolution.
+            The network ends at the deepest of them.
         dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
-        tf32: on NVIDIA GPUs, convolutions of a float32 network round their factors to the 10 bits of TF32; elsewhere it
-            changes nothing.
+        device: Device the network runs on.
+        tf32: Whether convolutions of a float32 network round their factors to the 10 bits of TF32; no effect except on
+            NVIDIA GPUs.
 
     Attributes:
-        precision: in which convolutions are asked for: "tf32", or the name of `dtype`.
-        rounding: of features, relative.
-        unit: by what features of the content layer have been made larger, where 1 is the units of a 0-255 input.
-        pixel_weight: by what the terms of `PIXELS` count more: their factor squared, which is not in these features.
-        search: cuDNN tries its algorithms on pictures of every new size, which takes about ten passes. Off, unless set:
-            it pays for sizes that come back often enough.
+        precision: Precision of convolutions: "tf32", or the name of `dtype`.
+        rounding: Relative rounding error of the features.
+        unit: Factor of the content layer's features relative to the units of a 0-255 input.
+        pixel_weight: Weight of the terms of `PIXELS`: their factor squared, which the features do not contain.
+        search: Whether cuDNN benchmarks its algorithms for every new image size, which takes about ten passes. Off by
+            default; worthwhile for sizes that recur often enough.
     """
 
     def __init__(
@@ -175,7 +181,7 @@ class FeatureNetwork:
         self.halo = HALO[weights.name]
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
-        # The normalization stays in at least float32: in bfloat16, 255 gray levels would lose their last bits twice.
+        # Normalize in float32 or float64: in bfloat16, 255 gray levels would lose their last bits twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
@@ -210,7 +216,7 @@ class FeatureNetwork:
 
     @torch.no_grad()
     def _fuse(self) -> None:
-        """Let cuDNN compute bias and ReLU with the convolution wherever it can, which a try shows."""
+        """Use cuDNN's fused convolution with bias and ReLU wherever a test shows that it works."""
         if self.device.type != "cuda" or torch.version.hip is not None or not torch.backends.cudnn.is_available():
             return
         with convolutions(self.device, tf32=self.tf32):
@@ -219,23 +225,23 @@ class FeatureNetwork:
                     step.fused = _can_fuse(step)
 
     def rounding_of(self, layer: str) -> float:
-        """Relative rounding of a layer's features."""
+        """Return the relative rounding error of a layer's features."""
         return torch.finfo(self._input_dtype).eps if layer == PIXELS else self.rounding
 
     def channels(self, layer: str) -> int:
-        """Number of channels of a layer."""
+        """Return the number of channels of a layer."""
         return self._channels[layer]
 
     @torch.no_grad()
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
-        """Features of pixels.
+        """Compute the features of an image.
 
         Args:
             rgb: [h, w, 3], values 0..1 (not clamped), any float dtype.
-            keep: hold what `backward` needs; without it only the features asked for survive.
+            keep: Whether to store what `backward` needs; if False, only the requested features remain.
 
         Returns:
-            Activations; a layer whose stride exceeds the pixels has zero cells (a dimension of size 0).
+            Activations. A layer whose stride exceeds the image has zero cells (a dimension of size 0).
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
         rgb = rgb.to(self.device, self._input_dtype)
@@ -244,7 +250,7 @@ class FeatureNetwork:
         if PIXELS in self.layers:
             kept.features[PIXELS] = rgb * PIXEL_UNIT
         x = rgb * self._scale + self._shift
-        # [h, w, 3] seen as [1, 3, h, w] is already in channels-last order: no copy.
+        # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
         x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32, search=self.search):
             self._forward_steps(x, kept, keep)
@@ -255,7 +261,7 @@ class FeatureNetwork:
         return kept
 
     def _forward_steps(self, x: Tensor, kept: Activations, keep: bool) -> None:
-        """All steps from the pixels [1, 3, h, w] on, as far as a layer has cells."""
+        """Run all steps from the pixels [1, 3, h, w], as long as layers have cells."""
         for step in self._steps:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
@@ -271,23 +277,23 @@ class FeatureNetwork:
                 kept.features[step.layer] = x[0].permute(1, 2, 0)
 
     def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
-        """ReLU of convolution and bias, of x [1, in, h, w]."""
+        """Apply convolution, bias and ReLU to x [1, in, h, w]."""
         if step.fused and x.shape[2] * x.shape[3] * max(step.weight.shape[:2]) < _FUSED_VALUES:
             return _fused_convolution(x, step)
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
-        """Gradient [1, in, h, w] with respect to what went into a convolution, of that of its sums [1, out, h, w]."""
+        """Return the gradient [1, in, h, w] of a convolution's input, given that of its output before the ReLU."""
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()
     def backward(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor:
-        """Gradient with respect to the pixels; consumes `kept`.
+        """Compute the gradient with respect to the pixels; consumes `kept`.
 
         Args:
-            kept: a forward pass made with keep=True; its tensors are released on the way.
-            feature_gradient: called for each reported layer, deepest first, with its name, its features [h, w, c] and
-                the gradient [h, w, c] so far; adds dL/dfeatures to it in place.
+            kept: Result of a forward pass with keep=True; its tensors are released along the way.
+            feature_gradient: Callback for each reported layer, deepest first. It gets the layer's name, its features
+                [h, w, c] and the gradient [h, w, c] so far, and adds dL/dfeatures to the latter in place.
 
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
@@ -306,9 +312,9 @@ class FeatureNetwork:
         return gray_gradient(pixels) if self._gray else pixels
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
-        """Gradient [1, 3, h, w] with respect to what went into the first step; None where no layer has one."""
+        """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has one."""
         gradient: Tensor | None = None  # [1, c, h, w]
-        masked = False  # 0 already where the ReLU's output is
+        masked = False  # whether gradient is already 0 where the ReLU's output is
         steps = self._steps[: len(kept.outputs)]
         for step in reversed(steps):
             output = kept.outputs.pop()
@@ -327,9 +333,9 @@ class FeatureNetwork:
         return gradient
 
     def held_bytes_per_pixel(self) -> float:
-        """Bytes that a forward pass keeps for each pixel until `backward` has used them.
+        """Return the bytes per pixel that a forward pass stores until `backward` has used them.
 
-        Counted from the layers: a ReLU output of c channels at stride k holds c/k^2 values a pixel.
+        Computed from the layers: a ReLU output of c channels at stride k holds c/k^2 values per pixel.
         """
         size = torch.finfo(self.dtype).bits // 8
         held, stride = 0.0, 1
@@ -343,26 +349,26 @@ class FeatureNetwork:
         return held
 
     def working_bytes_per_pixel(self) -> float:
-        """Bytes a pixel that a forward or backward pass needs beside what is held: two tensors of relu1_1's size."""
+        """Return the bytes per pixel that a pass needs beyond the stored ones: two tensors of relu1_1's size."""
         return 2 * self.channels("relu1_1") * torch.finfo(self.dtype).bits / 8
 
 
 def _fused_convolution(x: Tensor, step: _Convolution) -> Tensor:
-    """ReLU of convolution and bias in one launch, [1, out, h, w] of x [1, in, h, w], both channels last."""
+    """Apply convolution, bias and ReLU in one launch: [1, in, h, w] to [1, out, h, w], both channels last."""
     stride = padding = dilation = (1, 1)
     result: Tensor = torch.ops.aten.cudnn_convolution_relu(x, step.weight, step.bias, stride, padding, dilation, 1)
     return result
 
 
 def _can_fuse(step: _Convolution) -> bool:
-    """Whether cuDNN has a fused convolution of these channels and this dtype, and its result is that of the parts."""
+    """Return whether cuDNN's fused convolution supports this step and agrees with the separate operations."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn((1, int(step.weight.shape[1]), _TRIAL_SIDE, _TRIAL_SIDE), generator=generator)
     x = x.to(step.weight).contiguous(memory_format=torch.channels_last)
     expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
     try:
         found = _fused_convolution(x, step)
-    except RuntimeError:  # cuDNN finds no engine for it
+    except RuntimeError:  # cuDNN has no engine for it
         return False
     difference = float((found - expected).abs().max())
     return found.stride() == expected.stride() and difference <= _TRIAL_TOLERANCE * float(expected.abs().max())

@@ -1,1 +1,1 @@
-"""What ranks tell each other, and who of them does what."""
+"""Communication between ranks, and the division of work among them."""

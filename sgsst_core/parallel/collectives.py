@@ -1,7 +1,7 @@
-"""What the ranks of a job tell each other, as one small interface; `ALONE` is a job of one rank, with nobody to tell.
+"""Collective operations between the ranks of a job; `ALONE` implements them for a single rank.
 
-Every rank calls the same methods in the same order; that is what makes them meet. Results that are "the same on every
-rank" are the same bits, so that whatever follows from them is decided alike everywhere without another message.
+Every rank calls the same methods in the same order. Results that are "identical on all ranks" are bit-identical, so all
+ranks reach the same decisions from them without another message.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from sgsst_core.rasterizer.arguments import Rows
 
 T = TypeVar("T")
 
-#: Waits for statistics under way: those of all ranks together, and the sums [k] float64 of the numbers that went with
-#: them. On a GPU the device waits, not the caller.
+#: Waits for a pending merge of statistics. Returns the merged statistics of all ranks, and the sum [k] float64 of the
+#: numbers sent along. On a GPU the device waits, not the caller.
 Merged = Callable[[], tuple[list[LayerStatistics], Tensor]]
 
-#: What tensors are sent for.
+#: Purposes for which tensors are sent.
 Traffic = Literal["image", "statistics", "gradient"]
 TRAFFIC: tuple[Traffic, ...] = get_args(Traffic)
 
 
 class Collectives(Protocol):
-    """One rank's end of the exchanges of a group of ranks.
+    """Collective operations of one rank in a group of ranks.
 
     Attributes:
-        rank: this one's number in the group.
-        size: how many there are.
-        local_size: how many of them share this machine's memory, this one included.
+        rank: Index of this rank in the group.
+        size: Number of ranks.
+        local_size: Number of ranks on this machine, including this one.
     """
 
     rank: int
@@ -41,66 +41,70 @@ class Collectives(Protocol):
 
     @property
     def sent(self) -> Mapping[Traffic, int]:
-        """Bytes of tensors that this rank has sent so far, as rings move them; of other values, all are small.
+        """Bytes of tensors sent by this rank so far, assuming ring algorithms; other values are too small to count.
 
-        One count for this group, the one that it was made of, and those made of it.
+        The count is shared between this group, its parent group and its subgroups.
         """
         ...
 
     def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
-        """The image [H, ...] of every rank's band of rows [h, ...]; `bands` says which rows each has, in order."""
+        """Return the image [H, ...] composed of every rank's band of rows [h, ...].
+
+        `bands` lists the rows of each rank, in order.
+        """
         ...
 
     def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
-        """This rank's band [h, ...] of the sum over all ranks' images [H, ...]: the adjoint of `all_gather_rows`."""
+        """Return this rank's band [h, ...] of the sum of all ranks' images [H, ...]; adjoint of `all_gather_rows`."""
         ...
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
-        """The sum over all ranks, the same on every rank. The argument may be overwritten."""
+        """Return the sum over all ranks, identical on all ranks. The argument may be overwritten."""
         ...
 
     def union(self, mask: Tensor) -> Tensor:
-        """[n] bool: where any rank's mask [n] bool is true; the same on every rank."""
+        """Return the elementwise OR of all ranks' masks [n] bool, identical on all ranks."""
         ...
 
     def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
-        """Start merging the statistics of disjoint positions, layer by layer, and adding up numbers [k] float64.
+        """Start merging the statistics of disjoint positions, layer by layer, and summing numbers [k] float64.
 
-        Returns at once; what it returns waits for the result, the same on every rank. No other exchange may be started
-        before all results have been waited for, but for further ones of this kind.
+        Returns immediately. The returned function waits for the result, which is identical on all ranks. Until all
+        results have been waited for, no other kind of collective may be started.
         """
         ...
 
     def all_gather(self, value: T) -> list[T]:
-        """Every rank's value, by rank: the same on every rank. Values must be picklable and small."""
+        """Return every rank's value in rank order, identical on all ranks. Values must be picklable and small."""
         ...
 
     def broadcast(self, make: Callable[[], T]) -> T:
-        """What `make` returns on rank 0, the only one that calls it; an `SgsstError` of it is raised on every rank."""
+        """Call `make` on rank 0 only, and return its result on all ranks; an `SgsstError` is raised on all ranks."""
         ...
 
     def set_timeout_for(self, iteration_seconds: float) -> None:
-        """From now on ranks meet in every iteration: one that keeps the others waiting for much longer is given up.
+        """Set the timeout of collectives for iterations of this length.
 
-        Until this is called, they wait for as long as it may take to prepare a job.
+        From this call on, ranks meet in every iteration, and a rank that keeps the others waiting for much longer is
+        given up. Until then, the timeout allows for the preparation of a job.
         """
         ...
 
     def leading_group(self, count: int) -> Collectives | None:
-        """The group of the first `count` ranks; None on the others."""
+        """Return the group of the first `count` ranks; None on other ranks."""
         ...
 
     def split_group(self, groups: int) -> Collectives:
-        """The group of this rank when neighboring ranks form so many groups of equal size."""
+        """Return this rank's group after splitting the ranks into this many equal groups of neighbors."""
         ...
 
 
-class RankLeftOut(Exception):  # noqa: N818 (not an error: the job goes on without this rank)
-    """Raised on ranks that the plan leaves out, because they would only add communication."""
+class RankLeftOut(Exception):  # noqa: N818 (not an error: the job continues without this rank)
+    """Raised on ranks that the plan leaves out because they would only add communication."""
 
 
 class _Alone:
-    """The collectives of one rank."""
+    """Collectives of a single rank."""
 
     rank, size, local_size = 0, 1, 1
     sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
@@ -140,5 +144,5 @@ ALONE: Collectives = _Alone()
 
 
 def same_on_all(collectives: Collectives, value: Any) -> bool:
-    """Whether every rank has an equal value; the same answer on every rank."""
+    """Return whether all ranks have equal values; the answer is identical on all ranks."""
     return all(other == value for other in collectives.all_gather(value))

@@ -1,7 +1,7 @@
-"""Who does what: the rows of a view and the pixels of its scales, shared out among ranks by estimated cost.
+"""Division of work among ranks: rows of a view, and pixels of its scales, by estimated cost.
 
-Every rank computes the whole division from the same numbers, so that nobody has to be told. It changes nothing but
-rounding: partition tiles are exact wherever they are cut.
+Every rank computes the whole division from the same numbers, so no messages are needed. The division affects rounding
+only, because partition tiles are exact wherever they are split.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Size = tuple[int, int]  # height, width in pixels
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of one scale that one rank owns: pixels of `region` go through the network on it, and nowhere else.
+    """Part of one scale that one rank owns: only this rank passes the pixels of `region` through the network.
 
     Attributes:
-        scale: 0 is full size.
-        size: of the whole scaled view.
-        region: edges at multiples of 16, but where the view ends.
+        scale: Scale; 0 is full size.
+        size: Size of the whole scaled view.
+        region: Owned rectangle; edges are multiples of 16 or the border of the view.
     """
 
     scale: int
@@ -34,33 +34,33 @@ class Piece:
     region: Rectangle
 
     def cost(self, halo: int) -> int:
-        """Pixels through the network as one tile."""
+        """Return the pixels through the network if the piece is processed as one tile."""
         return self.tile(halo).outer.pixels if self.region.pixels else 0
 
     def cells(self, layer: str) -> int:
-        """Cells of a layer that the piece owns."""
+        """Return the number of cells of a layer that the piece owns."""
         return self.tile(0).owned_cells(layer, self.size)[0].pixels if self.region.pixels else 0
 
     def tile(self, halo: int) -> PartitionTile:
-        """The piece as one partition tile."""
+        """Return the piece as one partition tile."""
         return partition(*self.size, None, halo, self.region)[0]
 
 
 @functools.lru_cache(maxsize=1024)
 def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> tuple[tuple[Piece, ...], ...]:
-    """Share pieces out among ranks in proportion to their speeds, by cutting them.
+    """Divide pieces among ranks in proportion to their speeds.
 
-    Ranks are halved again and again, and the pieces with them: the larger ones go to the one half, the smaller ones to
-    the other, and the one in between is cut where the costs, halos included, match the speeds. So every halving makes
-    two halos, not two for each scale.
+    Ranks are halved recursively, and the pieces with them: larger ones go to one half, smaller ones to the other, and
+    the one in between is split where the costs, including halos, match the speeds. Each halving therefore adds two
+    halos in total, not two per scale.
 
     Args:
-        pieces: one for each scale.
-        halo: pixels around a tile.
-        speeds: of the ranks, in any unit.
+        pieces: One piece per scale.
+        halo: Pixels around a tile.
+        speeds: Relative speeds of the ranks.
 
     Returns:
-        For each rank its pieces, scale 0 first; none where there is less work than 16 x 16 pixels for each rank.
+        Pieces of each rank, scale 0 first. A rank may get none if there are fewer than 16 x 16 pixels per rank.
     """
     if len(speeds) == 1:
         return (tuple(sorted(pieces, key=lambda piece: piece.scale)),)
@@ -71,12 +71,12 @@ def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> t
 
 
 def _cut(pieces: tuple[Piece, ...], share: float, halo: int) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
-    """Two sets of pieces, the first with that share of the cost."""
+    """Divide pieces into two sets, of which the first has a given fraction of the cost."""
     ordered = sorted(pieces, key=lambda piece: -piece.cost(halo))
     costs = [piece.cost(halo) for piece in ordered]
     total = sum(costs)
     before = 0
-    place = 0  # of the piece to be cut
+    place = 0  # index of the piece to split
     while place < len(ordered) - 1 and before + costs[place] < share * total:
         before += costs[place]
         place += 1
@@ -94,14 +94,14 @@ def _cut(pieces: tuple[Piece, ...], share: float, halo: int) -> tuple[tuple[Piec
 
 
 def _cuts(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
-    """All ways to cut a piece in two: across or along at every 16th pixel, or not at all."""
+    """Return all ways to split a piece in two: at every 16th row or column, or not at all."""
     area = piece.region
     cuts: list[tuple[Piece | None, Piece | None]] = [(piece, None), (None, piece)]
 
     def part(region: Rectangle) -> Piece:
         return Piece(piece.scale, piece.size, region)
 
-    for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):  # first: rows lie together in memory
+    for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):  # rows first, because they are contiguous in memory
         upper = part(Rectangle(area.top, area.left, row, area.right))
         cuts.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
     for column in range(area.left + ALIGNMENT, area.right, ALIGNMENT):
@@ -111,10 +111,10 @@ def _cuts(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
 
 
 def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Rows]:
-    """Bands of rows for `count` ranks, in order; a band may be empty.
+    """Divide the rows of an image into one band per rank, in order; bands may be empty.
 
-    Bands begin at multiples of a raster tile, whose Gaussians would else be looked at twice. They share the covered
-    rows equally; the empty ones above and below cost nothing and go to the first and the last band.
+    Bands start at raster tile boundaries, since Gaussians of a divided raster tile would be processed twice. The
+    covered rows are divided equally; empty rows above and below cost nothing and go to the first and last band.
     """
     top, bottom = covered or (0, height)
     first, last = top // RASTER_TILE, -(-bottom // RASTER_TILE)
@@ -124,14 +124,14 @@ def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Ro
 
 
 def rounds(scales: Sequence[int], ranks: int) -> list[list[int]]:
-    """Scales whose activations are in memory at a time.
+    """Return groups of scales whose activations are in memory at the same time.
 
-    One rank takes them one by one, so that it holds those of one scale only. Several ranks take all at once: they have
-    equal work on all scales together, not on each, and would wait for each other in between.
+    A single rank processes scales one by one, to hold the activations of only one. Several ranks process all scales at
+    once: their work is balanced over all scales together, not for each, so they would wait for each other in between.
     """
     return [[scale] for scale in scales] if ranks == 1 else [list(scales)]
 
 
 def loads(shares: Sequence[Sequence[Piece]], halo: int) -> list[int]:
-    """Pixels through the network on each rank."""
+    """Return the number of pixels that each rank passes through the network."""
     return [sum(piece.cost(halo) for piece in share) for share in shares]

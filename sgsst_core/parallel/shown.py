@@ -1,6 +1,6 @@
-"""Which Gaussians a view shows. All others have no gradient, so that it need not travel for them.
+"""Sets of the Gaussians that a view shows; only their gradients need to be exchanged.
 
-Geometry is frozen, and so is what a view shows: ranks agree on it at the view's first visit, and never again.
+Geometry is frozen, so these sets never change: ranks agree on them at the first visit of each view.
 """
 
 from __future__ import annotations
@@ -9,26 +9,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: Where a view shows more than this share of the Gaussians, its gradient travels as it is: picking values out and
-#: putting them back would take what sending fewer saves.
+#: Above this fraction of shown Gaussians, the whole gradient is sent: gathering and scattering values would take more
+#: time than sending fewer of them saves.
 DENSE_SHARE = 0.7
 
 
 def gaussians_sent(shown: float, gaussians: int) -> float:
-    """For how many of so many Gaussians a gradient travels, of a view that shows some of them."""
+    """Return the number of Gaussians whose gradients are sent for a view that shows `shown` of them."""
     return shown if shown <= DENSE_SHARE * gaussians else gaussians
 
 
 class ShownGaussians:
-    """A set of Gaussians, one bit each.
+    """Set of Gaussians, one bit each.
 
-    A view's is kept for the whole job: 4 million Gaussians take 0.5 MB, where their indices would take up to 32.
+    Each view's set is stored for the whole job: 4 million Gaussians take 0.5 MB, while their indices would take up to
+    32 MB.
 
     Args:
-        mask: [N] bool, any device, on which the bits stay.
+        mask: [N] bool, on any device; the bits are stored on the same device.
 
     Attributes:
-        count: how many there are.
+        count: Number of Gaussians in the set.
         total: N.
     """
 
@@ -40,27 +41,27 @@ class ShownGaussians:
 
     @staticmethod
     def nbytes(gaussians: int) -> int:
-        """Bytes of a set out of so many Gaussians."""
+        """Return the size in bytes of a set out of this many Gaussians."""
         return -(-gaussians // 8)
 
     @property
     def sparse(self) -> bool:
-        """Whether a gradient travels for these alone."""
+        """Whether only the gradients of these Gaussians are sent."""
         return gaussians_sent(self.count, self.total) < self.total
 
     def indices(self) -> Tensor:
-        """[count] int64, in rising order."""
-        if self._bits.device.type == "cpu":  # an order of magnitude faster there
+        """Return the indices [count] int64 in ascending order."""
+        if self._bits.device.type == "cpu":  # an order of magnitude faster on a CPU
             mask = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
             return torch.from_numpy(np.flatnonzero(mask))
         return self._device_indices()
 
     def _device_indices(self) -> Tensor:
-        """`indices` on any device, for which nothing waits."""
+        """Compute `indices` on any device without synchronizing with it."""
         mask = (self._bits[:, None] >> _places(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
         return torch.nonzero_static(mask, size=self.count)[:, 0]
 
 
 def _places(device: torch.device) -> Tensor:
-    """Of the bits of a byte."""
+    """Return the positions of the bits in a byte."""
     return torch.arange(8, dtype=torch.uint8, device=device)
