@@ -1,7 +1,7 @@
-"""Rasterizers: one small protocol, six implementations.
+"""Rasterizers: one small protocol and its implementations for CPU and GPU.
 
-Geometry is frozen, so a view's image is linear in its colors: image = W c + T_final * background,
-and the gradient with respect to the colors is W^T dL/dimage.
+Geometry is frozen, so the image of a view is linear in its colors: image = W c + T_final * background. The gradient
+with respect to the colors is W^T dL/dimage.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ RasterizerName = Literal["reference", "cpu", "cached", "triton", "cuda"]
 
 
 class Rasterizer(Protocol):
-    """Renders one scene's frozen geometry with any colors.
+    """Renderer of a scene with frozen geometry and arbitrary colors.
 
-    `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colors` are the
-    colors of one view, after spherical harmonics and clamp. Arguments may come in any floating dtype and from any
-    device; results are on `device`, in `dtype`. A wrong shape is a ValueError.
+    `rows` is a half-open band (start, stop) of pixel rows; None is the whole view. `colors` are the colors of one
+    view, after spherical harmonics and clamping. Arguments may have any floating dtype and be on any device; results
+    are on `device`, in `dtype`. A wrong shape raises ValueError.
 
-    Images are of full size (`scale` 0) but for `coarse`, whose images are 2^scale x 2^scale box averages of the
-    camera's: heights, widths and rows are those at its scale.
+    Images are at full size (`scale` 0), except those of `coarse`. Its images are 2^scale x 2^scale box averages of the
+    camera's, and heights, widths and rows refer to its scale.
     """
 
     name: str
@@ -39,19 +39,19 @@ class Rasterizer(Protocol):
     dtype: torch.dtype
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] of colors [N, 3] in the camera's rows, over the background."""
+        """Return the image [h, width, 3] of colors [N, 3] over the background."""
         ...
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
         ...
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3] of the rows."""
         ...
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [h, width] of the whole view, and each Gaussian's blend weights summed over all its pixels [N]."""
+        """Return coverage [h, width] of the whole view, and each Gaussian's blend weight summed over all pixels [N]."""
         ...
 
 
@@ -64,20 +64,20 @@ def make_rasterizer(
     device: torch.device | str | None = None,
     **options: Any,
 ) -> Rasterizer:
-    """The rasterizer called `name` (`reference`, `cpu`, `cached`, `triton` or `cuda`) for a scene.
+    """Create the rasterizer of a given name for a scene.
 
     Args:
-        name: `cpu` computes blend weights in every call, `cached` keeps them (its options `precision`, `max_bytes` and
-            `uncached`), `triton` runs on GPUs, `cuda` is gsplat, `reference` is slow and float64.
-        scene: its geometry must not change while the rasterizer lives.
-        background: three values added where Gaussians leave pixels uncovered.
-        near: near plane in world units.
-        device: for `cached`, `triton` and `cuda`; None is the CPU for the first, or the device of its option
-            `uncached`, and the current GPU for the others.
-        options: of the implementation's own constructor.
+        name: `cpu` computes blend weights in every call; `cached` stores them (its options are `precision`, `max_bytes`
+            and `uncached`); `triton` runs on GPUs; `cuda` uses gsplat; `reference` is slow and float64.
+        scene: Scene, whose geometry must not change during the rasterizer's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        device: Device for `cached`, `triton` and `cuda`. None is the CPU for `cached` (or the device of its option
+            `uncached`), and the current GPU for the others.
+        options: Further arguments of the implementation's constructor.
 
     Raises:
-        SettingsError: no such rasterizer, a device it cannot use, or gsplat or a GPU missing for `cuda`.
+        SettingsError: If there is no such rasterizer, it cannot use the device, or `cuda` lacks gsplat or a GPU.
     """
     settings: dict[str, Any] = {"background": background, "near": near, **options}
     if name in ("reference", "cpu"):

@@ -1,4 +1,4 @@
-"""What all rasterizers check about their arguments, and how they tell cameras apart."""
+"""Argument checks shared by all rasterizers, and cache keys of cameras."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from sgsst_core.scene.camera import Camera
 
 Rows = tuple[int, int]
 
-#: Equal keys mean equal pictures: everything about a camera that rendering depends on; its name is not part of it.
+#: Cameras with equal keys render equal images. The key contains everything that rendering depends on, so not the name.
 CameraKey = tuple[int, int, float, float, float, float, bytes]
 
 
 def camera_key(camera: Camera) -> CameraKey:
-    """A hashable key with the content of a camera."""
+    """Return a hashable key of a camera's content."""
     pose = camera.world_to_camera.detach().cpu().double().contiguous().numpy().tobytes()
     return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose
 
 
 def check_rows(camera: Camera, rows: Rows | None) -> Rows:
-    """The band as (start, stop); None is the whole view.
+    """Return the band of rows as (start, stop); None is the whole view.
 
     Raises:
-        ValueError: the band is empty or reaches beyond the view.
+        ValueError: If the band is empty or extends beyond the view.
     """
     start, stop = (0, camera.height) if rows is None else rows
     if not 0 <= start < stop <= camera.height:
@@ -32,10 +32,10 @@ def check_rows(camera: Camera, rows: Rows | None) -> Rows:
 
 
 def check_colors(colors: Tensor, gaussians: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`colors` [N, 3], contiguous, in the dtype and on the device of the rasterizer.
+    """Return `colors` [N, 3], contiguous, in the dtype and on the device of the rasterizer.
 
     Raises:
-        ValueError: not one color for each Gaussian of the scene.
+        ValueError: If there is not exactly one color per Gaussian.
     """
     if tuple(colors.shape) != (gaussians, 3):
         raise ValueError(f"colors of shape {tuple(colors.shape)}: the scene needs {(gaussians, 3)}")
@@ -45,10 +45,10 @@ def check_colors(colors: Tensor, gaussians: int, dtype: torch.dtype, device: tor
 def check_image_gradient(
     image_gradient: Tensor, camera: Camera, rows: Rows, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """`image_gradient` [h, width, 3] of a band, contiguous, in the dtype and on the device of the rasterizer.
+    """Return `image_gradient` [h, width, 3] of a band, contiguous, in the dtype and on the device of the rasterizer.
 
     Raises:
-        ValueError: not the shape of the band.
+        ValueError: If the shape does not match the band.
     """
     expected = (rows[1] - rows[0], camera.width, 3)
     if tuple(image_gradient.shape) != expected:

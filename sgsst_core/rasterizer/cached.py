@@ -1,8 +1,8 @@
-"""`cached`: the blend weights of a view kept and applied again and again.
+"""`cached`: rasterizer that stores the blend weights of a view and reapplies them in every step.
 
-Geometry is frozen, so a view's W never changes: an image is W c + T_final background, a gradient W^T dL/dimage, and
-what is left of rasterizing is reading W from memory. Weights are kept where they are applied, in a layout for the
-device: `strips` on the CPU, `triton_kept` on GPUs.
+Geometry is frozen, so a view's W never changes: an image is W c + T_final background, its gradient W^T dL/dimage, and
+rasterizing reduces to reading W from memory. Weights are stored on the device that applies them, in a layout made for
+it: `strips` on the CPU, `triton_kept` on GPUs.
 """
 
 from __future__ import annotations
@@ -36,40 +36,41 @@ from sgsst_core.scene.gaussians import Scene
 
 @dataclass(frozen=True)
 class _Kept:
-    """Weights in memory, and the band they are good for."""
+    """Cached weights, and the band that they cover."""
 
     band: Rows
     weights: CachedWeights
 
 
 class CachedRasterizer:
-    """The protocol of `sgsst_core.rasterizer.Rasterizer` with blend weights that are computed once a view.
+    """Implementation of `sgsst_core.rasterizer.Rasterizer` with blend weights that are computed once per view.
 
-    Weights are kept in the order in which views first come, or in which `keep` names them, until the next ones would
-    exceed `max_bytes`; nothing is ever evicted (views come round in turn, so that what is evicted would be needed again
-    before what is kept). Views and bands without kept weights are computed each time, on the same device, by `cpu` or
-    `triton`: on the CPU with the same image as float32 weights give and gradients within rounding, on a GPU both within
-    rounding. A band is served from the whole view's weights where those are kept, else from its own. Color gradients
-    repeat to the bit.
+    Weights are cached in the order of the views' first use, or of the calls of `keep`, until the next ones would exceed
+    `max_bytes`. Nothing is ever evicted: views come round in turn, so evicted weights would be needed again before the
+    remaining ones. Views and bands without cached weights are computed in every call, on the same device, by `cpu` or
+    `triton`. On the CPU, images are then bit-identical to those from float32 weights and gradients equal up to
+    rounding; on a GPU, both are equal up to rounding. A band uses the whole view's weights if they are cached, else its
+    own. Color gradients are reproducible bit for bit.
 
     Args:
-        scene: its geometry must not change while this object lives.
-        background: three values added where Gaussians leave pixels uncovered.
-        near: near plane in world units.
-        alpha_max: clamp of alpha.
-        precision: of the kept weights. `half` takes half the memory; each weight then has a relative error of at most
-            2^-11.
-        max_bytes: memory for weights; None is no limit. On the CPU they share it with the lists of `uncached`, which
-            keeps those that weights leave room for, and lets go of a view's once its weights are kept.
-        least_list_bytes: memory for these lists beside it, however much is taken by weights.
-        at_first_use: keep what comes; False keeps what `keep` is called for alone, so that looks at other views in
-            between, as many as there may be, change no bit of what follows.
-        device: where weights are kept and applied, and where results lie.
-        uncached: Rasterizer of the same scene that computes weights, and what is not kept. Its lists, device,
-            background, near plane and clamp of alpha take the place of those given here; None makes one.
+        scene: Scene, whose geometry must not change during this object's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        alpha_max: Upper limit of alpha.
+        precision: Precision of the cached weights. `half` takes half the memory, with a relative error of at most 2^-11
+            per weight.
+        max_bytes: Memory budget for weights; None for no limit. On the CPU they share it with the tile intersections of
+            `uncached`, which get what the weights leave, and which are dropped for a view once its weights are cached.
+        least_list_bytes: Minimum budget for these tile intersections, however much the weights take.
+        at_first_use: Whether to cache weights at first use; if False, only by `keep`. Then rendering any number of
+            other views in between does not change later results by a single bit.
+        device: Device that stores and applies the weights and holds the results.
+        uncached: Rasterizer of the same scene that computes weights and everything without cached weights. Its tile
+            intersections, device, background, near plane and limit of alpha replace the arguments above. None to create
+            one.
 
     Raises:
-        SettingsError: Triton cannot run on `device`, which is not the CPU.
+        SettingsError: If `device` is not the CPU and Triton cannot run on it.
     """
 
     name = "cached"
@@ -107,18 +108,21 @@ class CachedRasterizer:
         self._lock = threading.Lock()
 
     def count(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
-        """Count a band's weights: costs about one render, and keeps nothing."""
+        """Count a band's weights without caching them; takes about as long as one render."""
         band = check_rows(camera, rows)
         if isinstance(self.uncached, CpuRasterizer):
             return CountedStrips(self.uncached, camera, band)
         return CountedPieces(self.uncached, camera, band)
 
     def operator_bytes(self, camera: Camera, rows: Rows | None = None) -> int:
-        """Bytes that a band's weights take or would take. Costs about one render, and keeps nothing."""
+        """Return the size in bytes of a band's weights without caching them; takes about as long as one render."""
         return self.count(camera, rows).nbytes(self.precision)
 
     def keep(self, camera: Camera, rows: Rows | None = None) -> bool:
-        """Keep a band's weights from now on; whether they fit, which is decided when the band is first named."""
+        """Cache a band's weights if they fit, and return whether the band has cached weights.
+
+        Whether they fit is decided the first time that the band is named.
+        """
         key, band = camera_key(camera), check_rows(camera, rows)
         with self._lock:
             if self._serving(key, band, camera) is None and (key, band) not in self._kept:
@@ -127,9 +131,10 @@ class CachedRasterizer:
 
     @contextmanager
     def lending(self, camera: Camera, rows: Rows | None = None) -> Iterator[None]:
-        """A block in which a band is served from weights as `keep` makes them, and after which they are gone.
+        """Use temporary cached weights for a band inside a `with` block.
 
-        Those that are kept by then serve it; those that alone exceed `max_bytes`, which `keep` never makes, do not.
+        If the band already has cached weights, those are used. Weights that alone exceed `max_bytes`, which `keep`
+        would never cache, are not computed.
         """
         key, band = camera_key(camera), check_rows(camera, rows)
         counted = None if self._serving(key, band, camera) else self.count(camera, band)
@@ -141,11 +146,11 @@ class CachedRasterizer:
             self._lent.pop((key, band), None)
 
     def is_kept(self, camera: Camera, rows: Rows | None = None) -> bool:
-        """Whether the band is served from kept weights by now."""
+        """Return whether the band has cached weights."""
         return self._serving(camera_key(camera), check_rows(camera, rows), camera) is not None
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
+        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
         band = check_rows(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, self.device)
         kept = self._kept_for(camera, band)
@@ -154,7 +159,7 @@ class CachedRasterizer:
         return kept.weights.render(values)[band[0] - kept.band[0] : band[1] - kept.band[0]]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         band = check_rows(camera, rows)
         kept = self._kept_for(camera, band)
         if kept is None:
@@ -162,30 +167,33 @@ class CachedRasterizer:
         return 1 - kept.weights.transmittance[band[0] - kept.band[0] : band[1] - kept.band[0]]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
         kept = self._kept_for(camera, band)
         if kept is None:
             return self.uncached.color_gradient(pixels, camera, band)
-        if kept.band != band:  # the weights of the whole view: no gradient from the other rows
+        if kept.band != band:  # weights of the whole view: zero gradient in the other rows
             whole = pixels.new_zeros((camera.height, camera.width, 3))
             whole[band[0] : band[1]] = pixels
             pixels = whole
         return kept.weights.color_gradient(pixels)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]; keeps nothing."""
+        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N].
+
+        Caches nothing.
+        """
         return self.uncached.survey(camera)
 
     def _kept_for(self, camera: Camera, band: Rows) -> _Kept | None:
-        """The kept weights that serve a band, made now if they are to be and fit; None where there are none."""
+        """Return the cached weights for a band, or None. With `at_first_use` they are computed first, if they fit."""
         if self._at_first_use:
             self.keep(camera, band)
         return self._serving(camera_key(camera), band, camera)
 
     def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _Kept | None:
-        """The weights that serve a band by now: those of the whole view, else its own."""
+        """Return the present cached weights for a band: those of the whole view, else its own, else temporary ones."""
         whole = self._kept.get((key, (0, camera.height)))
         return whole or self._kept.get((key, band)) or self._lent.get((key, band))
 
@@ -202,9 +210,9 @@ class CachedRasterizer:
 
 
 def repeatable(rasterizer: Rasterizer) -> Rasterizer:
-    """What renders a rasterizer's images with the same bits whether weights are kept by then or not.
+    """Return a rasterizer whose images are bit-identical whether or not weights are cached.
 
-    `cached` itself only in float32 on the CPU: see there.
+    This is `cached` itself only in float32 on the CPU; otherwise it is the rasterizer that computes its weights.
     """
     if not isinstance(rasterizer, CachedRasterizer):
         return rasterizer

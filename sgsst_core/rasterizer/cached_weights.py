@@ -1,4 +1,4 @@
-"""What `cached` asks of a layout of kept blend weights: `strips` on the CPU, `triton_kept` on GPUs."""
+"""Interface between `cached` and the layouts of cached blend weights: `strips` on the CPU, `triton_kept` on GPUs."""
 
 from __future__ import annotations
 
@@ -6,40 +6,40 @@ from typing import Literal, Protocol
 
 from torch import Tensor
 
-#: `half` is float16 times a power of two: each weight has a relative error of at most 2^-11.
+#: `half` is float16 times a power of two, with a relative error of at most 2^-11 per weight.
 Precision = Literal["float32", "half"]
 
 
 class CachedWeights(Protocol):
-    """Blend weights of one band of a view, on the device where they are applied.
+    """Cached blend weights of one band of a view, on the device where they are applied.
 
     Attributes:
-        transmittance: [h, width] float32, final.
+        transmittance: [h, width] float32, final transmittance.
     """
 
     transmittance: Tensor
 
     @property
     def nbytes(self) -> int:
-        """Bytes that they take on the device."""
+        """Size on the device in bytes."""
         ...
 
     def render(self, colors: Tensor) -> Tensor:
-        """Image [h, width, 3] float32 of colors [N, 3], over the background."""
+        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
         ...
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3]."""
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3]."""
         ...
 
 
 class CountedWeights(Protocol):
-    """Blend weights of one band of a view that are counted, not kept."""
+    """Blend weights of one band of a view, counted but not stored."""
 
     def nbytes(self, precision: Precision) -> int:
-        """Bytes that they would take."""
+        """Return the size that the weights would have in bytes."""
         ...
 
     def keep(self, precision: Precision) -> CachedWeights:
-        """Compute them once more, and keep them."""
+        """Compute the weights again and store them."""
         ...

@@ -1,8 +1,8 @@
-"""`coarse`: the box average of a view and its blend weights kept as one operator, for phase 1.
+"""`coarse`: box average and blend weights of a view, cached as a single operator for phase 1.
 
-At scale s the optimizer sees image_s = D (W c + T_final background), D the 2^s x 2^s box average
-(`pyramid.downscale`). Geometry is frozen, so D W never changes either; and because the pixels of a square
-share one weight, it is far smaller than W, and faster to apply by as much.
+At scale s the optimizer sees image_s = D (W c + T_final background), where D is the 2^s x 2^s box average
+(`pyramid.downscale`). Geometry is frozen, so D W never changes. The pixels of a square share one weight, so D W is much
+smaller than W and correspondingly faster to apply.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
 _CPU = torch.device("cpu")
-#: At this scale a raster tile is one pixel. Coarser pixels are averages of these.
+#: Scale at which a raster tile is one pixel. Coarser pixels are averages of these.
 _LARGEST_PIECE_SCALE = RASTER_TILE.bit_length() - 1
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Where a view's complete squares of 2^scale pixels lie."""
+    """Layout of a view's complete squares of 2^scale pixels."""
 
-    size: tuple[int, int]  # height and width in pixels of the part that fills squares
-    across: int  # raster tiles in a row of the whole view
-    piece_scale: int  # scale of the kept weights: `scale`, but one raster tile at most
+    size: tuple[int, int]  # height and width in pixels of the part covered by complete squares
+    across: int  # number of raster tiles in a row of the whole view
+    piece_scale: int  # scale of the cached weights: `scale`, but at most one raster tile
 
     @classmethod
     def of(cls, camera: Camera, scale: int) -> _Grid:
-        """The grid of a view at a scale.
+        """Return the grid of a view at a scale.
 
         Raises:
-            ValueError: a view that does not hold one square.
+            ValueError: If the view does not contain a single square.
         """
         size = (camera.height >> scale << scale, camera.width >> scale << scale)
         if 0 in size:
@@ -54,30 +54,30 @@ class _Grid:
         return cls(size, tile_grid(camera)[0], min(scale, _LARGEST_PIECE_SCALE))
 
     def shape(self, scale: int) -> tuple[int, int]:
-        """Height and width of the view's image at a scale."""
+        """Return height and width of the view's image at a scale."""
         return self.size[0] >> scale, self.size[1] >> scale
 
 
 @dataclass(frozen=True)
 class _Counts:
-    """What a view's operator will need, counted before anything is kept."""
+    """Sizes of a view's operator, counted before it is built."""
 
     tile_pieces: NDArray[np.int64]  # [raster tiles]
-    slot_used: NDArray[np.bool_]  # [E], whether a (Gaussian, raster tile) has a piece
+    slot_used: NDArray[np.bool_]  # [E], whether a (Gaussian, raster tile) pair has a piece
 
     @property
     def pieces(self) -> int:
         return int(self.tile_pieces.sum())
 
     def nbytes(self, lists: RasterLists, grid: _Grid) -> int:
-        """Bytes of all arrays of a `CoarseOperator`."""
+        """Return the size in bytes of all arrays of a `CoarseOperator`."""
         height, width = grid.shape(grid.piece_scale)
         offsets = 8 * (len(self.tile_pieces) + 1) + lists.first_slots.nbytes + lists.projection.gaussians.nbytes
         return offsets + 4 * height * width + self.pieces * (8 + 4 * (RASTER_TILE >> grid.piece_scale) ** 2)
 
 
 def _count(lists: RasterLists, grid: _Grid, alpha_max: float) -> _Counts:
-    """Count what a view's operator will need: costs about one render."""
+    """Count the sizes of a view's operator; takes about as long as one render."""
     counts = _Counts(np.zeros(len(lists.starts) - 1, dtype=np.int64), np.zeros(len(lists.ranks), dtype=np.bool_))
     tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
     with kernel_threads():
@@ -111,11 +111,11 @@ class CoarseOperator:
 
     @property
     def nbytes(self) -> int:
-        """Bytes kept in memory."""
+        """Memory use in bytes."""
         return sum(a.nbytes for a in (*self.pieces, self.transmittance, self.gaussians, self.first_slots))
 
     def render(self, colors: NDArray[np.float32], background: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Image [h, w, 3] of colors [N, 3]."""
+        """Return the image [h, w, 3] of colors [N, 3]."""
         image = np.empty((*self.transmittance.shape, 3), dtype=np.float32)
         with kernel_threads():
             coarse_kernels.apply_pieces(
@@ -124,7 +124,7 @@ class CoarseOperator:
         return image
 
     def color_gradient(self, image_gradient: NDArray[np.float32], gaussians: int) -> NDArray[np.float32]:
-        """W^T D^T dL/dimage_s, [gaussians, 3], of image_gradient [h, w, 3]."""
+        """Return W^T D^T dL/dimage_s, [gaussians, 3], given the image gradient [h, w, 3]."""
         gradient = np.zeros((gaussians, 3), dtype=np.float32)
         slot_gradients = np.empty((len(self.pieces.slots), 3), dtype=np.float32)
         with kernel_threads():
@@ -134,7 +134,7 @@ class CoarseOperator:
 
 
 class _Operators:
-    """Operators of views at coarse scales, kept until the next one would exceed `max_bytes`."""
+    """Cache of operators at coarse scales, filled until the next one would exceed `max_bytes`."""
 
     def __init__(self, cpu: CpuRasterizer, max_bytes: int | None, at_first_use: bool) -> None:
         self.max_bytes = max_bytes
@@ -145,13 +145,13 @@ class _Operators:
         self._lock = threading.Lock()
 
     def get(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
-        """The view's kept operator, built now if it is to be and fits; None where there is none."""
+        """Return the view's cached operator, or None. With `at_first_use` it is built first, if it fits."""
         if self.at_first_use:
             self.keep(camera, scale, grid)
         return self.kept.get((camera_key(camera), scale))
 
     def keep(self, camera: Camera, scale: int, grid: _Grid) -> None:
-        """Build the view's operator if it is new and fits."""
+        """Build and cache the view's operator if it is new and fits."""
         key = (camera_key(camera), scale)
         with self._lock:
             if key not in self.kept:
@@ -169,23 +169,24 @@ class _Operators:
 
 
 class CoarseRasterizer:
-    """The protocol of `sgsst_core.rasterizer.Rasterizer` at a coarse scale, on the CPU.
+    """Implementation of `sgsst_core.rasterizer.Rasterizer` at a coarse scale, on the CPU.
 
-    Operators are kept in the order in which views first come, or in which `keep` names them, until the next one would
-    exceed `max_bytes`; nothing is ever evicted. Views without a kept operator are rendered at full size by `cpu` and
-    averaged, with the same result up to rounding. Results are the same bits for any number of threads.
+    Operators are cached in the order of the views' first use, or of the calls of `keep`, until the next one would
+    exceed `max_bytes`; nothing is ever evicted. Views without a cached operator are rendered at full size by `cpu` and
+    averaged, with the same result up to rounding. Results are bit-identical for any number of threads.
 
-    Cameras are those of full-size views. Rows and columns that fill no square of 2^scale pixels are left out, as by
-    `pyramid.downscale`. Every method raises ValueError for a view that holds no such square: its image would be empty.
+    Cameras are those of full-size views. Rows and columns outside complete squares of 2^scale pixels are dropped, as in
+    `pyramid.downscale`. Every method raises ValueError for a view without a complete square, whose image would be
+    empty.
 
     Args:
-        cpu: whose scene, lists, background, near plane and clamp of alpha this object shares.
-        scale: 1 or more.
-        max_bytes: most bytes of operators to keep; None for no limit.
-        at_first_use: keep what comes; False keeps what `keep` is called for alone (`CachedRasterizer`).
+        cpu: Rasterizer whose scene, tile intersections, background, near plane and limit of alpha this object shares.
+        scale: Scale, 1 or more.
+        max_bytes: Memory budget for operators; None for no limit.
+        at_first_use: Whether to cache operators at first use; if False, only by `keep` (see `CachedRasterizer`).
 
     Raises:
-        ValueError: scale 0 or less.
+        ValueError: If the scale is less than 1.
     """
 
     name = "coarse"
@@ -203,33 +204,36 @@ class CoarseRasterizer:
         self._operators = _Operators(cpu, max_bytes, at_first_use)
 
     def at(self, scale: int) -> CoarseRasterizer:
-        """The same at another scale; what both keep counts together."""
+        """Return the same rasterizer at another scale; both share the cache and its budget."""
         other = CoarseRasterizer(self._cpu, scale)
         other._operators = self._operators
         return other
 
     @property
     def kept_bytes(self) -> int:
-        """Bytes of the operators that are kept by now, of all scales."""
+        """Size in bytes of all cached operators, at all scales."""
         return self._operators.kept_bytes
 
     def operator_bytes(self, camera: Camera) -> int:
-        """Bytes that a view's operator takes or would take. Costs about one render, and keeps nothing."""
+        """Return the size in bytes of a view's operator without caching it; takes about as long as one render."""
         grid = _Grid.of(camera, self.scale)
         lists = self._cpu.lists(camera)
         return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
 
     def keep(self, camera: Camera) -> bool:
-        """Keep a view's operator from now on; whether it fits, which is decided when the view is first named."""
+        """Cache a view's operator if it fits, and return whether it is cached.
+
+        Whether it fits is decided the first time that the view is named.
+        """
         self._operators.keep(camera, self.scale, _Grid.of(camera, self.scale))
         return self.is_kept(camera)
 
     def is_kept(self, camera: Camera) -> bool:
-        """Whether a view is served from a kept operator by now."""
+        """Return whether the view has a cached operator."""
         return self._operators.kept.get((camera_key(camera), self.scale)) is not None
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, W >> scale, 3] float32 of colors [N, 3] in some rows at the scale, over the background."""
+        """Return the float32 image [h, W >> scale, 3] of colors [N, 3] over the background, for rows at the scale."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, _CPU)
@@ -240,7 +244,7 @@ class CoarseRasterizer:
         return downscale(image, self.scale - operator.scale)[slice(*band)]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, W >> scale] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, W >> scale] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         operator = self._operators.get(camera, self.scale, grid)
@@ -249,7 +253,7 @@ class CoarseRasterizer:
         return 1 - downscale(torch.from_numpy(operator.transmittance), self.scale - operator.scale)[slice(*band)]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T D^T dL/dimage_s, [N, 3] float32, of image_gradient [h, W >> scale, 3] in some rows at the scale."""
+        """Return W^T D^T dL/dimage_s, [N, 3] float32, given the image gradient [h, W >> scale, 3] of some rows."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         pixels = self._whole(self._checked(image_gradient, camera, band), grid, band)
@@ -265,11 +269,11 @@ class CoarseRasterizer:
         return torch.from_numpy(operator.color_gradient(pixels.numpy(), len(self.scene)))
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [h, W >> scale], and each Gaussian's blend weights summed over its pixels [N]."""
+        """Return coverage [h, W >> scale], and each Gaussian's blend weight summed over all pixels [N]."""
         return plain_survey(self, camera)
 
     def _band(self, camera: Camera, rows: Rows | None) -> Rows:
-        """The band of rows at the scale as (start, stop); None is the whole view."""
+        """Return the band of rows at the scale as (start, stop); None is the whole view."""
         height = camera.height >> self.scale
         start, stop = rows or (0, height)
         if not 0 <= start < stop <= height:
@@ -292,7 +296,7 @@ class CoarseRasterizer:
         return image_gradient.detach().to(device=_CPU, dtype=torch.float32).contiguous()
 
     def _whole(self, pixels: Tensor, grid: _Grid, band: Rows) -> Tensor:
-        """The gradient of the whole view: none in the other rows."""
+        """Return the gradient of the whole view, with zeros outside the band."""
         size = grid.shape(self.scale)
         if band == (0, size[0]):
             return pixels

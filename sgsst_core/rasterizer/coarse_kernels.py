@@ -1,15 +1,15 @@
-"""The compiled kernels behind `coarse`: blend weights averaged over squares of 2^scale pixels, kept and applied.
+"""Numba kernels of `coarse`: blend weights averaged over squares of 2^scale pixels, stored and applied.
 
-A square of 2^scale pixels lies in one raster tile for scales 1 to 4. A piece is one Gaussian in one raster tile, all
-its (16 >> scale)^2 averaged weights row by row, zeros included: so it needs no index but its Gaussian and its slot, and
-where it fills vectors, every piece takes the same instructions. The weights that are averaged are those of `kernels`,
-to the last bit, and so is the scheme of slots that makes gradients independent of the number of threads.
+For scales 1 to 4, a square of 2^scale pixels lies in one raster tile. A piece is one Gaussian in one raster tile: all
+its (16 >> scale)^2 averaged weights in row-major order, including zeros. It therefore needs no index except those of
+its Gaussian and slot, and pieces that fill whole vectors all take the same instructions. The averaged weights are
+bit-identical to those of `kernels`. Slots make gradients independent of the number of threads, as they do there.
 
-Accuracy. Averages are formed in float64 and rounded once. An image adds up to `_RUN` pieces in float32, the sums of
-these runs in float64, because a coarse pixel may see thousands of Gaussians.
+Accuracy: averages are computed in float64 and rounded once. An image sums up to `_RUN` pieces in float32, and these
+partial sums in float64, because a coarse pixel may see thousands of Gaussians.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ _RUN = 64
 
 
 class Pieces(NamedTuple):
-    """Averaged weights of a view at one scale; P pieces. Pieces of a raster tile lie together, front to back.
+    """Averaged weights of a view at one scale, with P pieces. Pieces of a raster tile are contiguous, front to back.
 
-    Kernels unpack it before their parallel loop: Numba's loops take arrays, not fields of a tuple.
+    Kernels unpack it before their parallel loop, because Numba's parallel loops accept arrays but no tuple fields.
     """
 
     starts: NDArray[np.int64]  # [raster tiles + 1]
     gaussians: NDArray[np.int32]  # [P], indices into the scene
-    slots: NDArray[np.int32]  # [P]; the slots of one Gaussian lie side by side
+    slots: NDArray[np.int32]  # [P]; the slots of one Gaussian are contiguous
     weights: NDArray[np.float32]  # [(16 >> scale)^2 P]
 
 
 @compiled()
 def _has_weight(block, first, stop):
-    """Whether rows first..stop of block[1] hold any weight."""
+    """Return whether rows first..stop of block[1] contain any weight."""
     largest = _ZERO
     for row in range(first, stop):
         for i in range(_TILE):
@@ -54,9 +54,9 @@ def _has_weight(block, first, stop):
 
 @compiled()
 def _average(values, first, stop, scale, averages):
-    """Averages [16 >> scale, 16 >> scale] of |values| [16, 16], which are zero but in rows first..stop.
+    """Compute averages [16 >> scale, 16 >> scale] of |values| [16, 16], which are zero outside rows first..stop.
 
-    Absolute values, because transmittance is negative where a pixel is finished.
+    Absolute values, because the transmittance of finished pixels is stored negated.
     """
     averages[:] = 0.0
     for row in range(first, stop):
@@ -70,9 +70,10 @@ def _average(values, first, stop, scale, averages):
 
 @compiled(parallel=True)
 def count_pieces(entries, slots, starts, values, size, across, alpha_max, tile_pieces, slot_used):
-    """Pieces of every raster tile and whether a slot has one, in the pixels (height, width) = size that fill squares.
+    """Count the pieces of every raster tile, and mark the slots that have one.
 
-    `tile_pieces` [tiles] and `slot_used` [E] come as zeros.
+    Only pixels within size = (height, width), the complete squares, are considered. `tile_pieces` [tiles] and
+    `slot_used` [E] must be zero on entry.
     """
     height, width = size
     for tile in numba.prange(starts.size - 1):
@@ -96,7 +97,7 @@ def count_pieces(entries, slots, starts, values, size, across, alpha_max, tile_p
 def keep_pieces(
     entries, slots, starts, values, gaussians, size, across, scale, alpha_max, slot_starts, pieces, transmittance
 ):
-    """Fill the pieces that `count_pieces` counted, and the averaged final transmittance [height >> scale, ...]."""
+    """Store the pieces counted by `count_pieces`, and the averaged final transmittance [height >> scale, ...]."""
     piece_starts, piece_gaussians, piece_slots, weights = pieces
     height, width = size
     side = _TILE >> scale
@@ -129,7 +130,7 @@ def keep_pieces(
 
 @compiled()
 def _add_piece(weights, begin, count, pixels, red, green, blue):
-    """pixels[v, c, i] += weights[begin + 8 v + i] * color c for a piece of `count` weights."""
+    """Compute pixels[v, c, i] += weights[begin + 8 v + i] * color c for a piece of `count` weights."""
     if count >= LANES:
         add_scaled(weights, begin, count // LANES, pixels, 0, red, green, blue)
         return
@@ -141,7 +142,7 @@ def _add_piece(weights, begin, count, pixels, red, green, blue):
 
 @compiled()
 def _dot_piece(weights, begin, count, pixels):
-    """The three sums of weights[begin + 8 v + i] * pixels[v, c, i] over a piece of `count` weights."""
+    """Return the three sums of weights[begin + 8 v + i] * pixels[v, c, i] over a piece of `count` weights."""
     if count >= LANES:
         return dot_pixels(weights, begin, count // LANES, pixels, 0)
     red, green, blue = _ZERO, _ZERO, _ZERO
@@ -154,7 +155,7 @@ def _dot_piece(weights, begin, count, pixels):
 
 @compiled(parallel=True)
 def apply_pieces(pieces, colors, background, transmittance, across, scale, image):
-    """Image [h, w, 3] of colors [N, 3] over the background: the box average of what `kernels.render` computes."""
+    """Render the image [h, w, 3] of colors [N, 3] over the background: the box average of `kernels.render`."""
     starts, gaussians, _, weights = pieces
     height, width = transmittance.shape
     side = _TILE >> scale
@@ -180,7 +181,7 @@ def apply_pieces(pieces, colors, background, transmittance, across, scale, image
 
 @compiled(parallel=True)
 def apply_transposed_pieces(pieces, image_gradient, across, scale, slot_gradients):
-    """dL/dcolor of every piece in its slot [P, 3], of the gradient [h, w, 3] of the averaged image."""
+    """Write dL/dcolor of every piece to its slot [P, 3], given the gradient [h, w, 3] of the averaged image."""
     starts, _, slots, weights = pieces
     height, width = image_gradient.shape[0], image_gradient.shape[1]
     side = _TILE >> scale

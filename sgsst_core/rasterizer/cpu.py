@@ -1,4 +1,4 @@
-"""`cpu`: float32 on all cores; blend weights are recomputed in every call, the lists of Gaussians a view are kept."""
+"""`cpu`: float32 on all cores. Tile intersections are cached per view; blend weights are recomputed in every call."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists, 
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Lists are some 15 to 20 bytes for each Gaussian and tile: a few megabytes a view at 1280x720.
+#: Tile intersections take some 15 to 20 bytes per pair of Gaussian and tile: a few megabytes per view at 1280x720.
 DEFAULT_LIST_BYTES = 1 << 30
 _CPU = torch.device("cpu")
 
 
 class CpuRasterizer:
-    """The protocol of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
+    """Implementation of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
 
-    The order of summation is fixed, so results are the same bits for any number of threads, and bands of rows put
-    together are the same bits as the whole view. Lists of views are kept until `max_list_bytes` are reached
-    (`KeptLists`).
+    The order of summation is fixed. Results are therefore bit-identical for any number of threads, and bands of rows
+    put together are bit-identical to the whole view. Tile intersections are cached within a budget (`KeptLists`).
 
     Args:
-        scene: its geometry must not change while this object lives.
-        background: three values added where Gaussians leave pixels uncovered.
-        near: near plane in world units.
-        alpha_max: clamp of alpha.
-        max_list_bytes: see above.
-        beside: one in whose bytes for lists this one keeps its own, as far as they are left; in place of the above.
+        scene: Scene, whose geometry must not change during this object's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        alpha_max: Upper limit of alpha.
+        max_list_bytes: Memory budget for tile intersections in bytes.
+        beside: Rasterizer whose budget for tile intersections this one shares, with lower priority, instead of
+            `max_list_bytes`; None for a budget of its own.
     """
 
     name = "cpu"
@@ -67,11 +67,15 @@ class CpuRasterizer:
         self._lists: KeptLists[RasterLists] = KeptLists(self._build, max_list_bytes, host=host)
 
     def of_subset(self, scene: Scene, rows: Tensor, *, max_list_bytes: int = DEFAULT_LIST_BYTES) -> CpuRasterizer:
-        """A rasterizer of some of the Gaussians. Lists kept here are handed on to it, cut down when a view comes.
+        """Return a rasterizer of a subset of the Gaussians.
+
+        Cached tile intersections are handed over to it. They are restricted to the subset when their view is first
+        used.
 
         Args:
-            scene: of these Gaussians, their geometry unchanged.
-            rows: [N] bool, which they are.
+            scene: Scene of the subset, with unchanged geometry.
+            rows: [N] bool, mask of the subset.
+            max_list_bytes: Memory budget of the new rasterizer for tile intersections, in bytes.
         """
         if len(scene) != int(rows.sum()) or len(rows) != len(self.scene):
             raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
@@ -88,34 +92,34 @@ class CpuRasterizer:
         return build_raster_lists(self.scene, camera, near=self.near, shapes=self._shapes)
 
     def lists(self, camera: Camera) -> RasterLists:
-        """The view's Gaussians by raster tile, kept or new.
+        """Return the tile intersections of a view, cached or newly built.
 
         Raises:
-            TooManyIntersectionsError: see `build_raster_lists`.
+            TooManyIntersectionsError: See `build_raster_lists`.
         """
         return self._lists.of(camera)
 
     def has_lists(self, camera: Camera) -> bool:
-        """Whether the view's lists are kept, or handed on: no projection, no sorting."""
+        """Return whether the view's tile intersections are cached, so it needs no projection and no sorting."""
         return self._lists.holds(camera)
 
     def let_go_of_lists(self, camera: Camera, left: int) -> None:
-        """Keep the view's lists no longer, and no more than `left` bytes of all others from now on."""
+        """Drop the view's tile intersections, and reduce the budget for all others to `left` bytes."""
         self._lists.take(camera)
         self._lists.limit(left)
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
+        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
         values = check_colors(colors, len(self.scene), torch.float32, _CPU).numpy()
         return self._render(values, camera, check_rows(camera, rows))[0]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         nothing = np.zeros((len(self.scene), 3), dtype=np.float32)
         return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, _CPU).numpy()
         lists = self.lists(camera)
@@ -137,9 +141,9 @@ class CpuRasterizer:
         return torch.from_numpy(gradient)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [height, width] and each Gaussian's blend weights summed over all pixels [N], float32, in one pass.
+        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
-        The same bits as `coverage`, and as a column of `color_gradient` of ones.
+        Bit-identical to `coverage`, and to a column of `color_gradient` of ones.
         """
         lists = self.lists(camera)
         slot_weights = np.empty(len(lists.ranks), dtype=np.float32)
@@ -152,7 +156,7 @@ class CpuRasterizer:
         return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
 
     def _render(self, colors: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
-        """Image and final transmittance of a band."""
+        """Return the image and the final transmittance of a band."""
         lists = self.lists(camera)
         height = band[1] - band[0]
         image = np.empty((height, camera.width, 3), dtype=np.float32)

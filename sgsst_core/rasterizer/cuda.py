@@ -1,9 +1,9 @@
-"""`cuda`: gsplat's kernels (extra `[cuda]`), versions 1.5.3 and 1.6.
+"""`cuda`: rasterizer on gsplat's kernels (extra `[cuda]`), for gsplat 1.5.3 and 1.6.
 
-gsplat's `rasterization` is taken apart into its public stages. Geometry is frozen, so projection and tile lists are
-computed once a view; and a band is exact, because the projection (whose slopes are clamped to the whole view's frustum)
-does not see the band: the projected centers are moved up by its first row, and tiles that no longer lie in the image
-drop out.
+It calls the public stages of gsplat's `rasterization` separately. Geometry is frozen, so projection and tile
+intersections are computed once per view. Bands are exact, because the projection, whose slopes are clamped to the
+frustum of the whole view, does not depend on the band: projected centers are shifted up by its first row, and tiles
+outside the image are dropped.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from sgsst_core.scene.gaussians import Scene
 
 
 def load_gsplat() -> ModuleType:
-    """The gsplat module.
+    """Import gsplat.
 
     Raises:
-        SettingsError: gsplat is not installed or cannot be loaded.
+        SettingsError: If gsplat is not installed or cannot be loaded.
     """
     try:
         module = importlib.import_module("gsplat")
@@ -47,14 +47,14 @@ def load_gsplat() -> ModuleType:
 
 
 def gsplat_alpha_max(version: str) -> float:
-    """What gsplat clamps alpha at: 0.99 from version 1.6 on, 0.999 before. It cannot be set."""
+    """Return gsplat's upper limit of alpha, which cannot be set: 0.99 from version 1.6 on, 0.999 before."""
     major, minor = (int("".join(filter(str.isdigit, part)) or 0) for part in version.split(".")[:2])
     return 0.99 if (major, minor) >= (1, 6) else 0.999
 
 
 @dataclass(frozen=True)
 class _Splats:
-    """A band's Gaussians as gsplat wants them: one image, packed [1, N, ...]."""
+    """Gaussians of a band in gsplat's format: one image, packed [1, N, ...]."""
 
     means: Tensor
     conics: Tensor
@@ -64,19 +64,19 @@ class _Splats:
 
 
 class CudaRasterizer:
-    """The protocol of `sgsst_core.rasterizer.Rasterizer` on one GPU.
+    """Implementation of `sgsst_core.rasterizer.Rasterizer` with gsplat on one GPU.
 
-    Results are those of gsplat in float32; its backward adds atomically, so gradients repeat to rounding, not to the
-    bit. Projection and lists of the last view and band are kept.
+    Results are gsplat's in float32. Its backward pass uses atomics, so gradients are reproducible only up to rounding.
+    Projection and tile intersections of the latest view and band are cached.
 
     Args:
-        scene: its geometry must not change while this object lives.
-        background: three values added where Gaussians leave pixels uncovered.
-        near: near plane in world units.
-        device: a CUDA device.
+        scene: Scene, whose geometry must not change during this object's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        device: CUDA device.
 
     Raises:
-        SettingsError: gsplat or the GPU is missing.
+        SettingsError: If gsplat or the GPU is missing.
     """
 
     name = "cuda"
@@ -108,7 +108,7 @@ class CudaRasterizer:
         self._latest: tuple[CameraKey, Rows, _Splats] | None = None
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
+        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
         band = check_rows(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, self.device)
         with torch.no_grad():
@@ -116,15 +116,15 @@ class CudaRasterizer:
         return image + (1 - alpha) * self._background
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         nothing = torch.zeros(len(self.scene), 3, device=self.device)
         with torch.no_grad():
             return self._rasterize(nothing, camera, check_rows(camera, rows))[1][..., 0]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows.
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows.
 
-        The image is linear in the colors, so the gradient is that of <image, image_gradient> at any colors.
+        The image is linear in the colors, so this is the gradient of <image, image_gradient> at any colors.
         """
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
@@ -135,11 +135,11 @@ class CudaRasterizer:
         return gradient
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]."""
+        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N]."""
         return plain_survey(self, camera)
 
     def _rasterize(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
-        """Image [h, width, 3] over black and 1 - T_final [h, width, 1]."""
+        """Return the image [h, width, 3] over black, and 1 - T_final [h, width, 1]."""
         splats = self._splats(camera, band)
         image, alpha = self._gsplat.rasterize_to_pixels(
             splats.means,
@@ -155,7 +155,7 @@ class CudaRasterizer:
         return image[0], alpha[0]
 
     def _splats(self, camera: Camera, band: Rows) -> _Splats:
-        """Projection of the whole view, moved into the band, and the band's tile lists."""
+        """Return the projection of the whole view shifted into the band, and the band's tile intersections."""
         key = camera_key(camera)
         if self._latest is None or self._latest[:2] != (key, band):
             self._latest = None  # free its memory before the next one is built

@@ -1,11 +1,11 @@
-"""Gaussians in order of depth, on all cores: a stable sort of positive float64 numbers.
+"""Depth sort of Gaussians on all cores: a stable sort of positive float64 numbers.
 
-Positive floats are ordered as their bits are, read as integers. The bits' upper part puts each Gaussian into one of
-many buckets, by a counting sort of which every thread takes a part; then each bucket is sorted by itself. Equal depths
-keep the order of the file, so the result is that of any stable sort, whatever the number of threads.
+Positive floats have the same order as their bits read as integers. The upper bits assign each Gaussian to one of many
+buckets, by a parallel counting sort; then each bucket is sorted on its own. Equal depths keep the order of the file, so
+the result is that of any stable sort, for any number of threads.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -16,17 +16,22 @@ from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
 
-#: Gaussians that a bucket holds where depths are spread evenly.
+#: Gaussians per bucket if depths are spread evenly.
 _BUCKET = 16
 _MOST_BUCKETS = 1 << 17
-#: Buckets of up to so many are sorted by insertion, larger ones by merging.
+#: Buckets of up to this size are sorted by insertion, larger ones by merging.
 _INSERTED = 48
 
 
 def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> NDArray[np.int32]:
-    """`visible` [V], ascending indices into `depths` [N], by depth as int32; equal depths by index.
+    """Sort indices by depth; equal depths stay in index order.
 
-    The depths of what is visible are positive: the near plane is.
+    Args:
+        depths: [N] float64; positive for the visible Gaussians, because the near plane is.
+        visible: [V], ascending indices into `depths`.
+
+    Returns:
+        Sorted `visible` as int32.
     """
     count = len(visible)
     if not count:
@@ -42,7 +47,8 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         parts = np.linspace(0, count, threads + 1).astype(np.int64)
         ends = np.zeros((threads, buckets), dtype=np.int64)
         _count(bits, lowest, shift, parts, ends)
-        # The place of each part's first Gaussian of a bucket: after all smaller buckets, and the parts before it.
+        # First position that each part writes to in each bucket: after all smaller buckets, and after the preceding
+        # parts.
         totals = ends.sum(axis=0)
         starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(totals)])
         ends = starts[:-1] + np.cumsum(ends, axis=0) - ends
@@ -61,7 +67,7 @@ def _gather(values, places, out):
 
 @compiled(parallel=True)
 def _count(bits, lowest, shift, parts, counts):
-    """How many Gaussians of each part fall into each bucket."""
+    """Count the Gaussians of each part that fall into each bucket."""
     for part in numba.prange(parts.size - 1):
         for i in range(parts[part], parts[part + 1]):
             counts[part, (bits[i] - lowest) >> shift] += 1
@@ -69,7 +75,7 @@ def _count(bits, lowest, shift, parts, counts):
 
 @compiled(parallel=True)
 def _scatter(bits, visible, lowest, shift, parts, places, order, keys):
-    """Every part's Gaussians into their buckets, in the order in which they come."""
+    """Copy every part's Gaussians into their buckets, in input order."""
     for part in numba.prange(parts.size - 1):
         for i in range(parts[part], parts[part + 1]):
             bucket = (bits[i] - lowest) >> shift
@@ -80,7 +86,7 @@ def _scatter(bits, visible, lowest, shift, parts, places, order, keys):
 
 @compiled(parallel=True)
 def _sort_buckets(starts, shares, keys, order):
-    """Sort each bucket by its keys; equal keys stay as they are."""
+    """Sort each bucket by its keys, stably."""
     for share in numba.prange(shares.size - 1):
         for bucket in range(shares[share], shares[share + 1]):
             begin, end = starts[bucket], starts[bucket + 1]

@@ -1,4 +1,4 @@
-"""Lists of views, kept between calls as far as they fit a number of bytes."""
+"""Cache of per-view data under a memory budget, used for tile intersections."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sgsst_core.scene.camera import Camera
 
 
 class Sized(Protocol):
-    """What takes memory."""
+    """Object with a known memory use."""
 
     @property
     def nbytes(self) -> int:
-        """Bytes."""
+        """Memory use in bytes."""
         ...
 
 
@@ -24,18 +24,19 @@ L = TypeVar("L", bound=Sized)
 
 
 class KeptLists(Generic[L]):
-    """Builds what a view needs, and keeps it until the bytes are reached; of the views beyond only the last is held.
+    """Cache of per-view data. Beyond the budget, only the data of the latest view are held.
 
-    Views come round in turn, and evicting the least recently used would evict each just before it is needed.
+    Nothing is evicted: views come round in turn, so evicting the least recently used one would evict each just before
+    it is needed.
 
     Args:
-        build: makes the lists of a view.
-        max_bytes: of all that is kept, what is still to be taken over included.
-        before: lists of the same views, which are taken over, one view at a time when it first comes, in place of
-            building: they count among the bytes until then.
-        adapt: what becomes of lists that are taken over; it makes them no larger.
-        host: lists in whose bytes these are kept, in place of `max_bytes`, as far as they leave any: they come first,
-            and have these go where they need the room.
+        build: Function that computes the data of a view.
+        max_bytes: Memory budget in bytes, including what is still in `before`.
+        before: Cache whose data are taken over instead of building new ones, view by view at first use. They count
+            toward the budget until then.
+        adapt: Function applied to data that are taken over; must not make them larger.
+        host: Cache whose budget this one shares, instead of `max_bytes`. The host has priority: it removes entries from
+            this cache if it needs the space.
     """
 
     def __init__(
@@ -61,11 +62,11 @@ class KeptLists(Generic[L]):
 
     @property
     def kept_bytes(self) -> int:
-        """Bytes of all that is kept, but for the last view beyond the limit."""
+        """Size of the cached data in bytes, except those of the latest view beyond the budget."""
         return self._kept_bytes + (self._before.kept_bytes if self._before else 0)
 
     def of(self, camera: Camera) -> L:
-        """The view's lists, kept or new; raises what `build` raises."""
+        """Return the data of a view, cached or newly built. Exceptions of `build` propagate."""
         key = camera_key(camera)
         with self._lock:
             if key in self._kept:
@@ -84,12 +85,15 @@ class KeptLists(Generic[L]):
             return lists
 
     def holds(self, camera: Camera) -> bool:
-        """Whether the view's lists need not be built."""
+        """Return whether the data of a view are cached, so they need not be built."""
         key = camera_key(camera)
         return key in self._kept or (self._before is not None and self._before.holds(camera))
 
     def take(self, camera: Camera) -> L | None:
-        """The view's lists, which are no longer kept here; None where they are not. The latest ones are let go."""
+        """Remove the data of a view from the cache and return them; None if they are not cached.
+
+        Data of the latest view beyond the budget are dropped.
+        """
         with self._lock:
             latest, self._latest = self._latest, None
             key = camera_key(camera)
@@ -102,7 +106,7 @@ class KeptLists(Generic[L]):
             return self._before.take(camera) if self._before else None
 
     def limit(self, max_bytes: int) -> None:
-        """Keep no more than so many bytes from now on: views that came last are let go first."""
+        """Set the memory budget, and remove the most recent entries that exceed it."""
         with self._lock:
             self._max_bytes = max_bytes
             self._let_go(max_bytes)
@@ -115,14 +119,14 @@ class KeptLists(Generic[L]):
             self._kept_bytes -= self._kept.popitem()[1].nbytes
 
     def _bound(self) -> int:
-        """Bytes that may be kept now: with a host, what it and its other guests leave."""
+        """Return the current budget in bytes: with a host, what the host and its other guests leave."""
         if self._host is None:
             return self._max_bytes
         others = sum(guest.kept_bytes for guest in self._host._guests if guest is not self)
         return self._host._max_bytes - self._host.kept_bytes - others
 
     def _make_room(self) -> None:
-        """Have guests keep no more than is left."""
+        """Shrink the guests to the remaining budget."""
         for guest in list(self._guests):
             with guest._lock:
                 guest._let_go(max(guest._bound(), 0))

@@ -1,17 +1,18 @@
-"""The compiled kernels behind the CPU rasterizers.
+"""Numba kernels of the CPU rasterizers.
 
-Everything goes front to back through the Gaussians of one raster tile, with the blend weights of one Gaussian in a
-block of 16 x 16 that stays in the first-level cache (`_blend`). What is done with the block differs: add it to the
-image times a color, multiply it with dL/dimage, or keep it. All therefore see the same weights to the last bit.
+All kernels traverse the Gaussians of one raster tile front to back, and compute the blend weights of one Gaussian in a
+16 x 16 block that stays in the L1 cache (`_blend`). They differ in what they do with the block: add it times a color to
+the image, multiply it with dL/dimage, or store it. Their weights are therefore bit-identical.
 
-Accuracy. Offsets between a pixel and a Gaussian are taken in float64 once a row and rounded after the large terms have
-canceled; along the row at most 15 pixels are added in float32. So neither far-off centers nor needles lose digits.
+Accuracy: the offset between a pixel and a Gaussian is computed in float64 once per row, and rounded after the large
+terms have canceled; within the row, at most 15 pixels are added in float32. Neither distant centers nor needle-shaped
+Gaussians lose digits.
 
-Determinism. A tile belongs to one thread. A gradient is first kept by itself for each (Gaussian, tile) in a slot of its
-own, the slots of a Gaussian lying side by side; then each Gaussian's slots are added in order.
+Determinism: each tile is processed by one thread. The gradient of each (Gaussian, tile) pair first goes to a slot of
+its own, and the slots of a Gaussian are contiguous. Each Gaussian's slots are then added in order.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -46,24 +47,26 @@ _TILE = RASTER_TILE
 _LAST = RASTER_TILE - 1
 _PIXELS = RASTER_TILE**2
 _COLUMNS = 8
-#: Entries between asking for a Gaussian's values and reading them: some 100 ns of blending.
+#: Prefetch distance in entries; blending takes some 100 ns for that many.
 _AHEAD = 8
-#: Tiles side by side that one thread takes, and a prime by which such blocks are scattered over the image, which has
-#: fewer of them.
+#: Number of neighboring tiles that form a block, and a prime stride that scatters such blocks over the image. The prime
+#: is larger than the number of blocks.
 _BLOCK_TILES, _STRIDE = 8, 1_000_003
 
 
 @compiled()
 def _blend(block, alive, value, x, y, low, high, alpha_max):
-    """Blend one Gaussian into rows low..high of the tile at pixel (x, y); returns the rows (first, stop) it reached.
+    """Blend one Gaussian into rows low..high of the tile at pixel (x, y).
 
-    block[1, first:stop] then holds its weights. alive[row] says whether the row has unfinished pixels, alive[16] how
-    many rows have.
+    Return the rows (first, stop) that it reached.
+
+    block[1, first:stop] then holds its weights. alive[row] tells whether the row has unfinished pixels; alive[16] is
+    the number of such rows.
     """
     dx = x + 0.5 - value[0]
     top = y + 0.5 - value[1]
     skew, u_scale, w_scale, log2_opacity, extent_y = value[2], value[3], value[4], value[5], value[7]
-    # np, not math: in compiled code math.ceil gives an int64, which overflows for extents beyond 9e18 pixels
+    # np, not math: in compiled code math.ceil returns int64, which overflows for extents beyond 9e18 pixels.
     begin = max(np.float64(low), np.ceil(-extent_y - top))
     end = min(np.float64(high), np.floor(extent_y - top) + 1.0)
     first, stop = 0, 0
@@ -94,7 +97,7 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
 
 @compiled()
 def _start_tile(block, alive, columns, low, high):
-    """Full transmittance in the tile's pixels; those beyond the image or the band start finished."""
+    """Reset the transmittance of a tile to 1. Pixels outside the image or the band start out finished."""
     alive[:] = 0
     for row in range(_TILE):
         for i in range(_TILE):
@@ -107,7 +110,7 @@ def _start_tile(block, alive, columns, low, high):
 
 @compiled()
 def _load_pixels(image, y, x, low, high, columns, pixels):
-    """Rows low..high of a patch of `image` at (y, x) into `pixels` [P, 3, 8]; zero where the patch sticks out."""
+    """Load rows low..high of an image patch at (y, x) into `pixels` [P, 3, 8]; zero outside the patch."""
     pixels[:] = _ZERO
     across = pixels.shape[0] // _TILE
     for row in range(low, high):
@@ -121,7 +124,7 @@ def _load_pixels(image, y, x, low, high, columns, pixels):
 
 @compiled()
 def _store_pixels(pixels, transmittance, background, y, x, low, high, columns, image):
-    """The inverse of `_load_pixels`, over the background."""
+    """Store `pixels` [P, 3, 8] in rows low..high of an image patch at (y, x), over the background."""
     red, green, blue = background[0], background[1], background[2]
     across = pixels.shape[0] // _TILE
     for row in range(low, high):
@@ -135,23 +138,25 @@ def _store_pixels(pixels, transmittance, background, y, x, low, high, columns, i
 
 @compiled()
 def _blocks(tiles):
-    """Blocks of tiles side by side that hold so many."""
+    """Return the number of blocks of neighboring tiles."""
     return (tiles + _BLOCK_TILES - 1) // _BLOCK_TILES
 
 
 @compiled()
 def _scattered(step, tiles):
-    """The tile at a step of a parallel loop over `_blocks(tiles) * _BLOCK_TILES`; beyond `tiles` there is none.
+    """Return the tile at a step of a parallel loop over `_blocks(tiles) * _BLOCK_TILES`.
 
-    Each thread gets a run of steps. Blocks that follow each other there lie all over the image, so that no thread has
-    the sky for itself and another the crowd; within a block tiles are neighbors, which share Gaussians.
+    It may be beyond `tiles`: skip it.
+
+    Each thread gets a range of steps. Consecutive blocks are scattered over the image, so that no thread gets only sky
+    and another only dense areas. Tiles within a block are neighbors, which share Gaussians.
     """
     return step // _BLOCK_TILES * _STRIDE % _blocks(tiles) * _BLOCK_TILES + step % _BLOCK_TILES
 
 
 @compiled(parallel=True)
 def render(entries, starts, values, gaussians, colors, background, first_row, alpha_max, image, transmittance):
-    """Image [h, width, 3] and final transmittance [h, width] of the rows that begin at `first_row`."""
+    """Render the image [h, width, 3] and the final transmittance [h, width] of the rows from `first_row`."""
     width, last_row = image.shape[1], first_row + image.shape[0]
     across = (width + _LAST) // _TILE
     first_tile = first_row // _TILE * across
@@ -187,7 +192,7 @@ def render(entries, starts, values, gaussians, colors, background, first_row, al
 
 @compiled(parallel=True)
 def color_gradient(entries, slots, starts, values, image_gradient, first_row, alpha_max, slot_gradients):
-    """dL/dcolor of every (Gaussian, tile) in its own slot [E, 3]; zero where the tile is outside the band."""
+    """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3]; zero if the tile is outside the band."""
     width, last_row = image_gradient.shape[1], first_row + image_gradient.shape[0]
     across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
@@ -219,7 +224,7 @@ def color_gradient(entries, slots, starts, values, image_gradient, first_row, al
 
 @compiled(parallel=True)
 def add_slots(slot_gradients, first_slots, gaussians, gradient):
-    """Add up each Gaussian's slots, in order and in float64, into its row of `gradient` [N, 3]."""
+    """Sum each Gaussian's slots, in order and in float64, into its row of `gradient` [N, 3]."""
     for rank in numba.prange(gaussians.size):
         red, green, blue = 0.0, 0.0, 0.0
         for slot in range(first_slots[rank], first_slots[rank + 1]):
@@ -232,9 +237,9 @@ def add_slots(slot_gradients, first_slots, gaussians, gradient):
 
 @compiled(parallel=True)
 def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittance):
-    """Final transmittance [h, w] of a whole view, and the sum of each (Gaussian, tile)'s weights in its slot [E].
+    """Compute the final transmittance [h, w] of a whole view, and the sum of weights of each (Gaussian, tile) pair [E].
 
-    The same bits as `render` and as `color_gradient` of ones, in one pass.
+    Bit-identical to `render` and to `color_gradient` of ones, but in one pass.
     """
     height, width = transmittance.shape
     across = (width + _LAST) // _TILE
@@ -266,7 +271,7 @@ def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittanc
 
 @compiled(parallel=True)
 def add_slot_weights(slot_weights, first_slots, gaussians, weights):
-    """Add up each Gaussian's slots [E], in order and in float64, into its place in `weights` [N]: see `add_slots`."""
+    """Sum each Gaussian's slots [E], in order and in float64, into `weights` [N], as `add_slots` does."""
     for rank in numba.prange(gaussians.size):
         total = 0.0
         for slot in range(first_slots[rank], first_slots[rank + 1]):
@@ -274,10 +279,10 @@ def add_slot_weights(slot_weights, first_slots, gaussians, weights):
         weights[gaussians[rank]] = total
 
 
-# Kept weights. A strip is half a raster tile, 8 columns by 16 rows; it is cut into 4 blocks of 4 rows. An item is one
-# Gaussian in one strip, a piece is one item in one block: 32 weights, row by row. So little is stored beside a
-# Gaussian's support, every piece takes the same instructions, and what a block adds up (or is multiplied with) stays in
-# registers.
+# Layout of cached weights. A strip is half a raster tile, 8 columns by 16 rows, divided into 4 blocks of 4 rows. An
+# item is one Gaussian in one strip. A piece is one item in one block: 32 weights in row-major order. This stores little
+# outside a Gaussian's support, every piece takes the same instructions, and the values that a block accumulates (or is
+# multiplied with) stay in registers.
 
 STRIP = LANES
 PIECE = LANES * BLOCK_ROWS
@@ -286,22 +291,22 @@ _STRIPS = RASTER_TILE // STRIP
 
 
 class Strips(NamedTuple):
-    """Kept weights of a band; I items, P pieces. Strips run along the rows of raster tiles.
+    """Cached weights of a band with I items and P pieces. Strips are in the row-major order of raster tiles.
 
-    Kernels unpack it before their parallel loop: Numba's loops take arrays, not fields of a tuple.
+    Kernels unpack it before their parallel loop, because Numba's parallel loops accept arrays but no tuple fields.
     """
 
     item_starts: NDArray[np.int64]  # [strips + 1]
     piece_starts: NDArray[np.int64]  # [4 strips + 1], blocks from top to bottom
     gaussians: NDArray[np.int32]  # [I], indices into the scene
-    slots: NDArray[np.int32]  # [I]; the slots of one Gaussian lie side by side
-    items: NDArray[np.int32]  # [P], the piece's item, counted from the strip's first
+    slots: NDArray[np.int32]  # [I]; the slots of one Gaussian are contiguous
+    items: NDArray[np.int32]  # [P], the piece's item, relative to the strip's first item
     weights: NDArray[np.float32] | NDArray[np.uint16]  # [32 P], float32 or half-precision bits (see `vectors`)
 
 
 @compiled()
 def _fill_blocks(block, first, stop):
-    """Zero the weights of rows that share a block with rows first..stop but were not reached."""
+    """Zero the weights of unreached rows that share a block with rows first..stop."""
     for row in range(first // BLOCK_ROWS * BLOCK_ROWS, first):
         block[1, row] = _ZERO
     for row in range(stop, (stop + BLOCK_ROWS - 1) // BLOCK_ROWS * BLOCK_ROWS):
@@ -310,7 +315,7 @@ def _fill_blocks(block, first, stop):
 
 @compiled()
 def _has_weight(block, row, column):
-    """Whether the block of 4 rows and 8 columns at (row, column) holds any weight."""
+    """Return whether the block of 4 rows and 8 columns at (row, column) contains any weight."""
     largest = _ZERO
     for down in range(BLOCK_ROWS):
         for i in range(STRIP):
@@ -320,7 +325,7 @@ def _has_weight(block, row, column):
 
 @compiled(parallel=True)
 def count_weights(entries, slots, starts, values, band, width, alpha_max, items, pieces, slot_items):
-    """Items of every strip, pieces of every block, items of every slot: what is needed before weights are kept."""
+    """Count the items of every strip, the pieces of every block and the items of every slot, for allocating them."""
     across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
         x, y = tile % across * _TILE, tile // across * _TILE
@@ -346,7 +351,7 @@ def count_weights(entries, slots, starts, values, band, width, alpha_max, items,
 
 @compiled(parallel=True)
 def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slot_starts, strips, transmittance):
-    """Fill the items and weights that `count_weights` counted, and the final transmittance [h, width] of the band."""
+    """Store the items and weights counted by `count_weights`, and the final transmittance [h, width] of the band."""
     item_starts, piece_starts, item_gaussians, item_slots, piece_items, weights = strips
     width = transmittance.shape[1]
     across = (width + _LAST) // _TILE
@@ -388,7 +393,7 @@ def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slo
 
 @compiled(parallel=True)
 def apply_weights(strips, colors, background, transmittance, first_row, image):
-    """Image of kept weights: what `render` computes, without computing a weight."""
+    """Render an image from cached weights. With float32 weights it is bit-identical to `render`."""
     item_starts, piece_starts, item_gaussians, _, piece_items, weights = strips
     height, width = transmittance.shape
     across = (width + _LAST) // _TILE * _STRIPS
@@ -412,7 +417,7 @@ def apply_weights(strips, colors, background, transmittance, first_row, image):
 
 @compiled(parallel=True)
 def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
-    """dL/dcolor of every item in its slot: what `color_gradient` computes, without computing a weight."""
+    """Write dL/dcolor of every item to its slot, using cached weights; equals `color_gradient` up to rounding."""
     item_starts, piece_starts, _, item_slots, piece_items, weights = strips
     height, width = image_gradient.shape[0], image_gradient.shape[1]
     across = (width + _LAST) // _TILE * _STRIPS

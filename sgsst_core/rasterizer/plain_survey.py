@@ -1,4 +1,4 @@
-"""`Rasterizer.survey` by the other methods of the protocol, and what the fast ones are tested against."""
+"""`Rasterizer.survey` in terms of the other methods; reference for the fast implementations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sgsst_core.scene.camera import Camera
 
 
 def plain_survey(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Coverage [h, width], and each Gaussian's blend weights summed over all pixels [N]: the gradient of ones."""
+    """Return coverage [h, width], and each Gaussian's blend weight summed over all pixels [N]: the gradient of ones."""
     coverage = rasterizer.coverage(camera)
     ones = torch.ones((*coverage.shape, 3), dtype=rasterizer.dtype, device=coverage.device)
     return coverage, rasterizer.color_gradient(ones, camera)[:, 0]

@@ -1,18 +1,19 @@
-"""EWA projection of a scene onto one camera's image plane, in float64.
+"""EWA projection of a scene onto the image plane of one camera, in float64.
 
 Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 2002: a Gaussian with covariance V becomes a 2D Gaussian
-with covariance J V J^T, J the derivative of the perspective at its center. What is done about the numbers:
+with covariance J V J^T, where J is the Jacobian of the perspective at its center. For numerical accuracy:
 
-* The 2x3 factor M = J R_camera R_quaternion diag(scales) is formed, never the 3x3 covariance. With the blur e,
+* The 2x3 factor M = J R_camera R_quaternion diag(scales) is computed, never the 3x3 covariance. With the blur e,
   det(M M^T + e I) = (sum of the squared 2x2 minors of M) + e trace(M M^T) + e^2 (Cauchy-Binet): a sum of positive
   terms, which cannot cancel. p r - q^2 has no correct digit left for a needle a million times longer than wide.
-* With the covariance [[p, q], [q, r]] the exponent is a sum of two squares, which cannot become negative either:
+* With the covariance [[p, q], [q, r]], the exponent is a sum of two squares, so it cannot become negative:
   w = dy / sqrt(r), u = (dx - (q / r) dy) sqrt(r / det), power = (u^2 + w^2) / 2.
-* A Gaussian's support is exactly where its alpha is at least ALPHA_MIN: half extents t sqrt(p) and t sqrt(r) with
-  t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cut, so a renderer without any support agrees.
+* The support of a Gaussian is exactly the area where its alpha is at least ALPHA_MIN: half extents t sqrt(p) and
+  t sqrt(r) with t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cutoff, so a renderer without any support
+  agrees.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
 _LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
-#: exp(-power) = 2^-(u'^2 + w'^2) when u and w are scaled by this: the kernels evaluate powers of two.
+#: exp(-power) = 2^-(u'^2 + w'^2) if u and w are scaled by this factor. The kernels use powers of two.
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
-#: More than float64 can be off in pixels of any image, and relative to an extent.
+#: Upper bound of float64 rounding errors, in pixels of any image and relative to an extent.
 _ROUNDING = 1e-6
-#: Parts of the scene that a thread projects, one after the other.
+#: Number of parts of the scene that each thread projects, one after the other.
 _PARTS = 16
 
 
 class Column(IntEnum):
-    """Columns of `Projection.values`; dx, dy are a pixel center's offsets from (X, Y) in pixels.
+    """Columns of `Projection.values`; dx, dy are the offsets of a pixel center from (X, Y) in pixels.
 
     alpha = 2^(LOG2_OPACITY - u^2 - w^2) with w = dy * W_SCALE, u = (dx - SKEW * dy) * U_SCALE.
     """
@@ -57,16 +58,16 @@ class Column(IntEnum):
 
 
 class Outcome(IntEnum):
-    """What became of a Gaussian in a view."""
+    """Outcome of projecting a Gaussian."""
 
     VISIBLE = 0
-    #: Depth below the near plane; a Gaussian exactly on it is kept.
+    #: Depth below the near plane; a Gaussian exactly on the plane is visible.
     NEAR = 1
-    #: Zero quaternion, or a value that overflows float64, and the center not far beside the image.
+    #: Zero quaternion, or overflow of float64, unless the center is far outside the image.
     INVALID = 2
-    #: Opacity below ALPHA_MIN: contributes to no pixel.
+    #: Opacity below ALPHA_MIN, so it contributes to no pixel.
     FAINT = 3
-    #: No pixel center of the image inside its extents.
+    #: No pixel center of the image within its extents.
     OUTSIDE = 4
 
 
@@ -75,12 +76,12 @@ _VISIBLE, _NEAR, _INVALID, _FAINT, _OUTSIDE = (int(outcome) for outcome in Outco
 
 @dataclass(frozen=True)
 class Projection:
-    """The Gaussians of a scene that a view can show, front to back.
+    """Gaussians of a scene that can be visible in a view, front to back.
 
     Attributes:
-        gaussians: [V] int32 indices into the scene, by depth along the viewing axis; equal depths by index.
+        gaussians: [V] int32, indices into the scene, sorted by depth along the viewing axis and then by index.
         values: [V, 8] float64, see `Column`.
-        outcomes: how many Gaussians of the scene ended in which `Outcome`; of a subset's, the visible ones alone.
+        outcomes: Number of Gaussians of the scene with each `Outcome`; for a subset, only the visible ones.
     """
 
     gaussians: NDArray[np.int32]
@@ -90,11 +91,11 @@ class Projection:
 
 @dataclass(frozen=True)
 class Shapes:
-    """What projecting a scene computes of its Gaussians whatever the view, in float64.
+    """View-independent values of a scene's Gaussians, in float64.
 
     Attributes:
         deviations: [N, 3], standard deviations in world units.
-        log2_opacities: [N], of the opacity: -inf for logits under -709.
+        log2_opacities: [N], log2 of the opacities; -inf for logits below -709.
     """
 
     deviations: NDArray[np.float64]
@@ -102,7 +103,7 @@ class Shapes:
 
     @classmethod
     def of(cls, scene: Scene) -> Shapes:
-        """The shapes of a scene: 32 bytes for each Gaussian."""
+        """Compute the shapes of a scene; they take 32 bytes per Gaussian."""
         shapes = cls(np.empty((len(scene), 3)), np.empty(len(scene)))
         scales, logits = (np.ascontiguousarray(t.numpy()) for t in (scene.scales, scene.opacities))
         with kernel_threads():
@@ -111,13 +112,16 @@ class Shapes:
 
 
 def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None) -> Projection:
-    """Project a scene (any N, also 0) onto a camera.
+    """Project a scene onto a camera. The scene may be empty.
 
     Args:
-        shapes: of the scene, from an earlier view.
+        scene: Scene with N Gaussians.
+        camera: Camera to project onto.
+        near: Near plane in world units.
+        shapes: Shapes of the scene from an earlier view; None to compute them.
 
     Raises:
-        ValueError: `near` is not positive (depths of 0 and less have no projection).
+        ValueError: If `near` is not positive, since depths of 0 and less have no projection.
     """
     if not near > 0:
         raise ValueError(f"near plane {near}: must be positive")
@@ -159,7 +163,7 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
 
 @compiled()
 def _rotation(quat):
-    """Rows of the rotation matrix of a quaternion wxyz of any length but zero."""
+    """Return the rows of the rotation matrix of a wxyz quaternion of any non-zero norm."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / norm, x / norm, y / norm, z / norm
@@ -172,7 +176,7 @@ def _rotation(quat):
 
 @compiled()
 def _row(focal, slope, axis, forward):
-    """One row of J R_camera: focal / z times (camera axis - slope * viewing axis)."""
+    """Return one row of J R_camera: focal / z times (camera axis - slope * viewing axis)."""
     a = focal * (axis[0] - slope * forward[0])
     b = focal * (axis[1] - slope * forward[1])
     c = focal * (axis[2] - slope * forward[2])
@@ -181,7 +185,7 @@ def _row(focal, slope, axis, forward):
 
 @compiled()
 def _factor_row(row, rotation, deviation):
-    """One row of M: turned into the Gaussian's own axes."""
+    """Return one row of M: the row rotated into the Gaussian's axes and scaled."""
     a, b, c = row
     return (
         (a * rotation[0][0] + b * rotation[1][0] + c * rotation[2][0]) * deviation[0],
@@ -192,9 +196,9 @@ def _factor_row(row, rotation, deviation):
 
 @compiled()
 def _surely_outside(center, size, row, deviation, support):
-    """Whether a Gaussian lies beside the image, whatever its orientation: no row of M is longer than that of a ball.
+    """Return whether a Gaussian lies outside the image in any orientation, by bounding the row of M by that of a ball.
 
-    Beside by more than any rounding of the extents that it will be cut with, else False.
+    The distance must exceed any rounding error of the extents used for the exact test; otherwise return False.
     """
     beside = max(0.5 - center, center - (size - 0.5)) - _ROUNDING
     if not beside > 0:
@@ -206,7 +210,7 @@ def _surely_outside(center, size, row, deviation, support):
 
 @compiled()
 def _covariance(m0, m1):
-    """p, q, r and the determinant of M M^T + EPS2D I, without cancellation (see the module's text)."""
+    """Return p, q, r and the determinant of M M^T + EPS2D I, without cancellation (see the module docstring)."""
     p = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
     q = m0[0] * m1[0] + m0[1] * m1[1] + m0[2] * m1[2]
     r = m1[0] * m1[0] + m1[1] * m1[1] + m1[2] * m1[2]
@@ -219,7 +223,7 @@ def _covariance(m0, m1):
 
 @compiled()
 def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
-    """Fill one row of `Projection.values`; returns the outcome and the depth."""
+    """Fill one row of `Projection.values`, and return the outcome and the depth."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     width, height = intrinsics[4], intrinsics[5]
     x = pose[0, 0] * mean[0] + pose[0, 1] * mean[1] + pose[0, 2] * mean[2] + pose[0, 3]
@@ -258,7 +262,7 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
 
 @compiled(parallel=True)
 def _find_shapes(scales, logits, deviations, log2_opacities):
-    """See `Shapes`, of [N, 3] and [N] as files store them."""
+    """Compute `Shapes` from log scales [N, 3] and logits [N], as files store them."""
     for i in numba.prange(logits.size):
         for axis in range(3):
             deviations[i, axis] = math.exp(np.float64(scales[i, axis]))
@@ -269,9 +273,9 @@ def _find_shapes(scales, logits, deviations, log2_opacities):
 def _project_parts(
     means, quats, deviations, opacities, pose, intrinsics, near, parts, threads, values, depths, gaussians, tallies
 ):
-    """What is visible of each part, packed from its start on; how many of it ended in which outcome."""
+    """Project each part of the scene, packing the visible Gaussians at its start, and count the outcomes."""
     for step in numba.prange(parts.size - 1):
-        part = step % _PARTS * threads + step // _PARTS  # so that every thread gets parts from all over the scene
+        part = step % _PARTS * threads + step // _PARTS  # gives every thread parts from all over the scene
         place = parts[part]
         for i in range(parts[part], parts[part + 1]):
             outcome, depth = _project_one(
@@ -285,7 +289,7 @@ def _project_parts(
 
 @compiled(parallel=True)
 def take_rows(values, places, out) -> None:
-    """values[places] of [N, C] values, on all cores."""
+    """Write values[places] to `out` for values [N, C], on all cores."""
     for i in numba.prange(places.size):
         for column in range(values.shape[1]):
             out[i, column] = values[places[i], column]
@@ -293,6 +297,6 @@ def take_rows(values, places, out) -> None:
 
 @compiled(parallel=True)
 def take_places(values, places, out) -> None:
-    """values[places] of [N] values, on all cores."""
+    """Write values[places] to `out` for values [N], on all cores."""
     for i in numba.prange(places.size):
         out[i] = values[places[i]]

@@ -1,6 +1,9 @@
-"""Which Gaussians each raster tile blends, front to back: prepared once a camera, because geometry is frozen."""
+"""Tile intersections on the CPU: the depth-sorted Gaussians of each raster tile.
 
-# The types of compiled functions are those of their arguments.
+They are built once per camera, because geometry is frozen.
+"""
+
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -20,11 +23,11 @@ from sgsst_core.rasterizer.projection import Outcome, Projection, Shapes, projec
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Positions in the lists are 32-bit numbers.
+#: Positions in the arrays are 32-bit integers.
 MAX_INTERSECTIONS = 2**31 - 1
-#: What a pair of Gaussian and raster tile takes: rank, slot, and the slot's gradient in the backward pass.
+#: Bytes per pair of Gaussian and raster tile: rank, slot, and the slot's gradient in the backward pass.
 _PAIR_BYTES = 4 + 4 + 12
-#: Parts of the Gaussians that a thread lists, one after the other.
+#: Number of parts of the scene that each thread processes, one after the other.
 _PARTS = 4
 _TILE = RASTER_TILE
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
@@ -32,17 +35,17 @@ _SUPPORT_BITS = -math.log2(ALPHA_MIN)
 
 @dataclass(frozen=True)
 class RasterLists:
-    """A view's Gaussians and the raster tiles they touch.
+    """Tile intersections of a view.
 
-    A Gaussian touches a tile when its support covers a pixel row of the tile somewhere between two of the tile's
-    columns. Every pair has a *slot*; the slots of one Gaussian lie side by side.
+    A Gaussian intersects a raster tile if its support overlaps a pixel row of the tile within the tile's columns. Every
+    pair of Gaussian and tile has a *slot*; the slots of one Gaussian are contiguous.
 
     Attributes:
-        projection: V Gaussians, front to back; the lists name them by their place in it, their *rank*.
-        starts: [tiles + 1] int64, where each tile's entries begin; tiles run row by row.
-        ranks: [E] int32, entry -> rank, front to back within a tile.
-        slots: [E] int32, entry -> slot.
-        first_slots: [V + 1] int64, rank -> first slot.
+        projection: V Gaussians, front to back. The index of a Gaussian in this order is its *rank*.
+        starts: [tiles + 1] int64, first entry of each tile; tiles are in row-major order.
+        ranks: [E] int32, rank of each entry, front to back within a tile.
+        slots: [E] int32, slot of each entry.
+        first_slots: [V + 1] int64, first slot of each rank.
     """
 
     projection: Projection
@@ -53,7 +56,7 @@ class RasterLists:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the lists and the projection keep in memory."""
+        """Memory use in bytes, including the projection."""
         arrays = (
             self.projection.gaussians,
             self.projection.values,
@@ -66,21 +69,24 @@ class RasterLists:
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
-    """How many raster tiles a view has across and down."""
+    """Return the number of raster tiles of a view as (across, down)."""
     return -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
 
 
 def build_raster_lists(
     scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None
 ) -> RasterLists:
-    """Project, sort by depth, and list the Gaussians of every raster tile.
+    """Project a scene, sort it by depth, and compute the tile intersections.
 
     Args:
-        shapes: of the scene, from an earlier view.
+        scene: Scene to project.
+        camera: Camera of the view.
+        near: Near plane in world units.
+        shapes: Shapes of the scene from an earlier view; None to compute them.
 
     Raises:
-        TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address or the free memory
-            can hold; counted before anything of that size is allocated.
+        TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address or
+            free memory can hold. They are counted before they are allocated.
     """
     projection = project(scene, camera, near=near, shapes=shapes)
     values, size = projection.values, (camera.width, camera.height)
@@ -96,7 +102,7 @@ def build_raster_lists(
     check_intersections(total, len(counts), camera)
     _check_memory(total, len(counts), camera)
     starts = _starts(places.sum(axis=0))
-    # Where each part's first entry of a tile goes: behind those of the parts in front of it.
+    # First position that each part writes to in each tile: after the entries of all preceding parts.
     places = starts[:-1] + np.cumsum(places, axis=0) - places
     ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
     with kernel_threads():
@@ -105,17 +111,18 @@ def build_raster_lists(
 
 
 def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterLists:
-    """The lists of some of a scene's Gaussians, from those of all: the same arrays as `build_raster_lists` makes.
+    """Restrict tile intersections to a subset of the Gaussians; gives the same arrays as `build_raster_lists`.
 
     Args:
-        places: [N] int32, each Gaussian's index among them; -1 for the others. They keep their order.
+        lists: Intersections of the whole scene.
+        places: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
     """
     projection = lists.projection
     with kernel_threads():
         gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
         take_places(places, projection.gaussians, gaussians)
         kept = gaussians >= 0
-        # Of every rank: its new one, -1 where it goes, and by how much its slots move.
+        # For every rank: its new rank (-1 if removed), and the offset by which its slots move.
         ranks = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
         first_slots = _starts(np.where(kept, np.diff(lists.first_slots), 0))
         moves = (lists.first_slots - first_slots)[:-1]
@@ -131,20 +138,20 @@ def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterList
 
 
 def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where each of some lists begins that lie one behind the other, and the end of the last one."""
+    """Return the start offsets of consecutive arrays with these lengths, and the end of the last one."""
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
 
 
 def check_intersections(total: int, gaussians: int, camera: Camera) -> None:
-    """Raise TooManyIntersectionsError when `total` pairs of Gaussian and raster tile cannot be addressed."""
+    """Raise TooManyIntersectionsError if `total` pairs of Gaussian and raster tile cannot be addressed."""
     if total > MAX_INTERSECTIONS:
         raise _refusal(total, gaussians, camera, f"more than the {MAX_INTERSECTIONS:,} that can be addressed")
 
 
 def _check_memory(total: int, gaussians: int, camera: Camera) -> None:
-    """Raise TooManyIntersectionsError when `total` pairs do not fit the memory that is free.
+    """Raise TooManyIntersectionsError if `total` pairs do not fit in free memory.
 
-    Allocating them would succeed all the same, and the process be killed when it writes there.
+    Allocating them would succeed nonetheless, and the process would be killed when it writes to them.
     """
     needed, free = total * _PAIR_BYTES, psutil.virtual_memory().available
     if needed > free:
@@ -163,8 +170,8 @@ def _refusal(total: int, gaussians: int, camera: Camera, reason: str) -> TooMany
 
 @compiled()
 def _tile_rows(value, height):
-    """Pixel rows (first, last) of the image inside a Gaussian's extents; last < first where there are none."""
-    # np, not math: in compiled code math.ceil gives an int64, which overflows for extents beyond 9e18 pixels
+    """Return the pixel rows (first, last) of the image within a Gaussian's extents; last < first if there are none."""
+    # np, not math: in compiled code math.ceil returns int64, which overflows for extents beyond 9e18 pixels.
     first = max(0.0, np.ceil(value[1] - value[7] - 0.5))
     last = min(height - 1.0, np.floor(value[1] + value[7] - 0.5))
     return int(first), int(max(last, -1.0))
@@ -172,10 +179,10 @@ def _tile_rows(value, height):
 
 @compiled()
 def _tile_span(value, first, last, width):
-    """Tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last, all inside its extents.
+    """Return the tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last within its extents.
 
-    The right edge of an ellipse is concave in y and highest at dy = SKEW * EXTENT_Y^2 / EXTENT_X, the left one its
-    mirror image; over an interval each takes its extreme there or at the nearer end.
+    The right edge of an ellipse is concave in y, with its maximum at dy = SKEW * EXTENT_Y^2 / EXTENT_X; the left edge
+    is its point reflection. Over an interval, each edge is extreme there or at the nearer end.
     """
     top, bottom = first + 0.5 - value[1], last + 0.5 - value[1]
     widest = value[2] * value[7] * (value[7] / value[6]) if value[6] > 0 else 0.0
@@ -193,13 +200,13 @@ def _tile_span(value, first, last, width):
 
 @compiled()
 def _own_part(step, threads):
-    """The part that comes `step`th, so that every thread gets parts from front to back: nearer ones have more work."""
+    """Return the part for a step, such that every thread gets parts from front to back: nearer ones are more work."""
     return step % _PARTS * threads + step // _PARTS
 
 
 @compiled(parallel=True)
 def _count_tiles(values, width, height, parts, threads, counts, places):
-    """How many tiles each Gaussian touches, and how many Gaussians of each part touch each tile."""
+    """Count the tiles that each Gaussian intersects, and the Gaussians of each part that intersect each tile."""
     across = (width + _TILE - 1) // _TILE
     for step in numba.prange(parts.size - 1):
         part = _own_part(step, threads)
@@ -217,7 +224,7 @@ def _count_tiles(values, width, height, parts, threads, counts, places):
 
 @compiled(parallel=True)
 def _fill_tiles(values, width, height, parts, threads, first_slots, places, ranks, slots):
-    """Counting sort of all pairs by tile; Gaussians come in order of depth, so every tile's list does too."""
+    """Sort all pairs by tile (counting sort). Gaussians are processed in depth order, so every tile is depth-sorted."""
     across = (width + _TILE - 1) // _TILE
     for step in numba.prange(parts.size - 1):
         part = _own_part(step, threads)
@@ -236,7 +243,7 @@ def _fill_tiles(values, width, height, parts, threads, first_slots, places, rank
 
 @compiled(parallel=True)
 def _count_kept(ranks, starts, new_ranks, counts):
-    """How many entries each tile keeps."""
+    """Count the remaining entries of each tile."""
     for tile in numba.prange(starts.size - 1):
         total = 0
         for position in range(starts[tile], starts[tile + 1]):
@@ -246,7 +253,7 @@ def _count_kept(ranks, starts, new_ranks, counts):
 
 @compiled(parallel=True)
 def _take_kept(ranks, slots, starts, new_ranks, moves, new_starts, out_ranks, out_slots):
-    """The entries that each tile keeps, with their new ranks and slots."""
+    """Copy the remaining entries of each tile with their new ranks and slots."""
     for tile in numba.prange(starts.size - 1):
         place = new_starts[tile]
         for position in range(starts[tile], starts[tile + 1]):

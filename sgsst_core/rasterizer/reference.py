@@ -1,8 +1,8 @@
-"""`reference`: plain PyTorch, float64 by default, written from the formulas and sharing no code with the compiled path.
+"""`reference`: plain PyTorch, float64 by default, written from the formulas and independent of the compiled code.
 
-The fast rasterizers are tested against this one. In float32 it is also what a vectorized PyTorch rasterizer can do,
-which is what the benchmark compares with: raster tiles are batched by how many Gaussians they hold, and each batch is a
-handful of tensor operations.
+The fast rasterizers are tested against it. In float32 it also shows what a vectorized PyTorch rasterizer can achieve,
+which is the benchmark's baseline: raster tiles are batched by the number of their Gaussians, and each batch takes a few
+tensor operations.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: (pixel, Gaussian) pairs evaluated at a time; a batch holds about ten tensors of this many values.
+#: Number of (pixel, Gaussian) pairs per batch; a batch holds about ten tensors of this size.
 _BATCH_PAIRS = 1 << 20
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians on the image plane, front to back, all [V], float64.
+    """Gaussians on the image plane, front to back. All fields are [V], float64.
 
-    The power is (u^2 + w^2) / 2 with w = dx / sqrt(p), u = (dy - (q / p) dx) sqrt(p / det) for a covariance
-    [[p, q], [q, r]].
+    The power is (u^2 + w^2) / 2 with w = dx / sqrt(p), u = (dy - (q / p) dx) sqrt(p / det) for a covariance [[p, q],
+    [q, r]].
     """
 
     gaussians: Tensor  # int64, indices into the scene
@@ -45,12 +45,12 @@ class Splats:
     skew: Tensor  # q / p
     u_scale: Tensor  # sqrt(p / det)
     opacity: Tensor
-    extent_x: Tensor  # half extents in pixels of where alpha >= ALPHA_MIN
+    extent_x: Tensor  # half extents in pixels of the area where alpha >= ALPHA_MIN
     extent_y: Tensor
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any length but zero."""
+    """Return the rotation matrices [N, 3, 3] of wxyz quaternions [N, 4] of any non-zero norm."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -61,7 +61,10 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
-    """Derivative [N, 2, 3] of the projection at centers [N, 3] in the camera's frame, slopes clamped to the frustum."""
+    """Return the Jacobian [N, 2, 3] of the projection at camera-space centers [N, 3].
+
+    Slopes are clamped to the frustum plus a margin.
+    """
     x, y, z = centers.unbind(-1)
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
@@ -74,17 +77,17 @@ def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
 
 
 def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
-    """EWA projection (Zwicker et al. 2002) in float64; Gaussians that can reach no pixel are left out."""
+    """Project Gaussians (EWA, Zwicker et al. 2002) in float64, and drop those that reach no pixel."""
     pose = camera.world_to_camera.double()
     centers = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
     index = torch.nonzero(centers[:, 2] >= near)[:, 0]
     centers = centers[index]
     factor = perspective_derivative(centers, camera) @ pose[:3, :3] @ rotation_matrices(scene.quats[index].double())
-    factor = factor * scene.scales[index].double().exp()[:, None, :]  # covariance without blur: factor factor^T
+    factor = factor * scene.scales[index].double().exp()[:, None, :]  # covariance without blur is factor factor^T
     m0, m1 = factor[:, 0], factor[:, 1]
     p, q, r = (m0 * m0).sum(-1) + EPS2D, (m0 * m1).sum(-1), (m1 * m1).sum(-1) + EPS2D
     minors = torch.linalg.cross(m0, m1).square().sum(-1)
-    det = minors + EPS2D * (p + r - EPS2D)  # Cauchy-Binet; p and r hold the blur already
+    det = minors + EPS2D * (p + r - EPS2D)  # Cauchy-Binet; p and r already include the blur
     opacity = scene.opacities[index].double().sigmoid()
     reach = (2 * (opacity / ALPHA_MIN).log()).clamp_min(0).sqrt()
     columns = torch.stack(
@@ -99,7 +102,7 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
             reach * r.sqrt(),
         ]
     )
-    # a determinant that overflows would leave u_scale 0: finite, and a Gaussian where the fast projection has none
+    # An overflowing determinant would leave u_scale = 0: finite, but the fast projection drops this Gaussian.
     usable = columns.isfinite().all(0) & det.isfinite()
     keep = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
     keep = keep[torch.sort(centers[keep, 2], stable=True).indices]
@@ -107,17 +110,17 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
 
 
 class ReferenceRasterizer:
-    """The protocol of `sgsst_core.rasterizer.Rasterizer` in plain PyTorch on the CPU.
+    """Implementation of `sgsst_core.rasterizer.Rasterizer` in plain PyTorch on the CPU.
 
-    Memory is bounded by batches of about a million (pixel, Gaussian) pairs, whatever the size of view and scene. Of
-    what does not depend on colors, the projection and the lists of the last camera are kept.
+    Memory is bounded by batches of about a million (pixel, Gaussian) pairs, for views and scenes of any size.
+    Projection and tile intersections of the last camera are cached, because they do not depend on colors.
 
     Args:
-        scene: its geometry must not change while this object lives.
-        background: three values added where Gaussians leave pixels uncovered.
-        near: near plane in world units.
-        alpha_max: clamp of alpha.
-        dtype: of blending, image and gradient; the projection is float64 always.
+        scene: Scene, whose geometry must not change during this object's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        alpha_max: Upper limit of alpha.
+        dtype: Dtype of blending, image and gradient; the projection is always float64.
     """
 
     name = "reference"
@@ -141,7 +144,7 @@ class ReferenceRasterizer:
         self._prepared: tuple[CameraKey, Splats, Tensor, Tensor] | None = None
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] of colors [N, 3] in the camera's rows, over the background."""
+        """Return the image [h, width, 3] of colors [N, 3] over the background."""
         colors = check_colors(colors, len(self.scene), self.dtype, self.device)
         start, stop = check_rows(camera, rows)
         image = self.background.expand((stop - start) * camera.width + 1, 3).clone()
@@ -150,7 +153,7 @@ class ReferenceRasterizer:
         return image[:-1].view(stop - start, camera.width, 3)
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
         start, stop = check_rows(camera, rows)
         coverage = torch.zeros((stop - start) * camera.width + 1, dtype=self.dtype)
         for pixels, _, _, left in self._blended(camera, (start, stop)):
@@ -158,7 +161,7 @@ class ReferenceRasterizer:
         return coverage[:-1].view(stop - start, camera.width)
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3] in the camera's rows."""
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3] of the rows."""
         band = check_rows(camera, rows)
         flat = check_image_gradient(image_gradient, camera, band, self.dtype, self.device).view(-1, 3)
         flat = torch.cat([flat, flat.new_zeros(1, 3)])
@@ -168,13 +171,14 @@ class ReferenceRasterizer:
         return gradient
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [height, width], and each Gaussian's blend weights summed over all pixels [N]."""
+        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N]."""
         return plain_survey(self, camera)
 
     def near_cutoff(self, camera: Camera, tolerance: float, rows: Rows | None = None) -> Tensor:
-        """Pixels [h, width] bool where a decision is close: alpha or transmittance within `tolerance` of its cut.
+        """Return the mask [h, width] bool of pixels where a decision is close.
 
-        There, and only there, another rasterizer's rounding may skip what this one blends, or the other way round.
+        There, an alpha or a transmittance is within a relative `tolerance` of its cutoff. Only in these pixels can
+        another rasterizer, because of its rounding, skip what this one blends, or the reverse.
         """
         start, stop = check_rows(camera, rows)
         doubtful = torch.zeros((stop - start) * camera.width + 1, dtype=torch.bool)
@@ -189,7 +193,7 @@ class ReferenceRasterizer:
         return doubtful[:-1].view(stop - start, camera.width)
 
     def _blended(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Batches of pixels [b, n] (indices into the band), Gaussians [b, k], weights [b, n, k], T_final [b, n]."""
+        """Yield batches of pixel indices [b, n] in the band, Gaussians [b, k], weights [b, n, k] and T_final [b, n]."""
         for pixels, splats in self._batches(camera, band):
             alpha = self._alpha(splats, pixels, camera, band[0])
             alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
@@ -197,11 +201,12 @@ class ReferenceRasterizer:
             going_on = after > TRANSMITTANCE_MIN
             before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
             weights = torch.where(going_on, alpha * before, 0)
-            left = torch.where(going_on, after, 1).amin(-1)  # transmittance only falls: its last value is its smallest
+            # transmittance only decreases: its last value is its minimum
+            left = torch.where(going_on, after, 1).amin(-1)
             yield pixels, splats.gaussians, weights, left
 
     def _alpha(self, splats: Splats, pixels: Tensor, camera: Camera, first_row: int) -> Tensor:
-        """Clamped alpha [b, n, k] of splats [b, k] at pixels [b, n] of the band that begins at `first_row`."""
+        """Return the clamped alpha [b, n, k] of splats [b, k] at pixels [b, n] of the band from `first_row`."""
         dx = (pixels % camera.width + 0.5).to(self.dtype)[..., None] - splats.x[:, None]
         dy = (pixels // camera.width + (first_row + 0.5)).to(self.dtype)[..., None] - splats.y[:, None]
         w = dx * splats.w_scale[:, None]
@@ -209,7 +214,7 @@ class ReferenceRasterizer:
         return (splats.opacity[:, None] * ((u * u + w * w) * -0.5).exp()).clamp_max(self.alpha_max)
 
     def _batches(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Splats]]:
-        """Pixels [b, n] of b raster tiles with the splats [b, k] to blend in them; short lists end in empty splats."""
+        """Yield the pixels [b, n] of b raster tiles with the splats [b, k] to blend, padded with empty splats."""
         splats, ranks, counts = self._lists(camera)
         starts = counts.cumsum(0) - counts
         first_row = torch.arange(len(counts)) // -(-camera.width // RASTER_TILE) * RASTER_TILE
@@ -227,7 +232,12 @@ class ReferenceRasterizer:
                 yield pixels, batch
 
     def _lists(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
-        """Splats (one empty one added at the end), ranks by raster tile (the empty one last), list lengths."""
+        """Return the tile intersections of a camera.
+
+        Returns:
+            Splats with an empty one appended, ranks by raster tile with the empty splat's rank last, and number of
+                ranks per tile.
+        """
         key = camera_key(camera)
         if self._prepared is None or self._prepared[0] != key:
             splats = splat(self.scene, camera, near=self.near)
@@ -242,7 +252,10 @@ class ReferenceRasterizer:
 
 
 def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Ranks of the splats whose extents, a pixel wider, meet each raster tile; and the lists' lengths [tiles]."""
+    """Return the ranks of the splats that intersect each raster tile, and their number per tile [tiles].
+
+    Extents are enlarged by one pixel.
+    """
     across, down = -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
 
     def tiles(center: Tensor, extent: Tensor, limit: int) -> tuple[Tensor, Tensor]:
@@ -261,7 +274,10 @@ def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def tile_pixels(tiles: Tensor, camera: Camera, band: Rows) -> Tensor:
-    """Pixels [b, 256] of raster tiles as indices into the band; one past its end for pixels outside view or band."""
+    """Return the pixels [b, 256] of raster tiles as indices into the band.
+
+    Pixels outside the view or the band get the index one past the end.
+    """
     across = -(-camera.width // RASTER_TILE)
     place = torch.arange(RASTER_TILE**2)
     x = (tiles % across * RASTER_TILE)[:, None] + place % RASTER_TILE

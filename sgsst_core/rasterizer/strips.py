@@ -1,6 +1,7 @@
-"""Kept blend weights on the CPU: runs of weights by half raster tile, applied with vector instructions.
+"""Cached blend weights on the CPU, stored per half raster tile and applied with SIMD.
 
-In the same order as `cpu`, and so with the same result. See `kernels` for the layout.
+With float32 weights, images are bit-identical to those of `cpu`, because the order of operations is the same. See
+`kernels` for the layout.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene.camera import Camera
 
-_ITEM_BYTES = 20  # a Gaussian's index, a slot, a gradient
-_PIECE_BYTES = 4  # an item
+_ITEM_BYTES = 20  # Gaussian index, slot, gradient
+_PIECE_BYTES = 4  # item index
 
 
 def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -27,11 +28,11 @@ def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class CountedStrips:
-    """What a band's weights will need, counted before they are kept: costs about one render.
+    """Sizes of a band's weights, counted before they are stored; takes about as long as one render.
 
     Attributes:
-        items: [strips].
-        pieces: [4 strips], of 32 weights.
+        items: [strips], items per strip.
+        pieces: [4 strips], pieces of 32 weights per block.
         slot_items: [E], items of every pair of Gaussian and raster tile.
     """
 
@@ -47,21 +48,21 @@ class CountedStrips:
             kernels.count_weights(*tiles, band, camera.width, rasterizer.alpha_max, *counts)
 
     def nbytes(self, precision: Precision) -> int:
-        """Bytes that the weights would take."""
+        """Return the size of the weights in bytes."""
         pixels = (self.band[1] - self.band[0]) * self.camera.width
         index = self.items.nbytes + self.pieces.nbytes + 4 * pixels + _ITEM_BYTES * int(self.items.sum())
         piece = _PIECE_BYTES + kernels.PIECE * (4 if precision == "float32" else 2)
         return index + int(self.pieces.sum()) * piece
 
     def keep(self, precision: Precision) -> WeightStrips:
-        """Compute the weights once more, and keep them."""
+        """Compute the weights again and store them."""
         return WeightStrips(self, precision)
 
 
 class WeightStrips:
-    """Blend weights of one band of a view.
+    """Cached blend weights of one band of a view.
 
-    Weights are kept for the rows that a Gaussian reaches in a strip of 8 columns by 16 rows, one run of 8 a row,
+    Weights are stored for the rows that a Gaussian reaches in a strip of 8 columns by 16 rows: 8 values per row,
     float32 or float16.
     """
 
@@ -97,7 +98,7 @@ class WeightStrips:
             kernels.keep_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
 
     def render(self, colors: Tensor) -> Tensor:
-        """Image [h, width, 3] of colors [N, 3], over the background."""
+        """Return the image [h, width, 3] of colors [N, 3] over the background."""
         transmittance = self.transmittance.numpy()
         image = np.empty((*transmittance.shape, 3), dtype=np.float32)
         with kernel_threads():
@@ -105,7 +106,7 @@ class WeightStrips:
         return torch.from_numpy(image)
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3]."""
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3]."""
         gradient = np.zeros((self._total, 3), dtype=np.float32)
         pixels = image_gradient.numpy()
         with kernel_threads():

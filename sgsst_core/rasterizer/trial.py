@@ -1,8 +1,8 @@
-"""Whether a GPU rasterizer works here: one Gaussian is drawn to see.
+"""Test whether a GPU rasterizer works on this machine, by rendering a single Gaussian.
 
-A package that can be imported may still lack its compiled kernels, or have those of another CUDA, which shows at their
-first use: in the middle of a job, if nobody has tried before. gsplat compiles its kernels then, and processes that do
-so at the same time delete each other's files: they try one after the other.
+A package that can be imported may still lack compiled kernels, or have those of another CUDA version. This shows only
+at their first use, which would otherwise be in the middle of a job. gsplat compiles its kernels at that point, and
+processes that do so at the same time delete each other's files, so they take turns.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from sgsst_core.scene.gaussians import Scene
 
 
 def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -> str | None:
-    """Why a rasterizer cannot draw on a device, in a few words; None where it can.
+    """Return the reason why a rasterizer cannot render on a device, as a short text; None if it can.
 
-    Takes minutes where kernels are compiled, here or by another process. Afterwards they are at hand.
+    Takes minutes if kernels have to be compiled, by this or another process. Afterwards they are cached.
     """
     try:
         with one_at_a_time(build_folder()):
             drawn = _draws(name, device)
-    except Exception as error:  # whatever it is, it cannot be used
+    except Exception as error:  # any exception means that it cannot be used
         return (str(error).strip().splitlines() or [type(error).__name__])[0]
     return None if drawn else "it draws nothing"
 
@@ -51,18 +51,18 @@ def _draws(name: RasterizerName, device: torch.device | str) -> bool:
 
 
 def build_folder() -> Path:
-    """Where PyTorch compiles extensions."""
-    from torch.utils.cpp_extension import get_default_build_root  # looks for compilers when it is imported
+    """Return the folder in which PyTorch compiles extensions."""
+    from torch.utils.cpp_extension import get_default_build_root  # importing it searches for compilers
 
     return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root())
 
 
 @contextmanager
 def one_at_a_time(folder: Path) -> Iterator[None]:
-    """Wait until no other process is inside this block for the same folder, and keep others out until it ends.
+    """Hold an exclusive lock of a folder, across processes, inside a `with` block.
 
-    The system lifts the lock of a process that dies. Where nothing can be written nothing can be compiled either, and
-    nobody waits.
+    The operating system releases the lock of a process that dies. If the folder cannot be written, nothing can be
+    compiled there either, so nothing is locked.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

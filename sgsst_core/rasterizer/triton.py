@@ -1,9 +1,11 @@
-"""`triton`: float32 on a GPU, without a compiler to install; the same source runs in Triton's interpreter on the CPU.
+"""`triton`: float32 on a GPU, without requiring a compiler.
 
-Lists are built on the device: one projection kernel, one sort of the Gaussians by depth and one of the pairs of
-Gaussian and raster tile by tile, both radix sorts of PyTorch. The second one is stable and takes the tile alone as its
-key, because pairs are listed in order of depth: half the bits of a key that holds both, and Gaussians of equal float32
-depth keep the order of their float64 depths.
+The same source runs on the CPU in Triton's interpreter.
+
+Tile intersections are computed on the device: a projection kernel, a sort of the Gaussians by depth, and a sort of the
+(Gaussian, raster tile) pairs by tile. Both are PyTorch's radix sorts. The second sort is stable and its key is only the
+tile, because pairs are generated in depth order. This needs half the bits of a combined key, and Gaussians of equal
+float32 depth keep the order of their float64 depths.
 """
 
 from __future__ import annotations
@@ -27,24 +29,24 @@ from sgsst_core.rasterizer.raster_lists import check_intersections, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: exp(-power) = 2^-(u^2 + w^2) when u and w are scaled by this, as in `projection`.
+#: exp(-power) = 2^-(u^2 + w^2) if u and w are scaled by this factor, as in `projection`.
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
-#: Bytes of kept lists, unless told otherwise: some 80 a visible Gaussian and 8 a pair of Gaussian and tile.
+#: Default budget for tile intersections in bytes; they take some 80 per visible Gaussian and 8 per Gaussian-tile pair.
 DEFAULT_LIST_BYTES = 4 << 30
 
 
 @dataclass(frozen=True)
 class DeviceLists:
-    """`raster_lists.RasterLists` on the device; V visible Gaussians, E pairs of Gaussian and raster tile.
+    """`raster_lists.RasterLists` on the device, with V visible Gaussians and E pairs of Gaussian and raster tile.
 
     Attributes:
-        gaussians: [V] int64 indices into the scene, front to back.
+        gaussians: [V] int64, indices into the scene, front to back.
         values: [V, 8] float64, see `projection.Column`.
-        starts: [tiles + 1] int64, where each tile's entries begin.
-        ranks: [E] int32, entry -> rank, front to back within a tile.
-        slots: [E] int32, entry -> slot; the slots of one Gaussian lie side by side.
-        first_slots: [V + 1] int64, rank -> first slot.
+        starts: [tiles + 1] int64, first entry of each tile.
+        ranks: [E] int32, rank of each entry, front to back within a tile.
+        slots: [E] int32, slot of each entry; the slots of one Gaussian are contiguous.
+        first_slots: [V + 1] int64, first slot of each rank.
     """
 
     gaussians: Tensor
@@ -56,7 +58,7 @@ class DeviceLists:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the lists keep on the device."""
+        """Size on the device in bytes."""
         return sum(
             tensor.nbytes
             for tensor in (self.gaussians, self.values, self.starts, self.ranks, self.slots, self.first_slots)
@@ -64,24 +66,24 @@ class DeviceLists:
 
 
 class TritonRasterizer:
-    """The protocol of `sgsst_core.rasterizer.Rasterizer` in Triton kernels.
+    """Implementation of `sgsst_core.rasterizer.Rasterizer` in Triton kernels.
 
-    Color gradients repeat to the bit on one machine: every pair of Gaussian and tile has a slot of its own, and slots
-    are added in a fixed order. Bands of rows put together are the same bits as the whole view. Lists of views are kept
-    until `max_list_bytes` are reached (`KeptLists`).
+    Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a slot of its own,
+    and slots are added in a fixed order. Bands of rows put together are bit-identical to the whole view. Tile
+    intersections are cached within a budget (`KeptLists`).
 
     Args:
-        scene: its geometry must not change while this object lives.
-        background: three values added where Gaussians leave pixels uncovered.
-        near: near plane in world units.
-        device: a GPU, or the CPU where Triton's interpreter is on (TRITON_INTERPRET=1); None takes the GPU where there
-            is one.
-        alpha_max: clamp of alpha.
-        max_list_bytes: see above.
-        beside: one in whose bytes for lists this one keeps its own, as far as they are left; in place of the above.
+        scene: Scene, whose geometry must not change during this object's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        device: GPU, or the CPU if Triton's interpreter is on (TRITON_INTERPRET=1). None for the GPU if there is one.
+        alpha_max: Upper limit of alpha.
+        max_list_bytes: Memory budget for tile intersections in bytes.
+        beside: Rasterizer whose budget for tile intersections this one shares, with lower priority, instead of
+            `max_list_bytes`; None for a budget of its own.
 
     Raises:
-        SettingsError: Triton is missing, or cannot run on the device.
+        SettingsError: If Triton is missing or cannot run on the device.
     """
 
     name = "triton"
@@ -114,25 +116,25 @@ class TritonRasterizer:
         self._lists: KeptLists[DeviceLists] = KeptLists(self._build, max_list_bytes, host=host)
 
     def lists(self, camera: Camera) -> DeviceLists:
-        """The view's Gaussians by raster tile, kept or new.
+        """Return the tile intersections of a view, cached or newly built.
 
         Raises:
-            TooManyIntersectionsError: more pairs of Gaussian and tile than 32-bit positions can address.
+            TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address.
         """
         return self._lists.of(camera)
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Image [h, width, 3] float32 of colors [N, 3] in the camera's rows, over the background."""
+        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
         values = check_colors(colors, len(self.scene), torch.float32, self.device)
         return self._render(values, camera, check_rows(camera, rows))[0]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
+        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         nothing = torch.zeros((len(self.scene), 3), device=self.device)
         return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """W^T dL/dimage, [N, 3] float32, of image_gradient [h, width, 3] in the camera's rows."""
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         band = check_rows(camera, rows)
@@ -152,9 +154,9 @@ class TritonRasterizer:
         return gradient
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Coverage [height, width] and each Gaussian's blend weights summed over all pixels [N], float32, in one pass.
+        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
-        The same bits as `coverage`, and as a column of `color_gradient` of ones.
+        Bit-identical to `coverage`, and to a column of `color_gradient` of ones.
         """
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -176,7 +178,7 @@ class TritonRasterizer:
         return 1 - transmittance, weights
 
     def _render(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
-        """Image and final transmittance of a band."""
+        """Return the image and the final transmittance of a band."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         lists = self.lists(camera)
@@ -192,7 +194,7 @@ class TritonRasterizer:
         return image, transmittance
 
     def cuts(self) -> dict[str, float | int]:
-        """What the kernels that blend are compiled with."""
+        """Return the compile-time constants of the blending kernels."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         return {
@@ -204,7 +206,7 @@ class TritonRasterizer:
         }
 
     def _build(self, camera: Camera) -> DeviceLists:
-        """Project, sort by depth, list the Gaussians of every raster tile; waits for the device once."""
+        """Project, sort by depth and compute tile intersections; synchronizes with the device once."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         count, block = len(self.scene), kernels.PROJECTED.value
@@ -237,13 +239,13 @@ class TritonRasterizer:
 
 
 def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: Tensor) -> None:
-    """Write the sum of each Gaussian's slots, in a fixed order, into its row of `gradient`.
+    """Write the sum of each Gaussian's slots, added in a fixed order, to its row of `gradient`.
 
     Args:
         gradient: [N, 3] float32.
-        slots: [E, 3] float32; the slots of one Gaussian lie side by side.
-        first_slots: [V + 1] integers, rank -> first slot.
-        gaussians: [V] integers, rank -> row of `gradient`.
+        slots: [E, 3] float32; the slots of one Gaussian are contiguous.
+        first_slots: [V + 1] integers, first slot of each rank.
+        gaussians: [V] integers, row of `gradient` of each rank.
     """
     from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -254,10 +256,10 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
 
 
 def _usable_device(device: torch.device | str | None) -> torch.device:
-    """The device, with its index.
+    """Return the device with its index.
 
     Raises:
-        SettingsError: Triton is missing, or cannot run there.
+        SettingsError: If Triton is missing or cannot run there.
     """
     try:
         import triton
@@ -283,12 +285,12 @@ def _usable_device(device: torch.device | str | None) -> torch.device:
 
 
 def _numbers(camera: Camera, near: float) -> list[float]:
-    """What the projection kernel needs of a camera, in its order."""
+    """Return the camera parameters of the projection kernel, in its order."""
     pose = camera.world_to_camera.double()[:3].flatten().tolist()
     return [*pose, camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height), near]
 
 
 def tiles_of(camera: Camera, band: Rows) -> tuple[int, int]:
-    """Raster tiles across the view, and in the rows of tiles that a band touches."""
+    """Return the number of raster tiles across the view, and in the tile rows that a band intersects."""
     across = tile_grid(camera)[0]
     return across, across * (-(-band[1] // RASTER_TILE) - band[0] // RASTER_TILE)

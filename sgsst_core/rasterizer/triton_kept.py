@@ -1,8 +1,8 @@
-"""Kept blend weights on a GPU: pieces of 4 x 4 pixels, made and applied by Triton kernels.
+"""Cached blend weights on a GPU: pieces of 4 x 4 pixels, computed and applied by Triton kernels.
 
-See `triton_kept_kernels` for the layout. A piece takes 40 bytes in half precision and 72 in float32; with what tiles,
-Gaussians and pixels take, that was 3.0 to 3.4 and 5.3 to 6.1 bytes a weight on a scene of large Gaussians, 7.1 and 12.2
-on one of Gaussians of few pixels.
+See `triton_kept_kernels` for the layout. A piece takes 40 bytes in half precision and 72 in float32. Including data per
+tile, Gaussian and pixel, that is 3.0 to 3.4 and 5.3 to 6.1 bytes per weight for a scene of large Gaussians, and 7.1 and
+12.2 for one whose Gaussians cover few pixels.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "half": torch
 
 
 class CountedPieces:
-    """What a band's weights will need, counted before they are kept: one look at the view, one wait for the device.
+    """Sizes of a band's weights, counted before they are stored: one pass over the view and one synchronization.
 
     Attributes:
-        pieces: P.
+        pieces: P, number of pieces.
         slot_pieces: [E] int32, pieces of every pair of Gaussian and raster tile.
-        block_pieces: [16 tiles] int32, pieces of every block of the tiles that the band touches.
-        masks: [E] int32, in which blocks of its tile each pair has weights.
-        ends: [tiles] int64, the entry at which each tile is finished.
+        block_pieces: [16 tiles] int32, pieces of every block in the band's tiles.
+        masks: [E] int32, bit mask of the blocks of its tile in which each pair has weights.
+        ends: [tiles] int64, entry at which each tile is finished.
     """
 
     def __init__(self, rasterizer: TritonRasterizer, camera: Camera, band: Rows) -> None:
@@ -49,11 +49,11 @@ class CountedPieces:
 
     @property
     def index_type(self) -> torch.dtype:
-        """Of pieces and slots."""
+        """Integer dtype for piece and slot indices."""
         return torch.int32 if self.pieces < 2**31 else torch.int64
 
     def nbytes(self, precision: Precision) -> int:
-        """Bytes that the weights would take."""
+        """Return the size of the weights in bytes."""
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
         index, visible = self.index_type.itemsize, len(self.lists.gaussians)
@@ -63,21 +63,21 @@ class CountedPieces:
         return int(self.pieces * piece + starts * index + 4 * (visible + pixels))
 
     def keep(self, precision: Precision) -> WeightPieces:
-        """Compute the weights once more, and keep them."""
+        """Compute the weights again and store them."""
         return WeightPieces(self, precision)
 
 
 class WeightPieces:
-    """Blend weights of one band of a view; P pieces, V visible Gaussians.
+    """Cached blend weights of one band of a view, with P pieces and V visible Gaussians.
 
     Attributes:
-        block_starts: [16 tiles + 1], where the pieces of each block begin.
-        piece_gaussians: [P] int32 indices into the scene.
-        piece_slots: [P], where a piece's gradient goes; the slots of one Gaussian lie side by side.
-        weights: [16 P] float32, or float16 times `triton_kept_kernels.HALF_SCALE`.
-        first_slots: [V + 1], rank -> first slot.
-        gaussians: [V] int32, rank -> index into the scene.
-        transmittance: [h, width] float32, final.
+        block_starts: [16 tiles + 1], first piece of each block.
+        piece_gaussians: [P] int32, indices into the scene.
+        piece_slots: [P], slot of each piece's gradient; the slots of one Gaussian are contiguous.
+        weights: [16 P] float32, or float16 multiplied by `triton_kept_kernels.HALF_SCALE`.
+        first_slots: [V + 1], first slot of each rank.
+        gaussians: [V] int32, index into the scene of each rank.
+        transmittance: [h, width] float32, final transmittance.
     """
 
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
@@ -107,7 +107,7 @@ class WeightPieces:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the weights take on the device."""
+        """Size of the weights on the device in bytes."""
         kept = (
             *(self.block_starts, self.piece_gaussians, self.piece_slots, self.weights),
             *(self.first_slots, self.gaussians, self.transmittance),
@@ -115,7 +115,7 @@ class WeightPieces:
         return sum(tensor.nbytes for tensor in kept)
 
     def render(self, colors: Tensor) -> Tensor:
-        """Image [h, width, 3] of colors [N, 3], over the background."""
+        """Return the image [h, width, 3] of colors [N, 3] over the background."""
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
@@ -127,7 +127,7 @@ class WeightPieces:
         return image
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """W^T dL/dimage, [N, 3], of image_gradient [h, width, 3]."""
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3]."""
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
         gradient = torch.zeros((len(self._rasterizer.scene), 3), device=image_gradient.device)
@@ -142,16 +142,16 @@ class WeightPieces:
         return gradient
 
     def _grid(self) -> tuple[int]:
-        """One program a block."""
+        """Return the launch grid: one program per block."""
         return (len(self.block_starts) - 1,)
 
     def _place(self) -> tuple[int, int, int, int]:
-        """Of the band, for kernels."""
+        """Return the kernel arguments that describe the band."""
         return self.camera.width, *self.band, tiles_of(self.camera, self.band)[0]
 
 
 def _offsets(counts: Tensor, dtype: torch.dtype) -> Tensor:
-    """Where each of some counted runs begins, and the end of the last."""
+    """Return the start offsets of consecutive runs with these lengths, and the end of the last one."""
     starts = torch.zeros(len(counts) + 1, dtype=dtype, device=counts.device)
     torch.cumsum(counts, 0, out=starts[1:])
     return starts

@@ -1,19 +1,19 @@
-"""GPU kernels of kept blend weights: count, keep, apply, transpose.
+"""GPU kernels for cached blend weights: count, store, apply, transpose.
 
-A raster tile is cut into 16 blocks of 4 x 4 pixels. A piece is one Gaussian in one block: 16 weights, row by row, and
-two indices. The pieces of a block lie one after the other, front to back, so that a program reads nothing but what it
-needs, in one stream, and adds it up in registers. Blocks of 4 x 4 hold least padding together with indices: on trained
-scenes larger ones take up to a third more bytes, and smaller ones no fewer.
+A raster tile is divided into 16 blocks of 4 x 4 pixels. A piece is one Gaussian in one block: 16 weights in row-major
+order, and two indices. The pieces of a block are contiguous, front to back, so a program reads only what it needs, as
+one stream, and accumulates in registers. Blocks of 4 x 4 have the least overhead of padding and indices: on trained
+scenes, larger blocks take up to a third more bytes, and smaller ones take no fewer.
 
 Weights are those of `triton_kernels.blend_weights`. They are computed twice, by two kernels that the compiler may round
-differently: which blocks hold a weight is decided once, by `count_pieces`, and `keep_pieces` follows its masks. As
-float16 they are multiplied by `HALF_SCALE`, which keeps the least of them (4e-7) among the normal numbers: each is off
-by at most 2^-11 of itself.
+differently. Which blocks have a weight is therefore decided once, by `count_pieces`, and `keep_pieces` follows its
+masks. In float16, weights are multiplied by `HALF_SCALE`, which makes even the smallest of them (4e-7) a normal number,
+with a relative error of at most 2^-11.
 
-Nothing is added atomically: results repeat to the bit.
+There are no atomics, so results are reproducible bit for bit.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import triton.language as tl
 
 from sgsst_core.rasterizer.triton_kernels import blend_weights
 
-#: Blocks of a raster tile, weights of a piece, pieces that one program reads at a time.
+#: Blocks per raster tile, weights per piece, and pieces that a program reads per step.
 BLOCKS, PIECE, PIECES = tl.constexpr(16), tl.constexpr(16), tl.constexpr(16)
-#: 0.99 times it is in the range of float16, and the least weight a normal number.
+#: 0.99 times this is in the range of float16, and the smallest weight is a normal number.
 HALF_SCALE = 2.0**14
 _TILE: tl.constexpr = tl.constexpr(16)
 _PIXELS: tl.constexpr = tl.constexpr(256)
@@ -34,7 +34,7 @@ _SIDE: tl.constexpr = tl.constexpr(4)
 
 @triton.jit
 def _tile_pixels(tile, width, first_row, last_row, across):
-    """Of a raster tile: its corner, which of its 256 pixels are in the band, and their places in it."""
+    """Return the corner of a raster tile, which of its 256 pixels are in the band, and their indices in it."""
     x0, y0 = tile % across * _TILE, tile // across * _TILE
     pixel = tl.arange(0, _PIXELS)
     x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
@@ -44,7 +44,7 @@ def _tile_pixels(tile, width, first_row, last_row, across):
 
 @triton.jit
 def _block_pixels(block, width, first_row, last_row, across):
-    """Which of the 16 pixels of a band's block are in the band, and their places in it."""
+    """Return which of a block's 16 pixels are in the band, and their indices in it."""
     tile = first_row // _TILE * across + block // BLOCKS
     pixel = tl.arange(0, PIECE)
     x = tile % across * _TILE + block % _SIDE * _SIDE + pixel % _SIDE
@@ -55,8 +55,8 @@ def _block_pixels(block, width, first_row, last_row, across):
 
 @triton.jit
 def _by_block(weights, K: tl.constexpr):
-    """Weights [K, 256] of a tile's pixels as [K, 16, 16]: block, pixel of the block."""
-    split = tl.reshape(weights, [K, _SIDE, _SIDE, _SIDE, _SIDE])  # rows of blocks, rows, columns of blocks, columns
+    """Reshape the weights [K, 256] of a tile's pixels to [K, 16, 16]: block, pixel within the block."""
+    split = tl.reshape(weights, [K, _SIDE, _SIDE, _SIDE, _SIDE])  # block row, row, block column, column
     return tl.reshape(tl.permute(split, (0, 1, 3, 2, 4)), [K, BLOCKS, PIECE])
 
 
@@ -65,13 +65,13 @@ def count_pieces(
     ranks, slots, starts, values, masks, slot_pieces, block_pieces, ends, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
-    """Which blocks each pair of Gaussian and raster tile has weights in; one program a raster tile of the band.
+    """Find the blocks in which each (Gaussian, raster tile) pair has weights; one program per raster tile of the band.
 
     Args:
-        masks: [E] int32 zeros, a bit for each block.
-        slot_pieces: [E] int32 zeros, pieces by the pair's slot.
-        block_pieces: [16 tiles] int32, pieces of every block of the band's tiles, written.
-        ends: [tiles] int64, the entry at which the band's tiles are finished, written.
+        masks: Output [E] int32, one bit per block; zeros on entry.
+        slot_pieces: Output [E] int32, pieces by the pair's slot; zeros on entry.
+        block_pieces: Output [16 tiles] int32, pieces of every block in the band's tiles.
+        ends: Output [tiles] int64, entry at which each of the band's tiles is finished.
     """
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, inside, _ = _tile_pixels(tile, width, first_row, last_row, across)
@@ -100,14 +100,14 @@ def keep_pieces(
     weights, transmittances, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr, SCALE: tl.constexpr,
 ):  # fmt: skip
-    """Fill the pieces that `count_pieces` counted, and the final transmittance [h, width] of the band.
+    """Store the pieces counted by `count_pieces`, and the final transmittance [h, width] of the band.
 
     Args:
-        slot_starts: [E + 1], where the pieces of each pair begin among those of its Gaussian.
-        block_starts: [16 tiles + 1], where the pieces of each block of the band begin.
-        piece_gaussians: [P] int32 indices into the scene, written.
-        piece_slots: [P], where each piece's gradient goes, written.
-        weights: [16 P] float32, or float16 times SCALE, written.
+        slot_starts: [E + 1], first piece of each pair among those of its Gaussian.
+        block_starts: [16 tiles + 1], first piece of each block of the band.
+        piece_gaussians: Output [P] int32, indices into the scene.
+        piece_slots: Output [P], slot of each piece's gradient.
+        weights: Output [16 P] float32, or float16 multiplied by SCALE.
     """
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, inside, place = _tile_pixels(tile, width, first_row, last_row, across)
@@ -137,7 +137,7 @@ def keep_pieces(
 
 @triton.jit
 def _load_pieces(weights, k, end, P: tl.constexpr):
-    """Weights [P, 16] of the next P pieces of a block, their places [P] and which of them there are [P]."""
+    """Return the weights [P, 16] of the next P pieces of a block, their indices [P], and which of them exist [P]."""
     j = k.to(tl.int64) + tl.arange(0, P)
     there = j < end
     cells = weights + PIECE * j[:, None] + tl.arange(0, PIECE)[None, :]
@@ -149,7 +149,7 @@ def apply_pieces(
     block_starts, gaussians, weights, colors, background, transmittances, image, width, first_row, last_row, across,
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """Image [h, width, 3] of kept weights; one program a block."""
+    """Render the image [h, width, 3] from cached weights; one program per block."""
     inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
     k, end = tl.load(block_starts + tl.program_id(0)), tl.load(block_starts + tl.program_id(0) + 1)
     red, green, blue = (
@@ -175,7 +175,7 @@ def piece_gradients(
     block_starts, slots, weights, image_gradient, out, width, first_row, last_row, across,
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """dL/dcolor of every piece in its own slot [P, 3]; one program a block."""
+    """Write dL/dcolor of every piece to its slot [P, 3]; one program per block."""
     inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
     red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
     green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)

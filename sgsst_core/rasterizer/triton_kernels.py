@@ -1,13 +1,13 @@
-"""GPU kernels of the `triton` rasterizer: projection, tile lists, compositing, its transpose.
+"""GPU kernels of the `triton` rasterizer: projection, tile intersections, compositing and its transpose.
 
-The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (TRITON_INTERPRET=1 before the first
-import). What is done about the numbers is what `projection` and `vectors` do about them: geometry in float64, down to
-the offset of a row of pixels from a Gaussian's axis; alpha and everything behind it in float32. Compositing and its
-transpose walk front to back, so no transmittance is ever recomputed by dividing by 1 - alpha of many Gaussians. Nothing
-is added atomically: results repeat to the bit.
+The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (set TRITON_INTERPRET=1 before the first
+import). Numerics follow `projection` and `vectors`: geometry is float64, down to the offset of a pixel row from a
+Gaussian's axis; alpha and everything after it is float32. Compositing and its transpose go front to back, so no
+transmittance is recovered by dividing by 1 - alpha of many Gaussians. There are no atomics, so results are reproducible
+bit for bit.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-#: Gaussians that one program projects, and that it blends at a time.
+#: Gaussians projected per program, and Gaussians blended per step.
 PROJECTED, BLENDED = tl.constexpr(128), tl.constexpr(32)
-#: Gaussians whose slots one program adds up, and slots of each that it reads at a time.
+#: Gaussians per program of `add_slots`, and slots of each that it reads per step.
 ADDED, SLOTS = tl.constexpr(32), tl.constexpr(16)
 _TILE: tl.constexpr = tl.constexpr(16)
 _PIXELS: tl.constexpr = tl.constexpr(256)
@@ -31,13 +31,13 @@ def _is_finite(x):
 
 @triton.jit
 def _to_pixel(x, largest):
-    """Whole number in 0 .. largest of a float64 that may be anything but NaN."""
+    """Convert a float64 that is not NaN to an integer in 0 .. largest."""
     return tl.minimum(tl.maximum(x, 0.0), largest).to(tl.int32)
 
 
 @triton.jit
 def _tile_rows(value_y, extent_y, height):
-    """Pixel rows (first, last) of the image inside a Gaussian's extents; last < first where there are none."""
+    """Return the pixel rows (first, last) of the image within a Gaussian's extents; last < first if there are none."""
     first = tl.maximum(tl.ceil(value_y - extent_y - 0.5), 0.0)
     last = tl.minimum(tl.floor(value_y + extent_y - 0.5), height - 1.0)
     empty = (last < first) | (first >= height)
@@ -46,7 +46,10 @@ def _tile_rows(value_y, extent_y, height):
 
 @triton.jit
 def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first, last, width):
-    """Tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last: see `raster_lists._tile_span`."""
+    """Return the tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last.
+
+    See `raster_lists._tile_span`.
+    """
     top, bottom = first.to(tl.float64) + 0.5 - y, last.to(tl.float64) + 0.5 - y
     safe = tl.where(extent_x > 0, extent_x, 1.0)
     widest = tl.where(extent_x > 0, skew * extent_y * (extent_y / safe), 0.0)
@@ -63,7 +66,10 @@ def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first,
 
 @triton.jit
 def _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, extent_x, extent_y, width):
-    """Tiles (begin, end) that Gaussians reach in tile row `down`; none beyond their pixel rows first..last."""
+    """Return the tiles (begin, end) that Gaussians reach in tile row `down`.
+
+    There are none outside their pixel rows first..last.
+    """
     top = tl.maximum(first, down * _TILE)
     bottom = tl.minimum(last, down * _TILE + _TILE - 1)
     begin, end = _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, top, bottom, width)
@@ -76,13 +82,14 @@ def project(
     means, quats, scales, logits, camera, values, depths, counts, total,
     EPS2D: tl.constexpr, MARGIN: tl.constexpr, SUPPORT: tl.constexpr, POWER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`projection.project` of BLOCK Gaussians a program, and how many raster tiles each touches.
+    """Run `projection.project` for BLOCK Gaussians per program, and count the raster tiles that each intersects.
 
     Args:
         camera: [19] float64: the upper three rows of world_to_camera, fx, fy, cx, cy, width, height, near.
-        values: [N, 8] float64, see `projection.Column`; rows of invisible Gaussians are not written.
-        depths: [N] float64, infinite for invisible Gaussians.
-        counts: [N] int32, 0 for invisible ones.
+        values: Output [N, 8] float64, see `projection.Column`; rows of invisible Gaussians are not written.
+        depths: Output [N] float64, infinite for invisible Gaussians.
+        counts: Output [N] int32, 0 for invisible Gaussians.
+        total: N.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = i < total
@@ -149,7 +156,7 @@ def project(
     tl.store(row + 6, extent_x, mask=visible)
     tl.store(row + 7, extent_y, mask=visible)
     tl.store(depths + p, tl.where(visible, z, float("inf")), mask=there)
-    # What is not visible may hold NaN: plain numbers in its place, and no rows.
+    # Values of invisible Gaussians may be NaN: replace them with numbers, and give them no rows.
     v, extent_y = tl.where(visible, v, 0.0), tl.where(visible, extent_y, 0.0)
     u, extent_x = tl.where(visible, u, 0.0), tl.where(visible, extent_x, 1.0)
     skew, u_scale, w_scale = (
@@ -177,13 +184,14 @@ def list_tiles(
     order, values, first_slots, camera, tiles, ranks, visible,
     SUPPORT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tile and the rank of every pair of Gaussian and raster tile, Gaussian by Gaussian.
+    """Write the tile and the rank of every (Gaussian, raster tile) pair, Gaussian by Gaussian.
 
     Args:
-        order: [V] int64, rank -> Gaussian.
+        order: [V] int64, Gaussian of each rank.
         values: [N, 8] float64.
-        first_slots: [V + 1] int64.
-        tiles, ranks: [E] int32, written.
+        first_slots: [V + 1] int64, first slot of each rank.
+        tiles: Output [E] int32.
+        ranks: Output [E] int32.
         visible: V.
     """
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -220,9 +228,9 @@ def blend_weights(
     ranks, values, k, end, x0, y0, transmittance,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
-    """Blend weights [K, 256] of the next K entries of a tile, and the pixels' transmittance [256] behind them.
+    """Return the blend weights [K, 256] of the next K entries of a tile, and the transmittance [256] behind them.
 
-    A finished pixel has transmittance 0 or less: minus what it ended with. Rows are ranks' places in the list.
+    A finished pixel has a transmittance of 0 or less: its final value, negated. `values` is indexed by rank.
     """
     j = k + tl.arange(0, K)
     there = j < end
@@ -250,7 +258,7 @@ def blend_weights(
 
 @triton.jit
 def tile_pixels(tile, across, width, first_row, last_row):
-    """Corner (x0, y0) of a raster tile, x and y of its pixels [PIXELS], and which of these are in the rows."""
+    """Return the corner (x0, y0) of a raster tile, x and y of its pixels [PIXELS], and which of them are in the band."""
     x0, y0 = tile % across * _TILE, tile // across * _TILE
     pixel = tl.arange(0, _PIXELS)
     x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
@@ -262,7 +270,7 @@ def render(
     ranks, starts, gaussians, values, colors, background, image, transmittances, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
-    """Image [h, width, 3] and final transmittance [h, width] of rows first_row..last_row; one program a raster tile."""
+    """Render the image [h, width, 3] and final transmittance [h, width] of a band; one program per raster tile."""
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
     left = tl.where(inside, 1.0, 0.0)
@@ -274,7 +282,7 @@ def render(
         j = k + tl.arange(0, K)
         there = j < end
         gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
-        # Three channels are too few for matrix units, which would take the products in less than float32 besides.
+        # Three channels are too few for matrix units, which would also multiply in less than float32.
         red += tl.sum(weights * tl.load(colors + 3 * gaussian, mask=there, other=0.0)[:, None], 0)
         green += tl.sum(weights * tl.load(colors + 3 * gaussian + 1, mask=there, other=0.0)[:, None], 0)
         blue += tl.sum(weights * tl.load(colors + 3 * gaussian + 2, mask=there, other=0.0)[:, None], 0)
@@ -293,7 +301,7 @@ def slot_gradients(
     ranks, slots, starts, values, image_gradient, out, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
-    """dL/dcolor of every pair of Gaussian and tile in its own slot [E, 3], which holds zeros before."""
+    """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3], which must be zero on entry."""
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
     place = (y - first_row).to(tl.int64) * width + x
@@ -317,9 +325,9 @@ def slot_gradients(
 
 @triton.jit
 def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, SLOTS: tl.constexpr):
-    """Add up each Gaussian's slots [E, 3], in a fixed order and in float64, into its row of `out` [N, 3].
+    """Sum each Gaussian's slots [E, 3], in a fixed order and in float64, into its row of `out` [N, 3].
 
-    SLOTS at a time: a Gaussian that fills the view has a slot in every tile.
+    SLOTS are read per step, because a Gaussian that fills the view has a slot in every tile.
     """
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = rank < visible
@@ -345,9 +353,10 @@ def survey(
     ranks, slots, starts, values, out, transmittances, width, height, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
 ):  # fmt: skip
-    """Final transmittance [h, width] of a whole view, and the sum of each pair's weights in its slot [E].
+    """Compute the final transmittance [h, width] of a whole view, and the sum of weights of each pair in its slot [E].
 
-    Slots hold zeros before. What `render` and `slot_gradients` of ones give, in one pass; one program a raster tile.
+    Slots must be zero on entry. Equals `render` and `slot_gradients` of ones, but in one pass; one program per raster
+    tile.
     """
     tile = tl.program_id(0)
     x0, y0, x, y, inside = tile_pixels(tile, across, width, 0, height)
@@ -367,7 +376,7 @@ def survey(
 
 @triton.jit
 def add_slot_weights(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, SLOTS: tl.constexpr):
-    """Add up each Gaussian's slots [E], as `add_slots` does, into its place in `out` [N]."""
+    """Sum each Gaussian's slots [E] into `out` [N], as `add_slots` does."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = rank < visible
     slot = tl.load(first_slots + rank, mask=there, other=0).to(tl.int64)

@@ -1,11 +1,11 @@
-"""The inner loops over pixels in explicit vectors, for the compiled kernels.
+"""SIMD inner loops over pixels for the Numba kernels.
 
-Written as plain loops they are compiled for long arrays: four vectors at a time, and what remains one number at a time.
-A Gaussian's weights in a raster tile are some twenty vectors, so that much of the time went into remainders. LLVM
-lowers the vector types to what the processor has (one 256-bit register, two of 128 bits, ...). No bounds are checked.
+Plain loops would be compiled for long arrays: four vectors at a time, with a scalar remainder. The weights of a
+Gaussian in a raster tile are only some twenty vectors, so much of the time would go into remainders. LLVM lowers these
+vector types to the processor's own (one 256-bit register, two of 128 bits, ...). Bounds are not checked.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from numpy.typing import NDArray
 from sgsst_core.constants import ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
 
 LANES = 8
-#: Rows of a block of kept weights: 4 rows and 3 channels are 12 vectors of sums, which fit the registers.
+#: Rows of a block of cached weights: 4 rows and 3 channels are 12 vectors of sums, which fit in registers.
 BLOCK_ROWS = 4
 _FLOAT = ir.FloatType()
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _CHANNELS = 3
 _ROW = ir.VectorType(_FLOAT, RASTER_TILE)
 _ROW_BITS = ir.VectorType(ir.IntType(32), RASTER_TILE)
-#: 2^f on [-0.5, 0.5] by interpolation in Chebyshev points: relative error 3e-9, which float32 does not see.
+#: 2^f on [-0.5, 0.5] by interpolation at Chebyshev points; its relative error of 3e-9 is below float32 precision.
 _EXP2_SERIES = (
     np.polynomial.Chebyshev.interpolate(np.exp2, 6, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
 )
-#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which then stands in the low bits.
+#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which is then in the low bits.
 _ROUNDER = 12582912.0
-#: The only liberty taken with the arithmetic: a product and a sum may be rounded once.
+#: The only permitted relaxation of the arithmetic: a product and a sum may be rounded once.
 _FUSED = ("contract",)
 
-#: Half precision keeps weight * 2^HALF_EXPONENT: the smallest weight, ALPHA_MIN * TRANSMITTANCE_MIN, and the largest,
-#: ALPHA_MAX, then both are normal numbers of float16 (relative error 2^-11), and no conversion meets a denormal.
+#: Half precision stores weight * 2^HALF_EXPONENT. The smallest weight, ALPHA_MIN * TRANSMITTANCE_MIN, and the largest,
+#: ALPHA_MAX, are then both normal numbers in float16 (relative error 2^-11), so no conversion meets a denormal.
 HALF_EXPONENT = 14
-#: float16 has 13 bits less of mantissa than float32, and an exponent bias that is 112 smaller.
+#: float16 has 13 bits of mantissa less than float32, and an exponent bias that is 112 smaller.
 HALF_SHIFT, HALF_BIAS = 13, 112
 
 
 def _splat(builder: Any, value: Any, vector: Any = _VECTOR) -> Any:
-    """A scalar in every lane."""
+    """Broadcast a scalar to all lanes."""
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
     lanes = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
     return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), lanes)
@@ -59,7 +59,7 @@ def _number(value: int) -> Any:
 
 
 def _lane_sum(builder: Any, lanes: Any) -> Any:
-    """Sum of the lanes, the upper half folded onto the lower one until one is left."""
+    """Sum the lanes, folding the upper half onto the lower one until one is left."""
     half = LANES // 2
     while half:
         order = [(lane + half) % LANES for lane in range(LANES)]
@@ -70,7 +70,7 @@ def _lane_sum(builder: Any, lanes: Any) -> Any:
 
 
 def _data(context: Any, builder: Any, array_type: types.Array, array: Any, offset: Any) -> Any:
-    """Pointer to an element of a contiguous array."""
+    """Return a pointer to an element of a contiguous array."""
     return builder.gep(context.make_array(array_type)(context, builder, array).data, [offset])
 
 
@@ -79,7 +79,7 @@ def _load(builder: Any, pointer: Any, vector_type: Any = _VECTOR, align: int = 4
 
 
 def _load_weights(builder: Any, array_type: types.Array, pointer: Any) -> Any:
-    """8 weights: float32 as they are; half-precision bits shifted into place and their exponent scaled back."""
+    """Load 8 weights: float32 as they are; half-precision bits shifted into place, with the exponent scaled back."""
     if array_type.dtype == types.float32:
         return _load(builder, pointer)
     wide = ir.VectorType(ir.IntType(32), LANES)
@@ -94,7 +94,7 @@ def _is_weights(array: Any) -> bool:
 
 
 def as_float(kept: NDArray[Any]) -> NDArray[np.float32]:
-    """Weights as kept by `keep_vector` (float32, or half-precision bits in uint16) as float32, in NumPy."""
+    """Convert weights stored by `keep_vector` (float32, or half-precision bits in uint16) to float32 in NumPy."""
     if kept.dtype == np.float32:
         return kept
     return (kept.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
@@ -102,12 +102,13 @@ def as_float(kept: NDArray[Any]) -> NDArray[np.float32]:
 
 @intrinsic
 def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
-    """Blend one Gaussian into a row of 16 pixels: block [2, 16, 16] holds transmittances and receives weights.
+    """Blend one Gaussian into a row of 16 pixels. block [2, 16, 16] holds transmittances and receives weights.
 
-    Pixel i: alpha = min(2^(log2_alpha - (u + i u_scale)^2), alpha_max), nothing below ALPHA_MIN; weight = alpha T; T
-    becomes T (1 - alpha). Where T would fall to TRANSMITTANCE_MIN nothing is blended and the pixel is finished: its T
-    is stored negated, after which no weight passes, so that one comparison serves both the cut and the memory of it.
-    Returns 1 while a pixel of the row goes on, else 0.
+    Pixel i: alpha = min(2^(log2_alpha - (u + i u_scale)^2), alpha_max), or 0 below ALPHA_MIN; weight = alpha T; T
+    becomes T (1 - alpha). If T would fall to TRANSMITTANCE_MIN, nothing is blended and the pixel is finished: its T is
+    stored negated, so it accepts no further weight, and a single comparison serves both the cutoff and its memory.
+
+    Returns 1 if some pixel of the row is unfinished, else 0.
     """
     scalars = (types.float32,) * 4
     signature = types.int64(block, types.int64, *scalars)
@@ -123,7 +124,7 @@ def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
         alpha = _exp2(builder, power)
         alpha = builder.select(builder.fcmp_ordered("<", alpha, alpha_max_), alpha, alpha_max_)
         seen = builder.fcmp_ordered(">=", power, _row([math.log2(ALPHA_MIN)]))
-        alpha = builder.select(seen, alpha, _row([0.0]))  # whatever a power far below the cut gave
+        alpha = builder.select(seen, alpha, _row([0.0]))  # discards the result for powers far below the cutoff
 
         before = _load(builder, held, _ROW)
         after = builder.fmul(before, builder.fsub(_row([1.0]), alpha))
@@ -140,13 +141,16 @@ def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
 
 
 def _row(values: Iterable[float]) -> Any:
-    """A constant row of 16 floats; one value fills it."""
+    """Return a constant row of 16 floats; a single value fills it."""
     numbers = [float(np.float32(v)) for v in values]
     return ir.Constant(_ROW, numbers * (RASTER_TILE // len(numbers)))
 
 
 def _exp2(builder: Any, power: Any) -> Any:
-    """2^power of a row, powers in float32's normal range: the whole part is the exponent, the rest a polynomial."""
+    """Return 2^power of a row, for powers in float32's normal range.
+
+    The integer part becomes the exponent; the rest goes through a polynomial.
+    """
     rounded = builder.fadd(power, _row([_ROUNDER]))
     rest = builder.fsub(power, builder.fsub(rounded, _row([_ROUNDER])))
     series = _row([_EXP2_SERIES[-1]])
@@ -159,7 +163,7 @@ def _exp2(builder: Any, power: Any) -> Any:
 
 @intrinsic
 def keep_vector(typingctx, source, begin, weights, target):
-    """weights[target + i] = source[begin + i] for 8 floats; half precision is rounded to nearest even."""
+    """Store weights[target + i] = source[begin + i] for 8 floats; half precision rounds to nearest even."""
     if not _is_weights(weights):
         return None
     signature = types.void(source, types.int64, weights, types.int64)
@@ -189,9 +193,9 @@ def keep_vector(typingctx, source, begin, weights, target):
 
 @intrinsic
 def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, blue):
-    """pixels[offset + v, c, i] += weights[begin + 8 v + i] * color[c] for v < vectors, three channels, 8 lanes.
+    """Compute pixels[offset + v, c, i] += weights[begin + 8 v + i] * color[c] for v < vectors, 3 channels, 8 lanes.
 
-    `weights` is flat, float32 or half-precision bits (uint16); `pixels` [P, 3, 8] float32. Nothing is checked.
+    `weights` is flat, float32 or half-precision bits (uint16); `pixels` is [P, 3, 8] float32. Nothing is checked.
     """
     if not _is_weights(weights):
         return None
@@ -218,9 +222,10 @@ def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, b
 
 @intrinsic
 def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
-    """The three sums over v < vectors and lanes i of weights[begin + 8 v + i] * pixels[offset + v, c, i].
+    """Return the three sums over v < vectors and lanes i of weights[begin + 8 v + i] * pixels[offset + v, c, i].
 
-    Each lane is summed in order, then the lanes pairwise: the same bits always. Arrays as in `add_scaled`.
+    Each lane is summed in order, then the lanes pairwise, so the result is deterministic. Arrays are as in
+    `add_scaled`.
     """
     if not _is_weights(weights):
         return None
@@ -249,9 +254,9 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
 
 @intrinsic
 def sum_weights(typingctx, weights, begin, vectors):
-    """Sum over v < vectors and lanes i of weights[begin + 8 v + i]: `dot_pixels` of pixels that are all 1, bit for bit.
+    """Return the sum over v < vectors and lanes i of weights[begin + 8 v + i].
 
-    `weights` is flat, float32. Nothing is checked.
+    Bit-identical to `dot_pixels` with pixels of 1. `weights` is flat, float32. Nothing is checked.
     """
     if not _is_weights(weights) or weights.dtype != types.float32:
         return None
@@ -272,7 +277,7 @@ def sum_weights(typingctx, weights, begin, vectors):
 
 @intrinsic
 def prefetch(typingctx, values, place):
-    """Ask for the cache line of `values`, flat, at an element that will be read soon: a hint, which cannot fail."""
+    """Prefetch the cache line of an element of the flat array `values`; only a hint, which cannot fail."""
     if not isinstance(values, types.Array) or values.layout != "C":
         return None
     signature = types.void(values, types.int64)
@@ -284,7 +289,7 @@ def prefetch(typingctx, values, place):
         function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(ir.VoidType(), hint), "llvm.prefetch.p0"
         )
-        flags = [ir.Constant(ir.IntType(32), flag) for flag in (0, 3, 1)]  # to read, keep near, data
+        flags = [ir.Constant(ir.IntType(32), flag) for flag in (0, 3, 1)]  # read, high locality, data cache
         builder.call(function, [builder.bitcast(pointer, byte), *flags])
         return context.get_dummy_value()
 
@@ -293,10 +298,12 @@ def prefetch(typingctx, values, place):
 
 @intrinsic
 def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
-    """pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colors[items[piece], c] over the pieces.
+    """Compute pixels[offset + row, c, i] += sum over pieces of weights[32 piece + 8 row + i] * colors[items[piece],
+    c].
 
-    Pieces first..first + count in order; 4 rows, three channels, 8 lanes. `weights` is flat, float32 or half-precision
-    bits (uint16); `items` int32; `colors` [I, 3] and `pixels` [P, 3, 8] float32. Nothing is checked.
+    Processes pieces first..first + count in order; 4 rows, 3 channels, 8 lanes. `weights` is flat, float32 or
+    half-precision bits (uint16); `items` is int32; `colors` [I, 3] and `pixels` [P, 3, 8] are float32. Nothing is
+    checked.
     """
     if not _is_weights(weights):
         return None
@@ -332,9 +339,10 @@ def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
 
 @intrinsic
 def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
-    """sums[items[piece], c, i] += sum over 4 rows of weights[32 piece + 8 row + i] * pixels[offset + row, c, i].
+    """Compute sums[items[piece], c, i] += sum over 4 rows of weights[32 piece + 8 row + i] * pixels[offset + row, c,
+    i].
 
-    Pieces first..first + count in order; `sums` [I, 3, 8] float32, the others as in `add_pieces`.
+    Processes pieces first..first + count in order. `sums` is [I, 3, 8] float32; the others are as in `add_pieces`.
     """
     if not _is_weights(weights):
         return None
@@ -365,7 +373,7 @@ def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
 
 @intrinsic
 def sum_lanes(typingctx, sums, vector):
-    """Sum of the 8 lanes of a vector, counted from the first of an array, folded in halves."""
+    """Return the sum of the 8 lanes of the vector with this index in an array, folded in halves."""
     signature = types.float32(sums, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
