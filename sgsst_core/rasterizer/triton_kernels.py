@@ -258,7 +258,7 @@ def blend_weights(
 
 @triton.jit
 def tile_pixels(tile, across, width, first_row, last_row):
-    """Return the corner (x0, y0) of a raster tile, x and y of its pixels [PIXELS], and which of them are in the band."""
+    """Return the corner (x0, y0) of a raster tile, x and y of its pixels [PIXELS], and which are in the band."""
     x0, y0 = tile % across * _TILE, tile // across * _TILE
     pixel = tl.arange(0, _PIXELS)
     x, y = x0 + pixel % _TILE, y0 + pixel // _TILE

@@ -298,10 +298,9 @@ def prefetch(typingctx, values, place):
 
 @intrinsic
 def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
-    """Compute pixels[offset + row, c, i] += sum over pieces of weights[32 piece + 8 row + i] * colors[items[piece],
-    c].
+    """Compute pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colors[items[piece], c].
 
-    Processes pieces first..first + count in order; 4 rows, 3 channels, 8 lanes. `weights` is flat, float32 or
+    Sums over pieces first..first + count in order; 4 rows, 3 channels, 8 lanes. `weights` is flat, float32 or
     half-precision bits (uint16); `items` is int32; `colors` [I, 3] and `pixels` [P, 3, 8] are float32. Nothing is
     checked.
     """
@@ -339,8 +338,7 @@ def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
 
 @intrinsic
 def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
-    """Compute sums[items[piece], c, i] += sum over 4 rows of weights[32 piece + 8 row + i] * pixels[offset + row, c,
-    i].
+    """Compute sums[items[piece], c, i] += weights[32 piece + 8 row + i] * pixels[offset + row, c, i] for 4 rows.
 
     Processes pieces first..first + count in order. `sums` is [I, 3, 8] float32; the others are as in `add_pieces`.
     """

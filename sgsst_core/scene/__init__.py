@@ -1,1 +1,1 @@
-"""What is rendered, and from where: Gaussians, cameras, view-dependent colors, the pyramid of a view."""
+"""Scene representation: Gaussians, cameras, view-dependent colors and the image pyramid."""

@@ -1,4 +1,4 @@
-"""Pinhole cameras: the type, and making new ones from old ones."""
+"""Pinhole cameras, and functions that derive new cameras from existing ones."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; pixel centers lie at +0.5, x points right, y down, z forward.
+    """Pinhole camera. Pixel centers are at +0.5; x points right, y down, z forward.
 
     Attributes:
-        name: what the camera is called in its file (image name where there is one).
-        width, height: pixels.
-        fx, fy, cx, cy: pixels.
+        name: Name in the camera file (the image name if there is one).
+        width, height: Size in pixels.
+        fx, fy, cx, cy: Intrinsics in pixels.
         world_to_camera: [4, 4] float64 rigid transform.
-        resolution: of a camera whose shape was chosen for what it shows, the longer side of the 4:3 view with as many
-            pixels; None for the camera's own longer side.
+        resolution: For cameras whose aspect ratio was chosen to fit the content: longer side of the 4:3 view with the
+            same number of pixels. None for the camera's own longer side.
     """
 
     name: str
@@ -42,29 +42,29 @@ class Camera:
 
     @property
     def side(self) -> int:
-        """What a resolution is compared with: `resolution`, or the longer side."""
+        """Length that resolutions are compared with: `resolution`, or the longer side in pixels."""
         return self.resolution or max(self.width, self.height)
 
     @property
     def center(self) -> Tensor:
-        """[3] float64: the camera's position in the world."""
+        """[3] float64, position in the world."""
         rotation = self.world_to_camera[:3, :3]
         return -rotation.T @ self.world_to_camera[:3, 3]
 
 
 def resized(camera: Camera, side: int) -> Camera:
-    """The same camera with another number of pixels; the field of view stays exactly the same.
+    """Return the camera with another number of pixels and exactly the same field of view.
 
-    Sizes are integers, so that the aspect changes by up to half a pixel; each axis' intrinsics scale with its own
-    ratio, which stretches the pixels by as much and leaves the picture's content where it was.
+    Sizes are integers, so the aspect ratio changes by up to half a pixel. The intrinsics of each axis scale with its
+    own ratio, which stretches the pixels accordingly and leaves the image content in place.
 
     Args:
-        camera: any camera.
-        side: pixels of the longer side, or the new `Camera.resolution` of a camera that has one; at least 1. Larger
-            than the camera's own is allowed.
+        camera: Any camera.
+        side: Longer side in pixels, or the new `Camera.resolution` if the camera has one; at least 1. May exceed the
+            camera's own.
 
     Raises:
-        SettingsError: side below 1.
+        SettingsError: If the side is below 1.
     """
     if side < 1:
         raise SettingsError(f"The resolution is {side} pixels; give at least 1 for the longer side.")
@@ -84,18 +84,18 @@ def resized(camera: Camera, side: int) -> Camera:
 
 
 def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
-    """The cameras, those with more pixels than `settings.max_resolution` on their longer side brought down to it."""
+    """Return the cameras, with those whose longer side exceeds `settings.max_resolution` reduced to it."""
     limit = settings.max_resolution
     return [resized(camera, limit) if limit and camera.side > limit else camera for camera in cameras]
 
 
 def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """`count` of the cameras, evenly spread over the list, in its order; all where there are no more than that.
+    """Return `count` cameras, evenly spread over the list and in its order, or all if there are no more.
 
-    Each is the middle of one of `count` equal parts, so that neither a path's ends nor the seam of a ring are favored.
+    Each is the middle one of `count` equal parts, so neither the ends of a path nor the seam of a ring are preferred.
 
     Raises:
-        SettingsError: count below 1.
+        SettingsError: If the count is below 1.
     """
     if count < 1:
         raise SettingsError(f"The number of views is {count}; give at least 1.")
@@ -106,10 +106,10 @@ def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
 
 
 def between(first: Camera, second: Camera) -> Camera:
-    """The camera halfway between two: its center is their midpoint, its rotation the spherical mean of theirs.
+    """Return the camera halfway between two: at their midpoint, with the spherical mean of their rotations.
 
-    Size and intrinsics are the first's. The mean turns by half of the shortest rotation from one to the other (slerp,
-    Shoemake 1985); of the two shortest ones at 180 degrees, either.
+    Size and intrinsics are the first camera's. The mean is halfway along the shortest rotation between the two (slerp,
+    Shoemake 1985); at 180 degrees, either of the two shortest ones.
     """
     ends = np.stack([camera.world_to_camera[:3, :3].double().numpy() for camera in (first, second)])
     rotation = torch.from_numpy(Slerp([0, 1], Rotation.from_matrix(ends))(0.5).as_matrix())
@@ -130,17 +130,20 @@ def look_at(
     focal: float,
     resolution: int | None = None,
 ) -> Camera:
-    """A camera at `position` [3] that looks at `target` [3], `up` [3] toward its upper edge.
+    """Return a camera at `position` that looks at `target`.
 
     Args:
-        name: the camera's name.
-        position, target, up: [3]; `up` need not be a unit vector, and must not point along the view.
-        width, height: pixels.
-        focal: pixels, both axes; the principal point is the middle.
-        resolution: see `Camera`.
+        name: Name of the camera.
+        position: [3], position of the camera.
+        target: [3], point at the center of the view.
+        up: [3], direction toward the upper edge; need not be a unit vector, but must not be parallel to the view.
+        width: Width in pixels.
+        height: Height in pixels.
+        focal: Focal length in pixels for both axes; the principal point is the image center.
+        resolution: See `Camera`.
 
     Raises:
-        CameraError: position and target coincide, or `up` points along the view.
+        CameraError: If position and target coincide, or `up` is parallel to the view.
     """
     up = up.to(torch.float64)
     forward = target.to(torch.float64) - position.to(torch.float64)

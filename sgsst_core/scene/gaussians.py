@@ -1,4 +1,4 @@
-"""The scene: N Gaussians in the units that 3DGS files store them in."""
+"""Scene type: N Gaussians, in the units of 3DGS files."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
-#: Gaussians that are looked at together.
+#: Number of Gaussians that are processed at a time.
 _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A trained 3DGS scene. All tensors are float32 on the CPU and hold finite values only.
+    """Trained 3DGS scene. All tensors are float32 on the CPU and contain only finite values.
 
-    Of large scenes, `sh_rest` stays in the file that the scene was read from: see `StoredHarmonics`.
+    For large scenes, `sh_rest` stays in the scene's file: see `StoredHarmonics`.
 
     Attributes:
         means: [N, 3], world units.
         quats: [N, 4], wxyz, not necessarily normalized.
         scales: [N, 3], natural logarithm of the standard deviations in world units (as in files).
         opacities: [N], logits (as in files).
-        sh_dc: [N, 3], the degree-0 coefficients: what stylization optimizes.
+        sh_dc: [N, 3], degree-0 coefficients, which stylization optimizes.
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
     """
 
@@ -45,11 +45,11 @@ class Scene:
         return {0: 0, 3: 1, 8: 2, 15: 3}[int(self.sh_rest.shape[1])]
 
     def subset(self, rows: Tensor) -> Scene:
-        """The Gaussians of some rows ([N] bool, or indices)."""
+        """Return the Gaussians of some rows ([N] bool, or indices)."""
         return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def used_degree(self, rows: Tensor | None = None) -> int:
-        """The highest degree with a coefficient that is not 0, among some Gaussians ([N] bool) or all."""
+        """Return the highest degree with a non-zero coefficient, among some Gaussians ([N] bool) or all."""
         if self.sh_degree == 0:
             return 0
         if isinstance(self.sh_rest, StoredHarmonics):
@@ -60,7 +60,7 @@ class Scene:
         return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
 
     def attenuated(self, attenuation: float) -> Scene:
-        """Return the scene with all SH bands above degree 0 times 1 - attenuation; without them if that is 0.
+        """Return the scene with all SH bands above degree 0 multiplied by 1 - fade; for a fade of 1, without them.
 
         Coefficients are multiplied in float32 by the factor rounded to float32, as in files (`attenuation_factor`).
         """
@@ -74,7 +74,7 @@ class Scene:
         return replace(self, sh_rest=self.sh_rest * factor)
 
     def without_zero_bands(self) -> Scene:
-        """The same scene without the SH bands that are zero in all Gaussians; it looks the same from everywhere."""
+        """Return the scene without the SH bands that are zero in all Gaussians; it looks the same from everywhere."""
         coefficients = (self.used_degree() + 1) ** 2 - 1
         if coefficients == self.sh_rest.shape[1]:
             return self
@@ -84,15 +84,16 @@ class Scene:
 
 
 def attenuation_factor(attenuation: float) -> float:
-    """What coefficients are multiplied by that fade by a share: a float32's value."""
+    """Return the factor of SH coefficients for an SH attenuation, rounded to float32."""
     return float(torch.tensor(1.0 - attenuation, dtype=torch.float32))
 
 
 def sampled(scene: Scene, count: int) -> Scene:
-    """At most `count` Gaussians of a scene, one of each so many, enlarged by the root of how many it stands for.
+    """Return a random sample of at most `count` Gaussians, enlarged to cover about the same area together.
 
-    Which one is chance, seeded: files may hold Gaussians in an order that every so-manyth would keep to. The area that
-    a Gaussian covers grows with the square of its size, so that together they cover about as much.
+    One Gaussian is drawn, with a fixed seed, from each run of equal length, because a file may be ordered with a
+    period. The area of a Gaussian grows with the square of its size, so sizes are multiplied by the square root of the
+    run length.
     """
     step = -(-len(scene) // count)
     first = torch.arange(0, len(scene), step)
@@ -102,7 +103,10 @@ def sampled(scene: Scene, count: int) -> Scene:
 
 
 def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:
-    """How many of the first coefficients are not 0 in some Gaussians ([N] bool) together; by parts, without a copy."""
+    """Return how many leading coefficients are needed to include all non-zero ones of some Gaussians ([N] bool).
+
+    Processes the Gaussians in chunks, without a copy.
+    """
     used = 0
     for start in range(0, len(sh_rest), _CHUNK):
         values = sh_rest[start : start + _CHUNK, used:]

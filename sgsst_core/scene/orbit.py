@@ -1,4 +1,4 @@
-"""Cameras in rings around a scene's subject, each with a frame that the subject fills."""
+"""Orbit cameras: rings around a scene's subject, each camera framed to fit it."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.subject import Subject, find_subject
 from sgsst_core.scene.up import USUAL_UP
 
-#: Resolution of an orbit that none is given for: its views have as many pixels as 1024x768.
+#: Default resolution of an orbit: its views have as many pixels as 1024x768.
 RESOLUTION = 1024
-#: Height of the 4:3 view whose pixels are counted, in widths.
+#: Height of the 4:3 view that defines the number of pixels, relative to its width.
 _PIXELS = 3 / 4
-#: Elevation of a ring that none is given for, degrees.
+#: Default elevation of a ring in degrees.
 ELEVATION = 10.0
-#: Focal length in longer sides, for which the cameras' distance is chosen: a view of 37 degrees, as by a 50 mm lens.
-#: From nearer, what is in front would hide more of the rest.
+#: Focal length relative to the longer side, which determines the distance: a field of view of 37 degrees, as with a 50
+#: mm lens. From closer up, the front would hide more of the rest.
 _FOCAL = 1.5
-#: Room left around the subject, as a factor of its extent in the frame.
+#: Margin around the subject, as a factor of its extent in the frame.
 _MARGIN = 1.03
-#: Shapes (width over height) are steps of a fourth of an octave apart, so that an orbit has few sizes, and no farther
-#: than so many steps from a square: 4 to 1.
+#: Aspect ratios (width over height) are steps of a quarter octave, so that an orbit has few sizes, and at most this
+#: many steps from square: 4 to 1.
 _STEP, _MOST_STEPS = 2**0.25, 8
-#: Area of the smallest frame as a share of the largest, so that strokes are of one size to within half an octave.
+#: Minimum area of a frame as a fraction of the largest, so that stroke sizes stay within half an octave.
 _SMALLEST = 0.5
-#: The nearest point of the subject is farther than so many times the near plane.
+#: Minimum distance of the subject's nearest point, as a multiple of the near plane.
 _NEAR_MARGIN = 1.1
-#: Half of the field of view of a frame, at most, for cameras that a given radius puts into the subject.
+#: Maximum half field of view of a frame, for cameras that a given radius places inside the subject.
 _WIDEST = math.tan(math.radians(50))
-#: Spreads of the subject to two sides that differ by less than this show no front.
+#: If the spreads of the subject along two axes differ by less than this factor, it has no broad side.
 _ROUND = 0.9
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Where a camera stands, where it looks, and the half sides of what it must show at depth 1."""
+    """Position and target of a camera, and the half extents at depth 1 that it has to show."""
 
     position: Tensor
     target: Tensor
@@ -59,23 +59,24 @@ def orbit(
     height: int | None = None,
     near: float = 0.2,
 ) -> list[Camera]:
-    """Cameras around the robust middle of a scene, all at one distance, each with a frame that its subject fills.
+    """Return cameras around the robust center of a scene, all at one distance, framed to fit the subject.
 
-    Strays and background are left out (`find_subject`). The cameras look at the middle of what they see of the
-    subject. Their frames follow its shape and have as many pixels each as 1024x768.
+    Stray Gaussians and background are ignored (`find_subject`). The cameras look at the center of the visible part of
+    the subject. Aspect ratios follow its shape, and every frame has as many pixels as 1024x768.
 
     Args:
-        scene: what to look at.
-        count: number of cameras, shared out among the rings so that neighbors are about equally far apart.
-        up: world direction of up; captures processed by COLMAP have y pointing down, so that -y is up.
-        elevations: of the rings above the scene's horizon, degrees, between -90 and 90.
-        radius: distance of the cameras from the middle, world units; None for the smallest from which the longer side
-            of every frame is seen within 37 degrees.
-        width, height: pixels, for frames of one shape.
-        near: near plane of the rasterizer, world units: the cameras stay that far from the subject.
+        scene: Scene, or its subject.
+        count: Number of cameras, distributed over the rings so that neighbors are about equally far apart.
+        up: World direction of up. Captures processed by COLMAP have y pointing down, so -y is up.
+        elevations: Elevation of each ring above the scene's horizon in degrees, between -90 and 90.
+        radius: Distance of the cameras from the center in world units; None for the smallest distance at which the
+            longer side of every frame spans 37 degrees.
+        width: Width in pixels of every frame; None to follow the shape of the subject.
+        height: Height in pixels of every frame; None to follow the shape of the subject.
+        near: Near plane of the rasterizer in world units; cameras stay at least that far from the subject.
 
     Raises:
-        SettingsError: count or size below 1, `up` without direction, elevation or radius out of range.
+        SettingsError: If count or size are below 1, `up` has no direction, or elevation or radius are out of range.
     """
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
@@ -107,7 +108,7 @@ def orbit(
 
 
 def share_out(count: int, elevations: Sequence[float]) -> list[int]:
-    """How many of `count` cameras each ring has: by its circumference, one at least, as far as there are enough."""
+    """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough."""
     around = [math.cos(math.radians(elevation)) for elevation in elevations]
     shares = [count * length / sum(around) for length in around]
     counts = [max(1, math.floor(share)) for share in shares]
@@ -120,7 +121,7 @@ def share_out(count: int, elevations: Sequence[float]) -> list[int]:
 
 
 def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
-    """Unit vectors [3] from the middle to the cameras, ring by ring; each ring is turned by half a step more."""
+    """Return unit vectors [3] from the center to the cameras, ring by ring. Odd rings are rotated by half a step."""
     start, side, _ = _level_frame(subject, up).T
     found = []
     for ring, (number, elevation) in enumerate(zip(share_out(count, elevations), elevations, strict=True)):
@@ -133,14 +134,14 @@ def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequen
 
 
 def middle_of(subject: Subject, up: Tensor) -> Tensor:
-    """[3]: the middle of the upright box around a subject, since the median of a standing figure is not its middle."""
+    """Return the center [3] of the upright box around a subject; the median of a standing figure is not its center."""
     frame = _level_frame(subject, up)
     local = subject.hull @ frame
     return frame @ ((local.amin(0) + local.amax(0)) / 2)
 
 
 def _level_frame(subject: Subject, up: Tensor) -> Tensor:
-    """[3, 3]: the level direction to the first camera, another level one, and up, as columns."""
+    """Return [3, 3] whose columns are the level direction to the first camera, another level direction, and up."""
     front = _front(subject, up)
     return torch.stack([front, torch.linalg.cross(up, front), up], dim=1)
 
@@ -152,7 +153,7 @@ def _checked(
     radius: float | None,
     size: tuple[int | None, int | None],
 ) -> Tensor:
-    """Up as a unit vector, once everything has been found to be of use."""
+    """Return up as a unit vector after checking all arguments."""
     axis = torch.tensor(up, dtype=torch.float64)
     if count < 1 or any(side is not None and side < 1 for side in size) or not elevations:
         raise SettingsError(
@@ -168,9 +169,9 @@ def _checked(
 
 
 def _front(subject: Subject, up: Tensor) -> Tensor:
-    """The level direction [3] to the first camera: at the broad side, where there is one."""
+    """Return the level direction [3] to the first camera: facing the broad side, if there is one."""
     start = torch.zeros(3, dtype=torch.float64)
-    start[2 if abs(float(up[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) up
+    start[2 if abs(float(up[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) parallel to up
     start = torch.nn.functional.normalize(start - (start @ up) * up, dim=0)
     frame = torch.stack([start, torch.linalg.cross(up, start)], dim=1)
     flat = (subject.points - subject.points[0]) @ frame
@@ -179,7 +180,7 @@ def _front(subject: Subject, up: Tensor) -> Tensor:
     spreads, axes = torch.linalg.eigh((subject.weights[:, None] * flat).T @ flat)
     if not float(spreads[0]) < _ROUND**2 * float(spreads[1]):
         return start
-    # of the two broad sides, the one to which more stands out; of two alike, the one that looks where z does
+    # Of the two broad sides, take the one from which more protrudes; if they are alike, the one on the positive z side.
     skew = float((subject.weights * (flat @ axes[:, 0]) ** 3).sum()) / max(float(spreads[0]), 1e-100) ** 1.5
     sense = skew if abs(skew) > 0.05 else float(axes[0, 0]) or 1.0
     level: Tensor = math.copysign(1.0, sense) * (frame @ axes[:, 0])
@@ -187,7 +188,7 @@ def _front(subject: Subject, up: Tensor) -> Tensor:
 
 
 def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
-    """The smallest distance from the middle from which every camera sees what lies at offsets [D, 3]."""
+    """Return the smallest distance from the center at which every camera sees all points at offsets [D, 3]."""
     origin = torch.zeros(3, dtype=torch.float64)
     distance = 0.0
     for direction in directions:
@@ -200,7 +201,7 @@ def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: f
 
 
 def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float) -> _Frame:
-    """The frame of a camera at an offset from the middle, turned to the middle of what it sees of the subject."""
+    """Return the frame of a camera at an offset from the center, aimed at the center of what it sees of the subject."""
     position, target = middle + offset, middle
     half = (0.0, 0.0)
     for _ in range(5):
@@ -216,18 +217,18 @@ def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: f
         if float(aim[:2].abs().amax()) < 1e-3 * max(half):
             break
         target = position + float(offset.norm()) * (pose[:3, :3].T @ aim)
-    # a single point has no extent; as large as the blur, it would be seen from any distance
+    # A single point has no extent; as large as the blur, it would look the same from any distance.
     least = 1e-3 * subject.size / float(offset.norm()) + 1e-6
     return _Frame(position, target, (_MARGIN * max(half[0], least), _MARGIN * max(half[1], least)))
 
 
 def _shape(half: tuple[float, float]) -> float:
-    """Width over height of the frame of something with these half sides: the nearest of a few shapes."""
+    """Return the nearest permitted aspect ratio (width over height) for something with these half extents."""
     steps = round(math.log(half[0] / half[1]) / math.log(_STEP))
     return float(_STEP ** max(-_MOST_STEPS, min(_MOST_STEPS, steps)))
 
 
 def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:
-    """Half sides of the smallest frame of a shape that holds one with these half sides."""
+    """Return the half extents of the smallest frame of an aspect ratio that contains these half extents."""
     x, y = half
     return (max(x, y * shape), max(y, x / shape))

@@ -1,4 +1,4 @@
-"""The image pyramid: exact 2^s x 2^s box averages, their adjoint, and the number of scales."""
+"""Image pyramid: exact 2^s x 2^s box averages, their adjoint, and the number of scales."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 
-#: A style image is downscaled only where it is larger than the view by more than this factor.
+#: A style image is downscaled only if it is larger than the view by more than this factor.
 STYLE_SIZE_TOLERANCE = 1.1
 
 
 def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) -> int:
-    """n_s: halve the shorter side (integer division) until it is at most `coarsest`; a small view has one scale."""
+    """Return n_s: halve the shorter side (integer division) until it is at most `coarsest`.
+
+    Small views have one scale.
+    """
     count, side = 1, min(height, width)
     while side > coarsest:
         side //= 2
@@ -20,9 +23,9 @@ def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) 
 
 
 def downscale(image: Tensor, scale: int) -> Tensor:
-    """Box average of image [H, W] or [H, W, c] over 2^scale x 2^scale blocks: [H >> scale, W >> scale, ...].
+    """Box-average an image [H, W] or [H, W, c] over 2^scale x 2^scale blocks: [H >> scale, W >> scale, ...].
 
-    Rows and columns that do not fill a block are left out.
+    Rows and columns outside complete blocks are dropped.
     """
     if scale == 0:
         return image
@@ -33,11 +36,13 @@ def downscale(image: Tensor, scale: int) -> Tensor:
 
 
 def add_upscaled_(target: Tensor, gradient: Tensor, scale: int, factor: float = 1.0) -> None:
-    """Add the adjoint of `downscale` to target [H, W, c], in place: each pixel of a block gets 4^-scale of its value.
+    """Add the adjoint of `downscale` to target in place: each pixel of a block gets 4^-scale of the block's value.
 
     Args:
         target: [H, W, c], receives factor * downscale^T gradient.
         gradient: [H >> scale, W >> scale, c].
+        scale: Scale of the gradient relative to the target.
+        factor: Factor of the gradient.
     """
     side = 1 << scale
     height, width = gradient.shape[:2]
@@ -46,10 +51,10 @@ def add_upscaled_(target: Tensor, gradient: Tensor, scale: int, factor: float = 
 
 
 def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0) -> tuple[int, int]:
-    """Size (height, width) at which a style image is used for views of a size: never enlarged for a scale of 1.
+    """Return the size (height, width) at which a style image is used for views of a size.
 
-    A style whose shorter side is more than 1.1 times the view's is brought down to the view's shorter side; then, its
-    strokes are made so many times as large as `scale` says.
+    A style whose shorter side is more than 1.1 times the view's is downscaled to the view's shorter side. Its size is
+    then multiplied by `scale`, which scales its strokes. With a scale of 1, styles are never enlarged.
     """
     shorter, target = min(style), min(view)
     factor = scale * (1.0 if shorter <= STYLE_SIZE_TOLERANCE * target else target / shorter)
@@ -59,5 +64,5 @@ def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0
 
 
 def coverage_pyramid(coverage: Tensor, levels: int) -> list[Tensor]:
-    """Coverage [H, W] box-averaged to each of the first `levels` powers of two."""
+    """Box-average coverage [H, W] to each of the first `levels` powers of two."""
     return [downscale(coverage, level) for level in range(levels)]

@@ -1,8 +1,8 @@
-"""Colors that screens show: 0 to 1 in every channel.
+"""Projection of colors to the range of screens: 0 to 1 in every channel.
 
-A loss on pictures pushes colors beyond what a screen can show, where a viewer cuts them off and nothing is seen of
-what they were moved for. Bringing each color back after every step is projected gradient descent on a box; for Adam,
-whose metric is diagonal, cutting off each channel is the exact projection.
+A loss on images pushes colors beyond what a screen can show, where viewers clip them and the change is lost. Restoring
+each color after every step is projected gradient descent on a box. Adam's metric is diagonal, so clamping each channel
+is the exact projection.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 
 
 def _largest_coefficient() -> float:
-    """Largest float32 whose color is at most 1 in float64; that of 0 is its negative, because 0.5 is in the middle."""
+    """Return the largest float32 coefficient whose color is at most 1 in float64.
+
+    Its negative has the color 0, because coefficient 0 is mid-gray.
+    """
     largest = np.float32((1 - COLOR_OFFSET) / SH_C0)
     if COLOR_OFFSET + SH_C0 * float(largest) > 1:
         largest = np.nextafter(largest, np.float32(0))
@@ -27,20 +30,20 @@ LARGEST = _largest_coefficient()
 
 
 def on_screen(sh_dc: Tensor) -> Tensor:
-    """DC coefficients [n, 3] cut off where their colors would leave 0..1."""
+    """Clamp DC coefficients [n, 3] so that their colors are in 0..1."""
     return sh_dc.clamp(-LARGEST, LARGEST)
 
 
 def on_screen_by_luminance(sh_dc: Tensor) -> Tensor:
-    """DC coefficients [n, 3] moved along gray, as little as brings all channels into 0..1.
+    """Shift DC coefficients [n, 3] along gray as little as possible to bring all channels into 0..1.
 
-    Where channels are further apart than 0 and 1 are, none could hold them: they stick out as far on both sides.
+    If the channels differ by more than 1, no shift suffices; they then exceed the range equally on both sides.
 
     Returns:
-        [n, 3], in the dtype of the argument; chroma is kept to its rounding (`luminance.with_chroma_of`).
+        [n, 3], in the dtype of the argument; chroma is preserved up to rounding (`luminance.with_chroma_of`).
     """
     lowest, highest = torch.aminmax(sh_dc.double(), dim=1, keepdim=True)
-    # A little inside, so that rounding of what is added to each channel does not lead out again.
+    # Slightly inside, so that rounding of the sums does not leave the range again.
     bound = LARGEST * (1 - 1e-6)
     inwards = (-bound - lowest).clamp_min(0) - (highest - bound).clamp_min(0)
     centered = -(lowest + highest) / 2

@@ -1,6 +1,6 @@
-"""Which Gaussians of a scene lie somewhere, or have a property: [N] bool from [N, 3] positions or [N] values.
+"""Selection of Gaussians by position or property: [N] bool from positions [N, 3] or values [N].
 
-Positions are compared in float64; borders belong to what they enclose. NaN is nowhere and compares with nothing.
+Positions are compared in float64; boundaries are included. NaN is never selected.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-#: How a property is compared with a number.
+#: Comparisons of a property with a number.
 COMPARISONS: dict[str, Callable[[Tensor, float], Tensor]] = {
     ">=": operator.ge,
     "<=": operator.le,
@@ -23,26 +23,26 @@ COMPARISONS: dict[str, Callable[[Tensor, float], Tensor]] = {
 
 
 def in_box(means: Tensor, corners: Sequence[float]) -> Tensor:
-    """Between two opposite corners x0, y0, z0, x1, y1, z1, in whatever order."""
+    """Select positions between two opposite corners x0, y0, z0, x1, y1, z1, in any order."""
     first, second = torch.tensor([corners[:3], corners[3:]], dtype=torch.float64)
     places = means.double()
     return ((places >= torch.minimum(first, second)) & (places <= torch.maximum(first, second))).all(dim=1)
 
 
 def in_sphere(means: Tensor, sphere: Sequence[float]) -> Tensor:
-    """No farther from x, y, z than r."""
+    """Select positions within distance r of x, y, z."""
     *middle, radius = sphere
     distance: Tensor = (means.double() - torch.tensor(middle, dtype=torch.float64)).norm(dim=1)
     return distance <= radius
 
 
 def in_half_space(means: Tensor, plane: Sequence[float]) -> Tensor:
-    """Where a x + b y + c z >= d."""
+    """Select positions with a x + b y + c z >= d."""
     *normal, distance = plane
     height: Tensor = means.double() @ torch.tensor(normal, dtype=torch.float64)
     return height >= distance
 
 
 def where_property(values: Tensor, sign: str, number: float) -> Tensor:
-    """Where values [N] compare like that; float32 values with the number as float32, so that "=" can hold."""
+    """Select values [N] by comparison with a number, which is converted to their dtype so that "=" can hold."""
     return COMPARISONS[sign](values, torch.tensor(number).to(values).item()) & ~values.isnan()

@@ -2,9 +2,9 @@
 
     c_j = max(0, 0.5 + SH_C0 * sh_dc_j + sum over l >= 1 of sh_rest_j * Y_l(direction_j))
 
-Only `sh_dc` is ever optimized, so the sum over l >= 1 is frozen: it is computed once per view (`rest_colors`), after
-which a view's colors cost one multiply-add and a clamp. Plain tensor functions, in the dtype of their arguments, but
-for the compiled twins of that sum: Numba's on the CPU, Triton's on a GPU.
+Only `sh_dc` is optimized, so the sum over l >= 1 is frozen. It is computed once per view (`rest_colors`); after that,
+the colors of a view cost one multiply-add and a clamp. Functions operate on plain tensors in the dtype of their
+arguments. The sum also has compiled versions: Numba on the CPU, Triton on a GPU.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
-#: Gaussians evaluated at a time: bounds the basis [chunk, 15] and the float64 copies to some tens of megabytes.
+#: Gaussians per chunk: limits the basis [chunk, 15] and the float64 copies to some tens of megabytes.
 _CHUNK = 1 << 17
 
 
@@ -28,14 +28,14 @@ def view_directions(
     means: Tensor,  # [N, 3]
     center: Tensor,  # [3] float64
 ) -> Tensor:
-    """Unit vectors [N, 3] float64 from the camera's center to the Gaussians.
+    """Return unit vectors [N, 3] float64 from the camera center to the Gaussians.
 
-    The difference is taken in float64: with the world moved far from its origin, both points are large and nearly
-    equal. A Gaussian exactly at the center has no direction; it gets the zero vector, so that its color stays finite.
-    (It lies in front of the near plane and is never drawn.)
+    The difference is computed in float64: if the world is far from its origin, both points are large and nearly equal.
+    A Gaussian exactly at the center has no direction; it gets the zero vector, so that its color stays finite. (It is
+    in front of the near plane and never drawn.)
     """
     offsets = means.double() - center.to(device=means.device, dtype=torch.float64)
-    # hypot-like: scaled by the largest component first, so that no square overflows or vanishes.
+    # Like hypot: divided by the largest component first, so that no square overflows or underflows.
     largest = offsets.abs().amax(dim=-1, keepdim=True)
     scaled = offsets / torch.where(largest > 0, largest, torch.ones_like(largest))
     length = scaled.norm(dim=-1, keepdim=True)
@@ -46,7 +46,7 @@ def basis(
     directions: Tensor,  # [..., 3] unit vectors
     degree: int,
 ) -> Tensor:
-    """Real spherical harmonics of degrees 1 to `degree` (at most 3): [..., (degree + 1)^2 - 1]."""
+    """Return the real spherical harmonics of degrees 1 to `degree` (at most 3): [..., (degree + 1)^2 - 1]."""
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical harmonics of degree {degree}: 3DGS scenes have 0 to 3")
     x, y, z = directions.unbind(-1)
@@ -80,14 +80,15 @@ def rest_colors(
     *,
     degree: int | None = None,
 ) -> Tensor:
-    """The frozen part of a view's colors: the sum over l >= 1, [N, 3] in the dtype and on the device of `sh_rest`.
+    """Return the frozen part of a view's colors, the sum over l >= 1, [N, 3].
 
-    `degree` leaves out higher bands (that a plan found to be zero, say). Summed in float64 and rounded once; float32 on
-    a GPU is summed in float32 (`kernel_rest_colors`). Degree 0 is zeros, without any work.
+    The result has the dtype and device of `sh_rest`. The sum is computed in float64 and rounded once, except for
+    float32 on a GPU, which is summed in float32 (`kernel_rest_colors`). Bands above `degree` are skipped, for instance
+    because a plan found them to be zero; degree 0 gives zeros without any work.
 
     Raises:
-        ValueError: K is no number of coefficients of degree 0 to 3, or `degree` is higher than the file's.
-        SceneError: coefficients are in a file that was changed since it was first read.
+        ValueError: If K does not match a degree of 0 to 3, or `degree` exceeds that of the coefficients.
+        SceneError: If the coefficients are in a file that was changed after it was first read.
     """
     stored = {0: 0, 3: 1, 8: 2, 15: 3}.get(int(sh_rest.shape[1]))
     if stored is None:
@@ -112,7 +113,10 @@ def reference_rest_colors(
     camera: Camera,
     degree: int,
 ) -> Tensor:
-    """`rest_colors` of degree 1 to 3 in tensor functions, in float64, rounded to the dtype of `sh_rest`: [N, 3]."""
+    """Compute `rest_colors` [N, 3] of degree 1 to 3 with tensor functions.
+
+    Computes in float64 and rounds to the dtype of `sh_rest`.
+    """
     colors = torch.empty(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     count = (degree + 1) ** 2 - 1
     for start in range(0, sh_rest.shape[0], _CHUNK):
@@ -123,7 +127,7 @@ def reference_rest_colors(
 
 
 def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """The same on the CPU for float32, on all cores; sums are in another order, so that the last bit may differ."""
+    """Compute `rest_colors` for float32 on all CPU cores. Another summation order may change the last bit."""
     from sgsst_core.compiled import kernel_threads
     from sgsst_core.scene import spherical_harmonics_kernels as kernels
 
@@ -135,7 +139,10 @@ def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree
 
 
 def _stored_rest_colors(sh_rest: StoredHarmonics, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """The same, to the bit, of coefficients in a file: each block is used while it is in a core's cache."""
+    """Compute `rest_colors` from coefficients in a file, bit-identically.
+
+    Each block is used while it is in a core's cache.
+    """
     from sgsst_core.scene import spherical_harmonics_kernels as kernels
 
     colors = torch.empty((len(sh_rest), 3))
@@ -155,10 +162,10 @@ def kernel_rest_colors(
     camera: Camera,
     degree: int,
 ) -> Tensor:
-    """`rest_colors` of degree 1 to 3 in one launch of a Triton kernel: [N, 3] float32.
+    """Compute `rest_colors` of degree 1 to 3 in one launch of a Triton kernel: [N, 3] float32.
 
-    Directions are differences of float64; basis and sum are float32: up to 1e-6 of the sum of the coefficients' sizes
-    away from `rest_colors`. On a GPU, or on the CPU where Triton's interpreter is on.
+    Directions are float64 differences; basis and sum are float32, which differs from `rest_colors` by up to 1e-6 of
+    the sum of the coefficients' magnitudes. Runs on a GPU, or on the CPU if Triton's interpreter is on.
     """
     from sgsst_core.scene import spherical_harmonics_triton_kernels as kernels
 
@@ -175,15 +182,15 @@ def kernel_rest_colors(
 
 @functools.cache
 def triton_runs_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a GPU: the one of spherical harmonics is tried, once in a process.
+    """Return whether Triton kernels run on a GPU, by trying the spherical harmonics kernel once per process.
 
-    Triton may be missing, or find no C compiler for what it builds around its kernels.
+    Triton may be missing, or may not find a C compiler for the code around its kernels.
     """
     one, center = torch.ones((1, 3, 3), device=device), torch.eye(4, dtype=torch.float64)
     camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, center)
     try:
         found = kernel_rest_colors(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
-    except Exception:  # whatever it is, the tensor functions do the same
+    except Exception:  # whatever the reason, the tensor functions do the same
         return False
     return abs(float(found[0, 0]) - SH_C1) < 1e-6
 
@@ -192,7 +199,7 @@ def view_colors(
     sh_dc: Tensor,  # [N, 3]
     rest: Tensor,  # [N, 3]
 ) -> Tensor:
-    """Colors [N, 3] of one view, clamped at zero: `max(0, 0.5 + SH_C0 * sh_dc + rest)`."""
+    """Return the colors [N, 3] of one view, clamped at zero: `max(0, 0.5 + SH_C0 * sh_dc + rest)`."""
     return torch.add(rest + COLOR_OFFSET, sh_dc, alpha=SH_C0).clamp_min(0)
 
 
@@ -202,10 +209,10 @@ def view_colors_gradient(
     *,
     clamp_aware_gradient: bool = False,
 ) -> Tensor:
-    """dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolors` where the clamp let the color through, 0 where it did not.
+    """Return dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolors` where the color is above the clamp, else 0.
 
-    With `clamp_aware_gradient`, colors that the clamp holds at 0 also take a gradient that would raise them. It is not
-    the derivative: it lets colors that a large step has thrown below 0 come back, which otherwise never move again.
+    With `clamp_aware_gradient`, colors clamped at 0 also get gradients that would raise them (clamp-aware gradient). This is not the
+    derivative: it recovers colors that a large step has thrown below 0, which otherwise never move again.
     """
     passes = (colors > 0) | (color_gradient < 0) if clamp_aware_gradient else colors > 0
     return torch.where(passes, SH_C0 * color_gradient, torch.zeros_like(color_gradient))

@@ -1,10 +1,10 @@
-"""Compiled kernel of `spherical_harmonics.rest_colors` on CPUs: one pass over the coefficients, on all cores.
+"""Numba kernel of `spherical_harmonics.rest_colors`: one pass over the coefficients, on all CPU cores.
 
-In float64 like the tensor functions, whose sums it makes in another order. Float32 would be hardly faster, and right to
-six digits only.
+It computes in float64 like the tensor functions, but sums in another order. Float32 would hardly be faster, and
+accurate to only six digits.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = SH_C3
 
 @compiled()
 def _direction(means, i, center):
-    """Unit vector from the camera's center; 0 at the center. Scaled first where squares would overflow or vanish."""
+    """Return the unit vector from the camera center; 0 at the center.
+
+    Scales first if squares would over- or underflow.
+    """
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     largest = max(abs(x), abs(y), abs(z))
     if not largest > 0:
@@ -34,7 +37,7 @@ def _direction(means, i, center):
 
 @compiled()
 def _sum_of_bands(sh_rest, row, x, y, z, degree, out, i):
-    """out[i] = sum over bands 1 to `degree` of sh_rest[row] in direction x, y, z."""
+    """Compute out[i] = sum over bands 1 to `degree` of sh_rest[row] in direction x, y, z."""
     b0, b1, b2 = -SH_C1 * y, SH_C1 * z, -SH_C1 * x
     if degree == 1:
         for c in range(3):
@@ -61,7 +64,7 @@ def _sum_of_bands(sh_rest, row, x, y, z, degree, out, i):
 
 @compiled(parallel=True)
 def rest_colors(sh_rest, means, center, degree, out):
-    """Sum over bands 1 to `degree`, [N, 3] float32, of sh_rest [N, K, 3] float32 and means [N, 3]."""
+    """Write the sum over bands 1 to `degree` to out [N, 3] float32, for sh_rest [N, K, 3] float32 and means [N, 3]."""
     for i in numba.prange(out.shape[0]):
         x, y, z = _direction(means, i, center)
         _sum_of_bands(sh_rest, i, x, y, z, degree, out, i)
@@ -69,9 +72,9 @@ def rest_colors(sh_rest, means, center, degree, out):
 
 @compiled()
 def block_rest_colors(sh_rest, rows, means, center, degree, out):
-    """The same of the Gaussians in some rows [n] int32 of a block sh_rest [R, K, 3]; one core's work.
+    """Compute `rest_colors` for the Gaussians in some rows [n] int32 of a block sh_rest [R, K, 3], on one core.
 
-    Their means [n, 3] and colors out [n, 3] come in the order of the rows.
+    Means [n, 3] and colors out [n, 3] are in the order of the rows.
     """
     for i in range(rows.size):
         x, y, z = _direction(means, i, center)

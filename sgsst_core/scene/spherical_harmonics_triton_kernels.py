@@ -1,11 +1,11 @@
-"""GPU kernel of `spherical_harmonics.rest_colors`: one launch a view, in which every coefficient is read once.
+"""GPU kernel of `spherical_harmonics.rest_colors`: one launch per view, which reads every coefficient once.
 
-The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (TRITON_INTERPRET=1 before the first
-import). Directions are differences of float64, scaled by their largest component before anything is squared; basis and
-sum are float32, as the colors that they become part of.
+The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (set TRITON_INTERPRET=1 before the first
+import). Directions are float64 differences, divided by their largest component before squaring; basis and sum are
+float32, like the colors that they are added to.
 """
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import triton.language as tl
 
 from sgsst_core.constants import SH_C1, SH_C2, SH_C3
 
-#: Gaussians of one program.
+#: Gaussians per program.
 BLOCK = tl.constexpr(128)
 _C1 = tl.constexpr(SH_C1)
 _C20, _C21, _C22, _C23, _C24 = (tl.constexpr(factor) for factor in SH_C2)
@@ -24,7 +24,7 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = (tl.constexpr(factor) for factor in S
 
 @triton.jit
 def _term(k: tl.constexpr, factor: tl.constexpr, polynomial, row, own):
-    """Coefficient k times its basis function, factor * polynomial: [BLOCK, 4], the fourth channel 0."""
+    """Return coefficient k times its basis function, factor * polynomial: [BLOCK, 4], with 0 in the fourth channel."""
     return (polynomial * factor)[:, None] * tl.load(row + 3 * k, mask=own, other=0.0)
 
 
@@ -32,13 +32,13 @@ def _term(k: tl.constexpr, factor: tl.constexpr, polynomial, row, own):
 def rest_colors(
     sh_rest, means, center, out, total, DEGREE: tl.constexpr, COEFFICIENTS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """Sum over bands 1 to DEGREE of BLOCK Gaussians a program.
+    """Compute the sum over bands 1 to DEGREE for BLOCK Gaussians per program.
 
     Args:
         sh_rest: [N, COEFFICIENTS, 3] float32.
         means: [N, 3] float32 or float64.
-        center: [3] float64, of the camera.
-        out: [N, 3] float32.
+        center: [3] float64, camera center.
+        out: Output [N, 3] float32.
         total: N.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -50,10 +50,10 @@ def rest_colors(
     largest = tl.maximum(tl.maximum(tl.abs(dx), tl.abs(dy)), tl.abs(dz))
     largest = tl.where(largest > 0, largest, 1.0)
     x, y, z = (dx / largest).to(tl.float32), (dy / largest).to(tl.float32), (dz / largest).to(tl.float32)
-    length = tl.sqrt(x * x + y * y + z * z)  # 1 to sqrt(3), or 0 at the camera's center
+    length = tl.sqrt(x * x + y * y + z * z)  # 1 to sqrt(3), or 0 at the camera center
     length = tl.where(length > 0, length, 1.0)
     x, y, z = x / length, y / length, z / length
-    # Four channels, the last of them without memory: the three values of a coefficient lie side by side.
+    # Four channels, the last of them without memory, because the three values of a coefficient are contiguous.
     channel = tl.arange(0, 4)[None, :]
     own = there[:, None] & (channel < 3)
     row = sh_rest + (3 * COEFFICIENTS) * p[:, None] + channel

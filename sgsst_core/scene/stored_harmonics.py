@@ -1,12 +1,12 @@
-"""Spherical harmonics of large scenes: they stay in the scene's file until a view asks for them.
+"""Spherical harmonics of large scenes, left in the scene's file until a view needs them.
 
-They are three quarters of a scene of degree 3, are never changed, and a view needs each of them once. The file is read
-by blocks into a buffer that stays in the processor's cache, where the system's own cache of files holds it: for that
-memory is found when nobody else needs it, and it is shared by all processes that read the file.
+They make up three quarters of a scene of degree 3, never change, and each view reads them once. The file is read in
+blocks, into a buffer that stays in the CPU cache. The operating system's page cache holds the file: it uses memory that
+is otherwise free, and all processes that read the file share it.
 
-The file is not mapped. Where somebody else shortens a mapped file, or writes it anew from its start, the next look at
-its pages kills the process (SIGBUS), and a user's file may be overwritten at any time in the hours that a job takes.
-A read that comes back short is an error like any other, and costs a tenth of a second more for 4 million Gaussians.
+The file is not memory-mapped. If another program truncates or rewrites a mapped file, the next access to its pages
+kills the process (SIGBUS), and a user's file may be overwritten at any time during a job of several hours. A short
+read, in contrast, raises an ordinary error. Reading takes a tenth of a second longer for 4 million Gaussians.
 """
 
 from __future__ import annotations
@@ -26,26 +26,29 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError
 
-#: Bytes that are read at a time: they stay in one core's second-level cache until they have been used.
+#: Bytes per read; a block stays in the L2 cache of one core until it has been used.
 BLOCK_BYTES = 1 << 20
 
-#: Takes the first of some Gaussians that follow each other, the coefficients [R, K, 3] float32 of a block's rows, and
-#: the rows [n] int32 in it that are those Gaussians'. The coefficients are overwritten when it returns.
+#: Callback for a block. Arguments: index of the first of a run of Gaussians, coefficients [R, K, 3] float32 of all rows
+#: of the block, and rows [n] int32 of the block that belong to these Gaussians. The coefficients are overwritten after
+#: it returns.
 BlockWork = Callable[[int, NDArray[np.float32], NDArray[np.int32]], None]
 
 
 @dataclass(frozen=True)
 class RowLayout:
-    """Where a file holds coefficients: rows of one length, in each all float32 coefficients of red, green, blue.
+    """Layout of coefficients in a file: rows of equal length.
+
+    Each row contains all float32 coefficients of red, then green, then blue.
 
     Attributes:
-        path: the file.
-        stamp: its size in bytes and time of last change (ns).
-        offset: byte at which the first row starts.
-        rows: how many there are.
-        row_bytes: length of a row, a multiple of 4.
-        column: byte of a row at which its coefficients start, a multiple of 4.
-        coefficients: of one color in a row: 3, 8 or 15.
+        path: Path of the file.
+        stamp: Size in bytes and modification time in ns.
+        offset: Byte offset of the first row.
+        rows: Number of rows.
+        row_bytes: Length of a row in bytes, a multiple of 4.
+        column: Byte offset of the coefficients within a row, a multiple of 4.
+        coefficients: Number of coefficients per color channel in a row: 3, 8 or 15.
     """
 
     path: Path
@@ -58,10 +61,10 @@ class RowLayout:
 
 
 class RowFile:
-    """A file that is read by many at once, open until the last of them is gone.
+    """File with shared readers that stays open until the last of them is gone.
 
     Raises:
-        SceneError: it cannot be opened.
+        SceneError: If it cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,20 +77,20 @@ class RowFile:
 
     @property
     def stamp(self) -> tuple[int, int]:
-        """Size in bytes and time of last change (ns)."""
+        """Size in bytes and modification time in ns."""
         status = os.fstat(self._descriptor)
         return status.st_size, status.st_mtime_ns
 
     def check_unchanged(self, stamp: tuple[int, int]) -> None:
-        """Raise SceneError where the file is no longer what it was when its stamp was taken."""
+        """Raise SceneError if the file has changed since its stamp was taken."""
         if self.stamp != stamp:
             raise changed(self.path)
 
     def read(self, offset: int, buffer: NDArray[np.uint8]) -> None:
-        """Fill a buffer from some byte on.
+        """Fill a buffer from a byte offset on.
 
         Raises:
-            SceneError: the file ends before, or cannot be read.
+            SceneError: If the file is too short or cannot be read.
         """
         left = buffer.data
         while left:
@@ -101,7 +104,7 @@ class RowFile:
 
 
 def changed(path: Path) -> SceneError:
-    """The error of a file that is no longer the one that was read."""
+    """Return the error for a file that was changed after it was read."""
     return SceneError(
         f"{path}: was changed after it was read; the new colors may belong to other Gaussians. "
         "Put the original file back and run again."
@@ -109,17 +112,17 @@ def changed(path: Path) -> SceneError:
 
 
 class StoredHarmonics:
-    """Coefficients [N, K, 3] float32 of degree 1 to 3 in a file, in place of a tensor of that shape.
+    """Coefficients [N, K, 3] float32 of degree 1 to 3 in a file, as a replacement for a tensor of that shape.
 
     Args:
-        layout: where they are.
-        chosen: [N] int32, ascending: the rows that are the scene's Gaussians, some perhaps of several; None for all.
-        coefficients: K, the first ones of the file's; None for all.
-        file: the file, if it is open already.
-        factor: by which they are multiplied when they are read; rounded to float32.
+        layout: Layout of the file.
+        chosen: [N] int32, ascending row numbers of the scene's Gaussians, possibly with repetitions; None for all rows.
+        coefficients: K, number of leading coefficients to use; None for all.
+        file: The file if it is already open; None to open it.
+        factor: Factor of the coefficients, rounded to float32 and applied on reading.
 
     Raises:
-        SceneError: the file cannot be opened, or is no longer what the layout says.
+        SceneError: If the file cannot be opened or does not match the layout.
     """
 
     dtype = torch.float32
@@ -142,14 +145,17 @@ class StoredHarmonics:
         self.shape = torch.Size((count, layout.coefficients if coefficients is None else coefficients, 3))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Another process opens the file itself."""
+        """Pickle the arguments without the file, which another process opens itself."""
         return StoredHarmonics, (self.layout, self._chosen, self.shape[1], None, self._factor)
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def __getitem__(self, rows: Tensor) -> StoredHarmonics | Tensor:
-        """Those of some Gaussians ([N] bool, or indices; some several times); only ascending ones stay in the file."""
+        """Select Gaussians by mask [N] bool or by indices, which may repeat.
+
+        Ascending selections stay in the file; others are returned as a tensor.
+        """
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
         if len(rows) > 1 and not bool((rows[1:] >= rows[:-1]).all()):
@@ -158,25 +164,25 @@ class StoredHarmonics:
         return self._of(rows)
 
     def _of(self, rows: Tensor) -> StoredHarmonics:
-        """Those of Gaussians whose indices ascend."""
+        """Select Gaussians by ascending indices."""
         indices = rows.to("cpu", torch.int32).numpy()
         chosen = indices if self._chosen is None else self._chosen[indices]
         return StoredHarmonics(self.layout, chosen, self.shape[1], self._file, self._factor)
 
     def first(self, coefficients: int) -> StoredHarmonics:
-        """The first coefficients of each color alone."""
+        """Return only the first coefficients of each color channel."""
         return StoredHarmonics(self.layout, self._chosen, coefficients, self._file, self._factor)
 
     def times(self, factor: float) -> StoredHarmonics:
-        """All of them multiplied by a factor, as a tensor in memory would be: in float32."""
+        """Return the coefficients multiplied by a factor, in float32 as for a tensor in memory."""
         return StoredHarmonics(self.layout, self._chosen, self.shape[1], self._file, self._factor * factor)
 
     def to(self, device: torch.device | str) -> StoredHarmonics | Tensor:
-        """Themselves where they are used from the CPU; on a GPU a tensor [N, K, 3]."""
+        """Return `self` for the CPU, and a tensor [N, K, 3] for a GPU."""
         return self if torch.device(device).type == "cpu" else self.tensor(device)
 
     def tensor(self, device: torch.device | str = "cpu") -> Tensor:
-        """All of them, [N, K, 3]; never twice in the CPU's memory."""
+        """Load all coefficients, [N, K, 3]; they are never in CPU memory twice."""
         values = torch.empty(self.shape, device=device)
 
         def copy(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
@@ -186,7 +192,7 @@ class StoredHarmonics:
         return values
 
     def largest(self) -> Tensor:
-        """[N] float32, the largest magnitude among each Gaussian's coefficients."""
+        """Return the largest magnitude among the coefficients of each Gaussian, [N] float32."""
         found = torch.empty(len(self))
 
         def look(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
@@ -196,7 +202,10 @@ class StoredHarmonics:
         return found
 
     def used_coefficients(self) -> int:
-        """How many of the first coefficients are not 0 in all Gaussians together; looks no further than it must."""
+        """Return how many leading coefficients are needed to include all non-zero ones.
+
+        Reads no further than necessary.
+        """
         step, used = self._rows_at_a_time() * 16, 0
         for start in range(0, len(self), step):
             values = self._of(torch.arange(start, min(start + step, len(self)))).tensor()[:, used:]
@@ -207,14 +216,14 @@ class StoredHarmonics:
         return used
 
     def for_blocks(self, work: BlockWork, threads: int | None = None) -> None:
-        """Do some work on all coefficients, block by block, on as many cores as PyTorch was told to use.
+        """Call a function on all coefficients, block by block, on as many cores as PyTorch uses.
 
         Args:
-            work: called by several threads at once, with blocks in any order.
-            threads: how many, in place of PyTorch's; blocks come in order to a single one.
+            work: Callback, called by several threads at once and with blocks in any order.
+            threads: Number of threads, instead of PyTorch's; a single thread gets the blocks in order.
 
         Raises:
-            SceneError: the file was changed since it was first read.
+            SceneError: If the file was changed after it was first read.
         """
         step = self._rows_at_a_time()
         bounds = list(range(0, self.layout.rows, step))
@@ -223,7 +232,7 @@ class StoredHarmonics:
             self._work_through(work, bounds)
         else:
             with ThreadPoolExecutor(threads, thread_name_prefix="harmonics") as pool:
-                # Neighboring parts of the file to all threads at the same time: it may have to come from a disk.
+                # Threads read neighboring parts of the file at the same time, because it may have to come from a disk.
                 for done in [pool.submit(self._work_through, work, bounds[i::threads]) for i in range(threads)]:
                     done.result()
         self._file.check_unchanged(self.layout.stamp)
@@ -232,7 +241,7 @@ class StoredHarmonics:
         return max(1, BLOCK_BYTES // self.layout.row_bytes)
 
     def _work_through(self, work: BlockWork, bounds: list[int]) -> None:
-        """Do the work on the blocks that begin at some rows of the file."""
+        """Process the blocks that start at some rows of the file."""
         layout, step = self.layout, self._rows_at_a_time()
         buffer = np.empty(step * layout.row_bytes, np.uint8)
         every = np.arange(step, dtype=np.int32)
@@ -253,5 +262,5 @@ class StoredHarmonics:
 
 
 def held(sh_rest: Tensor | StoredHarmonics) -> Tensor:
-    """Coefficients [N, K, 3] as a tensor on the device where they are."""
+    """Return coefficients [N, K, 3] as a tensor on their present device."""
     return sh_rest.tensor() if isinstance(sh_rest, StoredHarmonics) else sh_rest

@@ -1,4 +1,4 @@
-"""What a scene is about: its Gaussians without strays and background, and the room that these take."""
+"""Subject of a scene: its Gaussians without strays and background, and their extent."""
 
 from __future__ import annotations
 
@@ -14,37 +14,36 @@ from torch import Tensor
 
 from sgsst_core.scene.gaussians import Scene
 
-#: Gaussians that give the extent, to well under a percent, and those of them that are kept as its points.
+#: Gaussians sampled for computing the extent, accurate to well under a percent, and points stored of them.
 _SAMPLE, _POINTS = 100_000, 20_000
-#: Share of the weight up to which areas and lengths are taken as they are; larger ones count as that one, so that a few
-#: needles or sheets decide nothing.
+#: Weight quantile at which areas and lengths are capped, so that a few needles or sheets do not dominate.
 _LARGEST = 0.98
-#: A point farther from the middle than this many weighted median distances is background. An object's own points lie
+#: A point farther from the center than this many weighted median distances is background. An object's own points lie
 #: within 3 (a long thin stick reaches 2); a room or a sky behind an object reaches 10 to 1000.
 _REACH = 4.0
-#: Cells along the longest side of a grid in which an object hangs together, at most.
+#: Maximum number of cells along the longest side of the grid that determines connected pieces.
 _CELLS = 32
-#: Share of the weight that a cell holds at least: fainter ones connect nothing.
+#: Minimum fraction of the weight in a cell; lighter cells connect nothing.
 _LEAST_CELL = 1e-5
-#: Share of the weight that a piece holds at least, or it is stray.
+#: Minimum fraction of the weight in a piece; lighter pieces are stray.
 _LEAST_PIECE = 0.01
-#: Share of the weight that is left at least; a scene of which more would go has no strays: it is made so.
+#: Minimum fraction of the weight to keep. If more would be removed, the scene has no strays but consists of pieces.
 _LEAST_LEFT = 0.5
-#: A Gaussian reaches to where its alpha falls below this.
+#: A Gaussian extends to where its alpha falls below this.
 _VISIBLE = 0.03
-#: Directions in which the extent is taken: 7 degrees apart, so that a ball's is right to 0.7 %.
+#: Directions for computing the extent: 7 degrees apart, which is accurate to 0.7 % for a ball.
 _DIRECTIONS = 300
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What an orbit looks at. All float64, in world units.
+    """Object that an orbit looks at. All values are float64, in world units.
 
     Attributes:
-        points: [P, 3] means of a sample of its Gaussians.
-        weights: [P], how much of its surface each stands for: opacity times area; they add up to 1.
-        hull: [D, 3], the outermost points of these Gaussians, extents included, in directions all around.
-        left_out: share of the scene's weight that is stray or background.
+        points: [P, 3], means of a sample of its Gaussians.
+        weights: [P], surface that each of them represents, opacity times area; the sum is 1.
+        hull: [D, 3], outermost points of these Gaussians, including their extents, in all directions.
+        left_out: Fraction of the scene's weight that is stray or background.
     """
 
     points: Tensor
@@ -54,26 +53,26 @@ class Subject:
 
     @cached_property
     def size(self) -> float:
-        """The largest distance of two of its points."""
+        """Largest distance between two points of the hull."""
         return float(torch.cdist(self.hull, self.hull).amax())
 
     def holds(self, means: Tensor) -> Tensor:
-        """[N] bool: which of some points [N, 3] lie in the box around it."""
+        """Return which of some points [N, 3] lie in the bounding box of the subject, [N] bool."""
         low, high = self.hull.amin(0), self.hull.amax(0)
         return ((means >= low.to(means)) & (means <= high.to(means))).all(1)
 
 
 def find_subject(scene: Scene) -> Subject:
-    """The subject of a scene of at least one Gaussian."""
+    """Find the subject of a scene with at least one Gaussian."""
     rows = _sample(len(scene), _SAMPLE)
     points = scene.means[rows].double()
-    # beyond e^60 a length is as good as infinite, and its square still fits
+    # beyond e^60 a length is practically infinite, and its square still fits
     lengths = scene.scales[rows].double().clamp(-60, 60).exp()
     opacities = torch.sigmoid(scene.opacities[rows].double())
     ordered = lengths.sort(dim=1).values
     areas = ordered[:, 1] * ordered[:, 2]
     weights = opacities * areas.clamp_max(quantile(areas, opacities + 1e-12, _LARGEST))
-    # a scene of which all Gaussians are invisible is still looked at
+    # makes the result defined for a scene whose Gaussians are all invisible
     weights = weights / weights.amax().clamp_min(1e-300) + 1e-12
     weights = weights / weights.sum()
     kept = _without_strays(points, weights)
@@ -88,7 +87,7 @@ def find_subject(scene: Scene) -> Subject:
 
 
 def quantile(values: Tensor, weights: Tensor, share: float) -> float:
-    """The smallest of `values` [P] at which the running sum of `weights` [P] reaches `share` of the whole."""
+    """Return the smallest of `values` [P] at which the cumulative `weights` [P] reach the fraction `share`."""
     ordered, order = values.sort()
     running = weights[order].cumsum(0)
     index = torch.searchsorted(running, share * running[-1])
@@ -96,7 +95,7 @@ def quantile(values: Tensor, weights: Tensor, share: float) -> float:
 
 
 def spread_directions(count: int) -> Tensor:
-    """[count, 3] float64 unit vectors, evenly spread over the sphere (on a Fibonacci spiral, after Gonzalez 2010)."""
+    """Return [count, 3] float64 unit vectors, evenly spread over the sphere (Fibonacci spiral, Gonzalez 2010)."""
     place = torch.arange(count, dtype=torch.float64) + 0.5
     height = 1 - 2 * place / count
     angle = place * math.pi * (1 + math.sqrt(5))
@@ -105,7 +104,7 @@ def spread_directions(count: int) -> Tensor:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """[P, 3, 3] of quaternions [P, 4], wxyz; of zeros, the identity."""
+    """Return the rotation matrices [P, 3, 3] of wxyz quaternions [P, 4]; the identity for a zero quaternion."""
     nothing = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     given = torch.where((quats != 0).any(1, keepdim=True), quats, nothing)
     turned: Tensor = torch.from_numpy(Rotation.from_quat(given.roll(-1, 1).numpy()).as_matrix())
@@ -113,7 +112,7 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def _sample(total: int, count: int) -> Tensor:
-    """Rows of one of each so many Gaussians; which one is chance, seeded: files may hold them in a regular order."""
+    """Return random rows, one from each run of equal length, with a fixed seed; a file may be ordered with a period."""
     step = -(-total // count)
     first = torch.arange(0, total, step)
     chance = torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
@@ -121,13 +120,13 @@ def _sample(total: int, count: int) -> Tensor:
 
 
 def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
-    """[P] bool: which of the points [P, 3] are neither background nor pieces that float by themselves."""
+    """Return which of the points [P, 3] are neither background nor in isolated pieces, [P] bool."""
     middle = torch.tensor([quantile(points[:, axis], weights, 0.5) for axis in range(3)], dtype=torch.float64)
     distances = (points - middle).norm(dim=1)
     median = quantile(distances, weights, 0.5)
     reach = _REACH * median if median > 0 else quantile(distances, weights, 0.99)
     kept: Tensor = distances <= reach
-    while True:  # without what lies far away, the grid is finer and shows more
+    while True:  # without distant parts, the grid becomes finer and may separate more pieces
         rows = kept.nonzero()[:, 0]
         whole = _pieces(points[rows], weights[rows])
         if bool(whole.all()) or float(weights[rows[whole]].sum()) < _LEAST_LEFT * float(weights[rows].sum()):
@@ -136,10 +135,10 @@ def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _pieces(points: Tensor, weights: Tensor) -> Tensor:
-    """[P] bool: which points belong to pieces of some weight; pieces hang together in a grid's cells."""
+    """Return which points belong to pieces with enough weight, [P] bool; pieces are connected cells of a grid."""
     low = points.amin(0)
     side = float((points.amax(0) - low).amax())
-    cells = min(_CELLS, max(4, round(len(points) ** (1 / 3))))  # so that random points still hang together
+    cells = min(_CELLS, max(4, round(len(points) ** (1 / 3))))  # keeps random points connected
     if not side > 0:
         return torch.ones(len(points), dtype=torch.bool)
     place = ((points - low) / side * cells).long().clamp_max(cells - 1)
@@ -149,24 +148,25 @@ def _pieces(points: Tensor, weights: Tensor) -> Tensor:
     labels, _ = ndimage.label((held > _LEAST_CELL * held.sum()).reshape(cells, cells, cells), touching)
     by_piece = np.bincount(labels.ravel(), held)
     large = by_piece >= _LEAST_PIECE * held.sum()
-    large[0] = False  # the empty and the faint cells
-    near = ndimage.binary_dilation(large[labels], touching)  # with the faint fringe around
+    large[0] = False  # the empty and light cells
+    near = ndimage.binary_dilation(large[labels], touching)  # includes the faint fringe around
     return torch.from_numpy(near.ravel()[flat])
 
 
 def _hull(points: Tensor, turned: Tensor, reach: Tensor) -> Tensor:
-    """[D, 3]: the outermost points of ellipsoids in many directions.
+    """Return the outermost points of ellipsoids in many directions, [D, 3].
 
     Args:
-        points: [P, 3], the middles.
+        points: [P, 3], centers.
         turned: [P, 3, 3], half axes of one standard deviation as columns.
-        reach: [P], standard deviations to the surface.
+        reach: [P], standard deviations from the center to the surface.
     """
     largest = reach * turned.norm(dim=1).amax(1)
     found = []
-    for directions in spread_directions(_DIRECTIONS).split(16):  # a few, since each needs a number of every Gaussian
+    # in batches, because each direction needs a value per Gaussian
+    for directions in spread_directions(_DIRECTIONS).split(16):
         along = points @ directions.T
-        # the others end before another one's middle, in all of these directions
+        # all others end before the center of another one in all of these directions
         rows = (along + largest[:, None] >= along.amax(0)).any(1).nonzero()[:, 0]
         ends = torch.einsum("pij,di->pdj", turned[rows], directions)
         widths = ends.norm(dim=2)

@@ -1,4 +1,4 @@
-"""Which way is up in a scene that says nothing about it."""
+"""Estimate of a scene's up direction, for files that do not store one."""
 
 from __future__ import annotations
 
@@ -12,37 +12,38 @@ from torch import Tensor
 
 from sgsst_core.scene.subject import Subject, quantile
 
-#: Up in most captures: COLMAP's y points down.
+#: Up in most captures, since COLMAP's y points down.
 USUAL_UP = (0.0, -1.0, 0.0)
-#: A direction so near to an axis of the world is that axis: captures are mostly turned upright by hand.
+#: Directions this close to a world axis are replaced by it, because captures are mostly aligned by hand.
 _SNAP = math.cos(math.radians(10))
-#: Thickness of the layers that are looked at, as a share of the subject's size; how far from its end one may lie, as a
-#: share of its size and of its height.
+#: Thickness of a layer as a fraction of the subject's size, and its maximum distance from the end, as fractions of the
+#: subject's size and of its height.
 _LAYER, _END, _END_OF_HEIGHT = 0.01, 0.12, 0.25
-#: A ground reaches under so much of the subject, and the layer at the other end over so much less of it.
+#: Minimum fraction of the subject that the ground lies under, and the maximum of the layer at the other end relative to
+#: it.
 _GROUND, _OTHER_END = 0.7, 0.6
 #: Cells along the longer side of a grid over a layer.
 _CELLS = 24
-#: A scene of which more is background or stray is no object that could stand.
+#: A scene with a larger fraction of background or strays is no object that could stand.
 _WHOLE = 0.03
-#: A subject stands where it is so many times as long (by standard deviation) as it is wide.
+#: A subject counts as standing if its length is at least this multiple of its width (by standard deviation).
 _STANDS = 1.6
-#: What stands has a foot: thickness of the layer at its ends as a share of its length, and how much wider it is there
-#: than at the other end, and which share of it a foot takes at least, seen from above.
+#: Standing subjects have a foot: thickness of the layer at the ends as a fraction of the length, minimum ratio of its
+#: area to that at the other end, and minimum fraction of the area of the whole seen from above.
 _FOOT, _WIDER, _LEAST_FOOT = 0.015, 1.3, 0.05
-#: What lies on its wheels has its foot under so much of it.
+#: Minimum foot area, as a fraction of the whole, of a subject that lies along its length, such as a car on its wheels.
 _LIES = 0.5
 
 
 @dataclass(frozen=True)
 class Up:
-    """Which way is up, and why.
+    """Up direction of a scene, with the reason for it.
 
     Attributes:
         direction: [3] float64, unit length.
-        reason: for people, such as "a flat layer lies under all of it".
-        sure: False where only habit says so.
-        ground: whether a ground lies under the subject, which hides it from below.
+        reason: Display text, such as "a flat layer lies under all of it".
+        sure: Whether it is derived from the scene; False if it is only the usual convention.
+        ground: Whether there is a ground under the subject, which hides it from below.
     """
 
     direction: Tensor
@@ -52,7 +53,7 @@ class Up:
 
     @property
     def name(self) -> str:
-        """An axis such as "-y", else the direction's three numbers."""
+        """Axis such as "-y", or the three components of another direction."""
         place = int(self.direction.abs().argmax())
         sign = "-" if self.direction[place] < 0 else ""
         if float(self.direction[place].abs()) > 1 - 1e-9:
@@ -61,7 +62,7 @@ class Up:
 
 
 def find_up(subject: Subject) -> Up:
-    """Up by the ground, else by the subject's long axis and the wider of its ends, else by habit (-y)."""
+    """Find up from the ground, else from the long axis of the subject and its wider end, else by convention (-y)."""
     axes = _principal_axes(subject)
     ground = _ground(subject, [*axes.T, *torch.eye(3, dtype=torch.float64)])
     if ground is not None:
@@ -89,13 +90,13 @@ def _times(larger: float, smaller: float) -> str:
 
 
 def _habit(direction: Tensor) -> float:
-    """Positive for the sense of an axis that captures use more: -y (COLMAP), z (Blender, nerfstudio), x."""
+    """Return a positive number for the more common sense of an axis: -y (COLMAP), z (Blender, nerfstudio), x."""
     x, y, z = (float(value) for value in direction)
     return -y if abs(y) >= max(abs(x), abs(z)) else z if abs(z) >= abs(x) else x
 
 
 def _snapped(direction: Tensor) -> Tensor:
-    """The world's axis where it is near, else the direction."""
+    """Return the nearest world axis if it is close, else the direction itself."""
     direction = direction / direction.norm()
     place = int(direction.abs().argmax())
     if float(direction[place].abs()) < _SNAP:
@@ -110,22 +111,22 @@ def _mean(subject: Subject) -> Tensor:
 
 
 def _principal_axes(subject: Subject) -> Tensor:
-    """[3, 3]: unit vectors as columns, the shortest axis first."""
+    """Return the principal axes [3, 3] as unit column vectors, shortest axis first."""
     return _axes_of(subject.points, subject.weights)
 
 
 def _axes_of(points: Tensor, weights: Tensor) -> Tensor:
-    """Principal axes [3, 3] of weighted points, as columns, the shortest first."""
+    """Return the principal axes [3, 3] of weighted points as columns, shortest first."""
     weights = weights / weights.sum()
     offsets = points - (weights[:, None] * points).sum(0)
-    largest = offsets.abs().amax().clamp_min(1e-300)  # squares of very small or large scenes would vanish or overflow
+    largest = offsets.abs().amax().clamp_min(1e-300)  # squares of very small or large scenes would under- or overflow
     offsets = offsets / largest
     axes: Tensor = torch.linalg.eigh((weights[:, None] * offsets).T @ offsets).eigenvectors
     return axes
 
 
 def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
-    """Up [3] from a flat layer at one end of one of some axes; None where there is none, or more than one."""
+    """Return up [3] from a flat layer at one end of a candidate axis; None if there is none, or more than one."""
     found: list[tuple[float, Tensor]] = []
     for axis in candidates:
         for up in (axis, -axis):
@@ -142,7 +143,7 @@ def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
 
 
 def _levelled(subject: Subject, up: Tensor) -> Tensor | None:
-    """`up` [3] turned to the normal of the flat layer at the lower end; None where it turns away from there."""
+    """Return the normal of the flat layer at the lower end, near `up` [3]; None if it deviates too much."""
     level = up
     for _ in range(4):
         rows, _ = _layer(subject, level)
@@ -154,11 +155,11 @@ def _levelled(subject: Subject, up: Tensor) -> Tensor | None:
 
 
 def _layer(subject: Subject, up: Tensor) -> tuple[Tensor, float]:
-    """The layer of most weight near the lower end: its rows [P] bool, and the share of the subject that it is under."""
+    """Return the heaviest layer near the lower end: its rows [P] bool, and the fraction of the subject above it."""
     heights = subject.points @ up
     heights = heights - heights.amin()
     thickness = _LAYER * subject.size
-    if float(heights.amax()) <= 2 * thickness:  # it is a layer itself
+    if float(heights.amax()) <= 2 * thickness:  # the subject is itself a layer
         return torch.ones_like(heights, dtype=torch.bool), 0.0
     ordered, order = heights.sort()
     running = torch.cat([torch.zeros(1, dtype=torch.float64), subject.weights[order].cumsum(0)])
@@ -171,7 +172,10 @@ def _layer(subject: Subject, up: Tensor) -> tuple[Tensor, float]:
 
 
 def _share_under(points: Tensor, up: Tensor, rows: Tensor) -> float:
-    """Of the cells that all points [P, 3] fall into from above, the share that some of them ([P] bool) fall into."""
+    """Return the fraction of the area of all points [P, 3], seen from above, that some of them ([P] bool) cover.
+
+    Areas are counted in grid cells.
+    """
     flat = points @ _across(up)
     low = flat.amin(0)
     side = float((flat.amax(0) - low).amax())
@@ -183,26 +187,26 @@ def _share_under(points: Tensor, up: Tensor, rows: Tensor) -> float:
 
 
 def _foot(subject: Subject, up: Tensor) -> float:
-    """How much of the subject, seen from above, the hull of its lowest points takes, 0 to 1."""
+    """Return the area of the hull of the lowest points, relative to that of the subject, both seen from above."""
     heights = subject.points @ up
     flat = subject.points @ _across(up)
-    # the lowest of a few strays is no foot
+    # quantiles, so that a few strays do not count as a foot
     low, high = (quantile(heights, subject.weights, share) for share in (0.001, 0.999))
     return _area(flat[heights <= low + _FOOT * (high - low)]) / max(_area(flat), 1e-300)
 
 
 def _area(points: Tensor) -> float:
-    """Of the convex hull of points [n, 2]; 0 where they lie on a line."""
+    """Return the area of the convex hull of points [n, 2]; 0 if they lie on a line."""
     if len(points) < 3:
         return 0.0
     try:
-        return float(ConvexHull(points.numpy()).volume)  # in two dimensions the volume is the area
+        return float(ConvexHull(points.numpy()).volume)  # in two dimensions, `volume` is the area
     except QhullError:
         return 0.0
 
 
 def _across(up: Tensor) -> Tensor:
-    """[3, 2]: two unit vectors at right angles to `up` and each other, as columns."""
+    """Return two unit vectors perpendicular to `up` and each other, [3, 2] as columns."""
     first = torch.zeros(3, dtype=torch.float64)
     first[int(up.abs().argmin())] = 1.0
     first = torch.linalg.cross(up, first)
