@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from sgsst_core.stylizing.loop import Callbacks, Progress, run, stylize
     from sgsst_core.stylizing.stylizer import Stylizer
 
-# PyTorch looks at it once, before its first tensor: memory of two megabytes and more in pages of that size, of which a
-# step on a CPU then takes a few thousand and not millions. Linux grants them where it can; elsewhere it does nothing.
+# PyTorch reads this once, before its first tensor. Allocations of two megabytes and more then use huge pages, so a step
+# on a CPU touches a few thousand pages instead of millions. Linux grants them if it can; other systems ignore it.
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 __all__ = ["Callbacks", "Camera", "Progress", "Scene", "Settings", "Stylizer", "make_settings", "run", "stylize"]
@@ -33,7 +33,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for when it is asked for: PyTorch takes seconds, which `sgsst --help` does without."""
+    """Import exported names on first access: PyTorch takes seconds to import, and `sgsst --help` does not need it."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

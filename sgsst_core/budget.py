@@ -1,4 +1,4 @@
-"""A memory budget: how much there is, and shelves that keep what fits."""
+"""Memory budgets: how much memory is available, and caches that respect a limit."""
 
 from __future__ import annotations
 
@@ -11,26 +11,33 @@ import torch
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
-#: Shares of all memory and of the free memory that a job plans with at most; the rest is left to its buffers and to
-#: other programs. The first rules as long as half of the memory is free, so that the same job on the same machine makes
-#: the same plan, and rounds the same, whatever else happens to run.
+#: Maximum fractions of the total and of the free memory that a job plans with; the rest is for its buffers and for
+#: other programs. The first limit applies as long as half of the memory is free, so the same job on the same machine
+#: gets the same plan, with the same rounding, whatever else is running.
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
-#: Of all memory of a GPU, which a job has to itself.
+#: Fraction of the total memory of a GPU, which a job has to itself.
 GPU_SHARE = 0.7
-#: Of the memory limit: activations of one iteration, view targets and colors, and the rasterizer's lists or weights.
+#: Fractions of the memory limit: activations of one iteration, view targets and colors, and the rasterizer's tile
+#: intersections or cached weights.
 MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
-#: One part in so many of the memory limit, of the views' share, is left to raster lists where blend weights are kept:
-#: views whose weights do not fit are rendered from these.
+#: Where blend weights are cached, the memory limit divided by this, taken from the views' fraction, is left for tile
+#: intersections: views whose weights do not fit are rendered from them.
 LISTS_BESIDE_WEIGHTS = 16
 
 
 def measuring_memory(memory: int) -> int:
-    """Bytes that what is kept of novel views may take, and the exact twin's views: of a rank's memory."""
+    """Return the bytes of a rank's memory that novel views may use as cache.
+
+    The views of the reference may use as much again.
+    """
     return memory // 16
 
 
 def default_memory_limit(device: torch.device | None = None) -> int:
-    """Bytes that a job may plan with on this machine, now; those of a GPU where it computes on one."""
+    """Return the bytes that a job may plan with on this machine at present.
+
+    They are those of the GPU if `device` is one, else those of the CPU.
+    """
     if device is not None and device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         return int(min(total * GPU_SHARE, free * FREE_SHARE))
@@ -39,20 +46,20 @@ def default_memory_limit(device: torch.device | None = None) -> int:
 
 
 def forget_device_peak(device: torch.device | str) -> None:
-    """Let `device_peak` count from here."""
+    """Reset the counter of `device_peak`."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 
 
 def device_peak(device: torch.device | str) -> int | None:
-    """Most bytes of a GPU's memory that tensors have held, since `forget_device_peak`; None for a CPU."""
+    """Return the peak GPU memory held by tensors since `forget_device_peak`, in bytes; None for a CPU."""
     return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
 
 
 class Shelf(Generic[K, V]):
-    """Keeps values by key as long as they fit a number of bytes; what does not fit is made anew at each use.
+    """Cache of values by key within a number of bytes; what does not fit is recomputed at each use.
 
-    Nothing is ever evicted: views come round in turn, and evicting one would only trade it for another.
+    Nothing is ever evicted: views come round in turn, so evicting one would only trade it for another.
     """
 
     def __init__(self, capacity: int, size: Callable[[V], int] | None = None) -> None:
@@ -62,7 +69,13 @@ class Shelf(Generic[K, V]):
         self._kept: dict[K, V] = {}
 
     def get(self, key: K, make: Callable[[], V], size: int | None = None) -> V:
-        """The value of a key: kept, or made and kept if it fits. `size` takes the place of the shelf's own."""
+        """Return the value of a key, from the cache or computed, and cache it if it fits.
+
+        Args:
+            key: Key of the value.
+            make: Function that computes the value.
+            size: Size of the value in bytes; None to use the cache's own `size` function.
+        """
         if key in self._kept:
             return self._kept[key]
         value = make()
@@ -75,14 +88,14 @@ class Shelf(Generic[K, V]):
         return value
 
     def __contains__(self, key: K) -> bool:
-        """Whether the value of a key is kept."""
+        """Return whether the value of a key is cached."""
         return key in self._kept
 
     def holds(self, key: K, size: int) -> bool:
-        """Whether the value of a key is kept, or would be: there is room for so many bytes."""
+        """Return whether the value of a key is cached, or would be because this many bytes are free."""
         return key in self._kept or self.used + size <= self._capacity
 
     def clear(self) -> None:
-        """Keep nothing of what is there."""
+        """Remove all values."""
         self._kept.clear()
         self.used = 0

@@ -1,4 +1,4 @@
-"""Numba as this package uses it: a decorator, and the one way in which threads run compiled kernels."""
+"""Numba configuration of this package: the kernel decorator, and the lock and thread count under which kernels run."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 import numba
 import torch
 
-#: Numba's `workqueue` threading layer, the only one that is always there, aborts the process when two Python threads
-#: are inside a parallel kernel at once. A kernel uses every core anyway, so kernels of one process take turns.
+#: Numba's `workqueue` threading layer, the only one that is always available, aborts the process if two Python threads
+#: are inside a parallel kernel at once. A kernel uses every core anyway, so the kernels of a process take turns.
 _TURN = threading.RLock()
 
 
@@ -24,18 +24,18 @@ _COMPILED_IN = ("constants.py", "rasterizer/vectors.py", "rasterizer/kernels.py"
 
 @functools.cache
 def _digest() -> str:
-    """Changes with the sources that are compiled into kernels of other modules."""
+    """Return a hash of the sources that are compiled into kernels of other modules."""
     folder = Path(__file__).parent
     content = b"".join((folder / name).read_bytes() for name in _COMPILED_IN)
     return hashlib.sha256(content).hexdigest()[:12]
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit` with the machine code kept on disk, or in memory only where no folder can be written.
+    """Return a `numba.njit` decorator that caches machine code on disk, or only in memory if no folder is writable.
 
-    Numba checks a kept kernel against its own source file alone, so what else goes into the machine code is part of the
-    name that it is kept under: see `_COMPILED_IN`, the only modules from which a kernel may call compiled functions.
-    Multiply-adds are contracted; nothing is reordered, so results do not depend on threads.
+    Numba validates a cached kernel only against its own source file. Other inputs of the machine code are therefore
+    made part of its cached name: see `_COMPILED_IN`, the only modules from which a kernel may call compiled functions.
+    Multiply-adds are contracted, but nothing is reordered, so results do not depend on threads.
     """
     settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, **options}
 
@@ -43,7 +43,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         function.__qualname__ = f"{function.__qualname__}_{_digest()}"
         try:
             return numba.njit(cache=True, **settings)(function)
-        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache can be written
+        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache is writable
             return numba.njit(**settings)(function)
 
     return decorate
@@ -51,10 +51,10 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 @contextmanager
 def kernel_threads() -> Iterator[None]:
-    """Run parallel kernels inside: one Python thread at a time, on as many cores as PyTorch was told to use.
+    """Run parallel kernels in a `with` block: one Python thread at a time, with the number of cores that PyTorch uses.
 
-    Following `torch.set_num_threads` lets several ranks of one machine share its cores with one setting. Where both use
-    the same OpenMP library, Numba's first kernel would set PyTorch back to all cores; so the setting is put back.
+    Following `torch.set_num_threads` lets several ranks share the cores of a machine with one setting. If both use the
+    same OpenMP library, Numba's first kernel resets PyTorch to all cores, so the setting is restored.
     """
     with _TURN:
         threads = torch.get_num_threads()

@@ -1,7 +1,7 @@
-"""The numbers of the splatting model, each with the reason for its value.
+"""Constants of the splatting model, each with the reason for its value.
 
-They are those of gsplat 1.6 and of the method it implements, because a scene is only rendered right with the constants
-that it was trained with. The compiled kernels bake these values in: change them here, nowhere else.
+They are those of gsplat 1.6 and of the method it implements, because a scene renders correctly only with the constants
+it was trained with. Compiled kernels contain these values, so change them only here.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ SH_C3 = (
     -math.sqrt(17.5 / math.pi) / 4,
 )
 
-#: Files store colors around mid-gray, so that coefficients of zero are gray.
+#: Files store colors relative to mid-gray, so coefficients of zero are gray.
 COLOR_OFFSET = 0.5
 
-#: Variance in square pixels added to both axes of a projected Gaussian: the pixel's own width, without which a Gaussian
-#: smaller than a pixel falls between the pixel centers.
+#: Variance in square pixels added to both axes of a projected Gaussian: the width of a pixel. Without it, a Gaussian
+#: smaller than a pixel could fall between pixel centers.
 EPS2D = 0.3
 
-#: A Gaussian never hides everything behind it, so that transmittance stays above zero. gsplat 1.6 and the original use
-#: 0.99; gsplat 1.5.3, the version on the package index, uses 0.999.
+#: Upper limit of alpha: a Gaussian never hides everything behind it, so transmittance stays above zero. gsplat 1.6 and
+#: the original use 0.99; gsplat 1.5.3, the version on PyPI, uses 0.999.
 ALPHA_MAX = 0.99
 
-#: Below one gray level of an 8-bit image a contribution is skipped. This also gives a Gaussian a finite support.
+#: Contributions below one gray level of an 8-bit image are skipped, which also gives a Gaussian finite support.
 ALPHA_MIN = 1.0 / 255.0
 
-#: A pixel is finished when its transmittance would fall to this, which is 1e-4: two opaque Gaussians. Written as they
-#: multiply, so that the second one finishes the pixel in float64 as it does in float32 (where 1e-4 itself would not).
+#: A pixel is finished before its transmittance falls to this value, 1e-4: two opaque Gaussians. It is written as their
+#: product, so that the second one finishes the pixel in float64 as it does in float32 (where 1e-4 itself would not).
 TRANSMITTANCE_MIN = (1.0 - ALPHA_MAX) ** 2
 
-#: Nearest depth that is drawn, in world units: what the original viewers use. gsplat trains with 0.01.
+#: Smallest depth that is drawn, in world units, as in the original viewers. gsplat trains with 0.01.
 NEAR = 0.2
 
-#: Where the linearized perspective is evaluated: at most this share of the half field of view outside the image, beyond
-#: which the linearization of a far-off Gaussian would smear it over the picture.
+#: Limit of the directions at which the perspective is linearized, as a fraction of the half field of view beyond the
+#: image border. Further out, linearizing would smear a distant Gaussian over the image.
 FRUSTUM_MARGIN = 0.3
 
 #: Edge of a raster tile in pixels. 16 neighboring pixels of a row fill one 512-bit or two 256-bit vectors.
 RASTER_TILE = 16
 
-#: The coarsest scale has a shorter side in 256..511, about what VGG was trained on (SGSST). Where full views are no
-#: larger than that, a smaller bound gives them several scales too.
+#: Maximum shorter side of the coarsest scale, which is then in 256..511, about the size VGG was trained on (SGSST). If
+#: full views are no larger than that, a smaller limit still gives them several scales.
 COARSEST_SHORTER_SIDE = 511

@@ -1,7 +1,7 @@
-"""How fields of a pydantic model are offered as options: on the command line, over HTTP, in the reference.
+"""Declaration of pydantic fields as options of the command line, the HTTP API and the reference.
 
-Type, bounds, default and help text are the field's own (`Field(..., ge=..., description=...)`). What pydantic has no
-word for stands beside them in `Annotated[..., Option(...)]`.
+Type, bounds, default and help text are those of the field (`Field(..., ge=..., description=...)`). What pydantic cannot
+express is added by `Annotated[..., Option(...)]`.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ def renamed_hint(name: str) -> str:
 
 @dataclass(frozen=True)
 class Option:
-    """What a field is to its user, beside what pydantic knows of it.
+    """Presentation of a field to users, in addition to what pydantic knows.
 
     Attributes:
-        unit: of a quantity; empty for words and switches.
-        metavar: stands for the value in a command's help, and in the help text; empty for the type's name.
-        flags: on the command line, such as "--warm-start/--cold-start"; empty for those made from the name.
-        default: the default in words, where it is None or says little by itself.
-        name: that users know the field by; empty for its own.
-        instead: the option that stands for this field, which is none itself; empty for an option.
+        unit: Unit of a quantity; empty for words and switches.
+        metavar: Placeholder of the value in a command's help and in the help text; empty for the name of the type.
+        flags: Command-line flags, such as "--warm-start/--cold-start"; empty to derive them from the name.
+        default: Default as text, if it is None or not self-explanatory.
+        name: Name shown to users; empty for the field's own.
+        instead: Option that represents this field, which is then not an option itself; empty if the field is an option.
     """
 
     unit: str = ""
@@ -62,19 +62,19 @@ class Option:
     instead: str = ""
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Unit and default are told in JSON schemas too, so in the OpenAPI document."""
+        """Add unit and default to JSON schemas, and thereby to the OpenAPI document."""
         extra = {"x-unit": self.unit, "x-default": self.default}
         return handler(schema) | {name: value for name, value in extra.items() if value}
 
 
 @dataclass(frozen=True)
 class Declared:
-    """A field of a model, as an option.
+    """Model field that is offered as an option.
 
     Attributes:
-        field: its name in the model.
-        info: what pydantic knows of it.
-        option: the rest.
+        field: Name in the model.
+        info: Field information from pydantic.
+        option: Presentation to users.
     """
 
     field: str
@@ -83,23 +83,23 @@ class Declared:
 
     @property
     def name(self) -> str:
-        """The name that users know it by."""
+        """Name shown to users."""
         return self.option.name or self.field
 
     @property
     def help(self) -> str:
-        """What it does, in a sentence."""
+        """Help text."""
         return self.info.description or ""
 
     @property
     def limits(self) -> list[Any]:
-        """What bounds a number; of one that may be a word instead, this stands inside the union."""
+        """Bounds of a number. If a word is accepted too, they are inside the union type."""
         inside = [kind.__metadata__ for kind in get_args(self.info.annotation) if get_origin(kind) is Annotated]
         return [item for item in itertools.chain(self.info.metadata, *inside) if isinstance(item, Ge | Gt | Le | Lt)]
 
     @property
     def bounds(self) -> str:
-        """The values that a number may have, such as "0<=x<1" or "x>=1"; empty where it may have all."""
+        """Range of a number, such as "0<=x<1" or "x>=1"; empty if unbounded."""
         low = high = above = ""
         for item in self.limits:
             if isinstance(item, Ge | Gt):
@@ -110,14 +110,14 @@ class Declared:
         return f"{low}x{high}" if high else above
 
     def text(self, value: object) -> str:
-        """A value in words: the default by its own ones."""
+        """Return a value as text; for the default, its text in the declaration."""
         if self.option.default and value == self.info.default:
             return self.option.default
         return _plain(value)
 
 
 def declared(model: type[BaseModel]) -> dict[str, Declared]:
-    """The fields of a model that are options, by the name that users know them by."""
+    """Return the fields of a model that are options, by the name shown to users."""
     found = [
         Declared(field, info, next((item for item in info.metadata if isinstance(item, Option)), Option()))
         for field, info in model.model_fields.items()
@@ -126,7 +126,7 @@ def declared(model: type[BaseModel]) -> dict[str, Declared]:
 
 
 def _plain(value: object) -> str:
-    """A value without digits that say nothing."""
+    """Return a value as text without redundant digits."""
     if isinstance(value, bool):
         return "on" if value else "off"
     return f"{value:g}" if isinstance(value, float) else str(value)

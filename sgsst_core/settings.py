@@ -1,4 +1,4 @@
-"""Settings of a stylization and the presets that give them values."""
+"""Settings of a stylization, and the presets that provide their values."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ CachedWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
 PreservedColors = Literal["no", "match", "luminance"]
 StyleLossName = Literal["sos", "nnfm", "mixed"]
-#: What lies behind the Gaussians in a step: `Settings.background`, a uniform color, or one of the style's pixels.
+#: Background of the Gaussians in a step: `Settings.background`, a uniform random color, or the color of a style pixel.
 PlannedBackground = Literal["background", "random", "palette"]
 TrainingBackground = Literal["auto", "background", "random", "palette"]
-#: What can be left out without changing the result, for `Settings.keep`.
+#: Values of `Settings.keep`: items that can be left out without changing the result.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
-#: Content weights by how strong the style is then, chosen on the front of style against content (docs/quality.md).
+#: Content weight of each named style strength, chosen on the trade-off curve of style and content (docs/quality.md).
 STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 1e4, "strong": 1.0}
-#: How the default of a setting that presets decide begins, in words.
+#: First words of the default's description for settings whose default depends on the preset.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
 
 
-#: Largest longer side that can be asked for: well beyond the paper's 5187, and short of exhausting memory by a typo.
+#: Upper limit of the longer side: well beyond the paper's 5187, and low enough that a typo does not exhaust memory.
 MAX_RESOLUTION = 16384
-#: More would be a slip of the hand.
+#: Larger values are assumed to be typing errors.
 _MAX_STEPS, _MAX_WEIGHT = 10_000_000, 1e12
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -63,14 +63,14 @@ ScaleWeight = Annotated[float, Field(ge=0, le=_MAX_WEIGHT, allow_inf_nan=False)]
 
 
 def _some_weight(weights: tuple[float, ...] | None) -> tuple[float, ...] | None:
-    """Scales of which one counts; none given leaves them all alike."""
+    """Check that at least one scale has a weight. An empty tuple means equal weights."""
     if weights and not any(weights):
         raise ValueError("no scale has a weight")
     return weights
 
 
 class _StrengthWords:
-    """Lets a number be given by a word of `STRENGTHS`, in JSON schemas too."""
+    """Annotation that accepts a word of `STRENGTHS` in place of a number, also in JSON schemas."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(self._number, handler(source))
@@ -86,11 +86,11 @@ class _StrengthWords:
 
 
 class Settings(BaseModel):
-    """Everything that decides a result, apart from scene, cameras, style and photos.
+    """Everything that determines a result, apart from scene, cameras, style and photos.
 
-    Each field is declared here and nowhere else: options of the command line, parameters of the API and the reference
-    in docs/options.md follow from it. Names and order are part of a checkpoint's fingerprint: another name, or one more
-    field, and checkpoints of before belong to another job.
+    Each field is declared only here: command-line options, API parameters and the reference in docs/options.md are
+    derived from it. Names and order are part of a checkpoint's fingerprint, so renaming or adding a field invalidates
+    existing checkpoints.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -247,15 +247,14 @@ class Settings(BaseModel):
     )
 
     def learning_rate_at(self, share: float) -> float:
-        """Adam's learning rate when `share` (0..1) of all steps is done."""
+        """Return Adam's learning rate after a fraction `share` (0..1) of all steps."""
         return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** share)
 
 
-#: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps, which throw many
-#: colors below 0 on their way and therefore need `clamp_aware_gradient` (docs/performance.md, "The standard preset"),
-#: and begin with the style's colors, which steps alone reach slowly (docs/quality.md, "What colors begin with").
-#: Phase 1 pays on large views and has given what it can after some 80 steps (docs/performance.md, "At the photos' own
-#: size").
+#: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps. These push many
+#: colors below 0 along the way, which is why they need `clamp_aware_gradient` (docs/performance.md). They start from the style's
+#: colors, which steps alone reach only slowly (docs/quality.md). Phase 1 pays off for large views, and has no further
+#: effect after some 80 steps (docs/performance.md).
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,
@@ -290,24 +289,24 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
 
 
 def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
-    """A preset's settings with single values on top; values that are None are left to the preset.
+    """Return the settings of a preset with individual values replaced; values of None are left to the preset.
 
     Raises:
-        SettingsError: unknown preset, or a value out of range.
+        SettingsError: If the preset is unknown, or a value is out of range.
     """
     if preset not in _PRESETS:
         raise SettingsError(f"There is no preset {preset!r}; choose one of {', '.join(_PRESETS)}.")
     chosen = {name: value for name, value in values.items() if value is not None}
-    if "learning_rate" in chosen:  # a rate given by hand is meant as it is, unless its end is given too
+    if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
     return checked(Settings, {"preset": preset, **_PRESETS[preset], **chosen})
 
 
 def checked(model: type[M], values: Mapping[str, object]) -> M:
-    """A model of these values.
+    """Validate values against a model.
 
     Raises:
-        SettingsError: one of them is unknown, or not what the model declares; named with what is wrong.
+        SettingsError: If a value is unknown or does not match the model's declaration; the message names the first one.
     """
     try:
         return model.model_validate(values)
@@ -318,7 +317,7 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
 
 
 def default_text(setting: Declared) -> str:
-    """What holds for a setting that is not given, in words; each preset's where they differ."""
+    """Return the default of a setting as text, for each preset if they differ."""
     values = {preset: setting.text(getattr(make_settings(preset), setting.field)) for preset in _PRESETS}
     if len(set(values.values())) == 1:
         return values["standard"]

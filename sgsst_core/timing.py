@@ -1,4 +1,4 @@
-"""Where the seconds go: exclusive time by name, on a CPU by the clock, on a GPU by events in its stream."""
+"""Profiling by name: exclusive time, from the clock on a CPU, and from stream events on a GPU."""
 
 from __future__ import annotations
 
@@ -12,34 +12,37 @@ import torch
 
 
 class Event(Protocol):
-    """A mark in a device's stream, as `torch.cuda.Event`."""
+    """Event in a device's stream, as `torch.cuda.Event`."""
 
     def record(self) -> None:
-        """Put it behind what the device was given so far."""
+        """Record the event after all work queued so far."""
 
     def query(self) -> bool:
-        """Whether the device has come to it."""
+        """Return whether the device has reached the event."""
 
     def synchronize(self) -> None:
-        """Wait until the device has come to it."""
+        """Wait until the device has reached the event."""
 
     def elapsed_time(self, end_event: Any, /) -> float:
-        """Milliseconds from this mark to a later one, once the device has come to both."""
+        """Return the milliseconds from this event to a later one, once the device has reached both."""
 
 
 class Timer:
-    """Adds up seconds by name. Nested blocks count for the inner name only, so that the sum is the whole; within a
-    whole block they count for its name.
+    """Accumulator of seconds by name.
 
-    A GPU works behind the program: what is measured there is when it began and ended a block's work, not when the
-    program gave it. Nothing waits for it until `read`.
+    Time in nested blocks counts only for the innermost name, so the sum is the total. Blocks inside a `whole` block
+    count for the name of the latter.
+
+    A GPU works asynchronously: what is measured is when it started and finished the work of a block, not when the
+    program queued it. Nothing synchronizes until `read`.
 
     Args:
-        device: whose time it is.
-        event: makes a mark in the device's stream; None for PyTorch's own on a GPU, and the clock on a CPU.
+        device: Device whose time is measured.
+        event: Function that creates an event in the device's stream; None for PyTorch's events on a GPU and the clock
+            on a CPU.
 
     Attributes:
-        seconds: by name; on a GPU those of blocks that ended before the last `read`.
+        seconds: Seconds by name; on a GPU, of blocks that ended before the last `read`.
     """
 
     def __init__(self, device: torch.device | str = "cpu", event: Callable[[], Event] | None = None) -> None:
@@ -51,12 +54,12 @@ class Timer:
         self._whole: str | None = None
         self._since: Event | None = None
         self._since_clock = 0.0
-        #: Name, begin and end of what was marked and not yet read.
+        #: Name, start and end of blocks that have not been read yet.
         self._marked: list[tuple[str, Event, Event]] = []
 
     @contextmanager
     def __call__(self, name: str, *, whole: bool = False) -> Iterator[None]:
-        """Time a block; whole: with the blocks in it."""
+        """Measure a `with` block. With `whole`, blocks nested in it count for its name."""
         self._switch()
         outer = self._whole
         self._open.append(outer or name)
@@ -70,14 +73,14 @@ class Timer:
             self._whole = outer
 
     def clear(self) -> None:
-        """Forget everything that was measured so far; blocks that are open count from here."""
+        """Discard all measurements; blocks that are open count from now on."""
         self.seconds.clear()
         self._marked.clear()
         if self._open:
             self._begin()
 
     def read(self) -> dict[str, float]:
-        """Complete `seconds`. Waits for the end of the last block on a GPU, if nothing else has waited for it yet."""
+        """Update and return `seconds`. On a GPU, waits for the end of the last block."""
         if self._marked and not self._marked[-1][2].query():
             self._marked[-1][2].synchronize()
         for name, begin, end in self._marked:
@@ -86,7 +89,7 @@ class Timer:
         return self.seconds
 
     def _switch(self) -> None:
-        """Give the time since the last switch to the innermost open block."""
+        """Attribute the time since the last switch to the innermost open block."""
         begin, begin_clock = self._since, self._since_clock
         self._begin()
         if not self._open:
@@ -108,6 +111,6 @@ class Timer:
 
 
 def wait_for(device: torch.device) -> None:
-    """Until a device has done what it was given."""
+    """Wait until a device has finished its queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

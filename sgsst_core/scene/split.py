@@ -12,9 +12,11 @@ smaller.) Axes are split independently, so the mixture of all children has the p
 A child's opacity is the parent's times the product of w_i r over the axes. This is its fraction of the parent's
 density, whose peak is r times as high if the deviation is r times as small. As long as children do not cover each other
 fully, this adds up to the parent's alpha to first order in the opacity. Opacities stay proportional to the weights, so
-the opacity-weighted mixture keeps its moments at any opacity. (Children that add up in optical depth, 1 - (1 - a)^(w
-r), cover more than the parent in its tails. Children whose lattice has the parent's optical depth are no closer to it
-than these: docs/performance.md.)
+the opacity-weighted mixture keeps its moments at any opacity.
+
+Two alternatives are no better (docs/performance.md). Children that add up in optical depth, with opacity 1 - (1 - a)^(w
+r), cover more than the parent in its tails. Children whose lattice has the parent's optical depth are no closer to the
+parent than these.
 """
 
 from __future__ import annotations
