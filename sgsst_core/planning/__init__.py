@@ -1,1 +1,1 @@
-"""What a scene does not need is left out: measured by a probe, decided before the first step."""
+"""Planning: measure a job before its first step, and decide what its scene allows to leave out."""

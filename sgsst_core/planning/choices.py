@@ -1,6 +1,6 @@
-"""Choices that follow from the settings and a first measurement.
+"""Choices that follow directly from the settings and a first measurement.
 
-What is measured next depends on them, so the probe and `decide` share them.
+Later measurements depend on them, so the probe and `decide` share them.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
 from sgsst_core.settings import PlannedBackground, Precision, Settings
 
-#: On the CPU, making a view's kept weights costs about three renders with gradient, and each use of them saves two
-#: thirds of one: with fewer visits they do not pay. On GPUs both are measured (`RasterCost.least_visits`).
+#: On the CPU, computing a view's cached weights takes about three renders with gradient, and each use saves two thirds
+#: of one, so they do not pay off for fewer visits. On GPUs both are measured (`RasterCost.least_visits`).
 LEAST_VISITS = 5
-#: With this share of pixels uncovered, views show an object without background. (Those of a room that was captured from
-#: some places only have holes of a few percent.)
+#: Above this fraction of uncovered pixels, views show an object without background. (Views of a room that was captured
+#: from only some places have holes of a few percent.)
 SCAN_SHARE = 0.2
-#: What is behind such an object in a step, if nothing else was asked for (docs/quality.md).
+#: Default background of such an object in a step (docs/quality.md).
 SCAN_BACKGROUND: PlannedBackground = "palette"
 
 
 def optimized_gaussians(looked: Survey, settings: Settings) -> Tensor:
-    """[N] bool, Gaussians whose colors the views decide.
+    """Return the mask [N] bool of Gaussians whose colors are determined by the views.
 
     Raises:
-        SettingsError: pruning would leave none.
+        SettingsError: If pruning would leave none.
     """
     optimized = looked.total_blend_weights > settings.prune_weight
     if not optimized.any():
@@ -45,14 +45,15 @@ def optimized_gaussians(looked: Survey, settings: Settings) -> Tensor:
 
 
 def is_scan(looked: Survey, *, weighted: bool) -> bool:
-    """Whether views show an object without background, whose statistics leave out what is behind it."""
+    """Return whether views show an object without background, whose statistics exclude the background."""
     return weighted and looked.uncovered_share > SCAN_SHARE
 
 
 def starts_warm(settings: Settings, *, scan: bool) -> bool:
-    """Whether colors begin as the style's: what they have in common, steps reach slowly (docs/quality.md).
+    """Return whether colors start like the style's.
 
-    By luminance alone that is known of scans only, beside which nothing tells how bright they should be.
+    Steps change what all colors have in common only slowly (docs/quality.md). If only luminance is stylized, a warm
+    start pays off only for scans, in which nothing else determines how bright they should be.
     """
     if settings.warm_start is None:
         return scan or settings.preserve_colors != "luminance"
@@ -60,56 +61,60 @@ def starts_warm(settings: Settings, *, scan: bool) -> bool:
 
 
 def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
-    """Whether a job that begins with the style's colors is given them once more behind the last step.
+    """Return whether a job that starts with the style's colors is given them once more after the last step.
 
-    A loss without statistics lets them go in its steps; ARF (Zhang et al. 2022) transfers them a second time, too. With
-    statistics it would undo what steps have found (docs/quality.md).
+    A loss without statistics lets these colors drift during the steps; ARF (Zhang et al. 2022) transfers them a second
+    time too. With statistics, the transfer would undo what the steps have achieved (docs/quality.md).
     """
     return warm and not has_statistics(settings.style_loss)
 
 
 def training_background_of(settings: Settings, *, scan: bool) -> PlannedBackground:
-    """What is behind the Gaussians in a step."""
+    """Return the background of the Gaussians in a step."""
     if settings.training_background == "auto":
         return SCAN_BACKGROUND if scan else "background"
     return settings.training_background
 
 
 def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
-    """[N] bool, Gaussians that are rendered: the optimized ones, or all for comparison."""
+    """Return the mask [N] bool of Gaussians that are rendered: the optimized ones, or all for comparison."""
     everything = "unseen" in settings.keep and not settings.prune_weight
     return torch.ones_like(optimized) if everything else optimized
 
 
 def pruned_gaussians(looked: Survey, seen: Tensor) -> Tensor:
-    """[N] bool, Gaussians that a view shows and that are not rendered all the same."""
+    """Return the mask [N] bool of Gaussians that are visible in a view but not rendered."""
     return ~seen & (looked.total_blend_weights > 0)
 
 
 def precision_of(asked: Precision, ratio: float | None) -> Precision:
-    """The network's precision, where a convolution in float32 takes `ratio` times as long as in the one asked for.
+    """Return the precision of the network: the requested one if it is faster than float32, else float32.
 
-    Processors without bfloat16 instructions compute it hundreds of times slower than float32.
+    Processors without bfloat16 instructions compute it hundreds of times more slowly than float32.
 
     Args:
-        ratio: None where float32 was asked for, or what there is not here.
+        asked: Requested precision.
+        ratio: Seconds of a convolution in float32 divided by those in the requested precision; None if float32 was
+            requested, or the requested one is unavailable.
     """
     return asked if ratio is not None and ratio > 1 else "float32"
 
 
-#: Rasterizers of GPUs, the preferred one first.
+#: GPU rasterizers in order of preference.
 GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
 
 
 def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
-    """What the rasterizer of a job that computes weights anew is made with, beside its scene.
+    """Return the constructor options, apart from the scene, of the rasterizer that computes blend weights.
 
-    On the CPU lists share the memory of kept weights (`CachedRasterizer`). Lists of a GPU are small beside its memory,
-    and each view without one costs a sort and a wait: they have half as much as kept weights, of what is left to
-    buffers.
+    On the CPU, tile intersections share the memory of cached weights (`CachedRasterizer`). On a GPU, they are small
+    compared to its memory, and each view without them costs a sort and a synchronization. There they get half as much
+    as cached weights, from the part that is left for buffers.
 
     Args:
-        memory: bytes that the rank may plan with.
+        name: Name of the rasterizer.
+        settings: Settings of the job.
+        memory: Memory budget of the rank in bytes.
     """
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if name in ("cpu", "triton"):
@@ -118,10 +123,11 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
 
 
 def uncached_rasterizer(device: Device, problems: Mapping[str, str]) -> RasterizerName:
-    """The rasterizer that computes blend weights anew: on a GPU the first of `GPU_RASTERIZERS` that works.
+    """Return the rasterizer that computes blend weights: on a GPU, the first of `GPU_RASTERIZERS` that works.
 
     Args:
-        problems: why GPU rasterizers cannot be used, by their name; those that can are not in it.
+        device: Device of the job.
+        problems: Reason by name for each GPU rasterizer that does not work.
     """
     if device == "cuda":
         return next((name for name in GPU_RASTERIZERS if name not in problems), "cpu")

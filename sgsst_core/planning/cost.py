@@ -1,4 +1,4 @@
-"""What an iteration will cost, from what was measured: pixels through the network, seconds, bytes that are kept."""
+"""Cost of an iteration, from measured rates: pixels through the network, seconds, and stored bytes."""
 
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ from sgsst_core.loss.nearest import MATCH_BYTES, MOST_VECTORS, working_bytes
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Piece, Size
 
-#: One of the layers whose features are matched with the style's: they have the same cells.
+#: One of the layers whose features are matched with the style's; all of them have the same cells.
 _MATCHED = "relu3_1"
 
-#: Bytes an optimized Gaussian costs beside the scene: colors, gradient and two moments, float32.
+#: Additional bytes per optimized Gaussian: color, gradient and two moments, float32.
 OPTIMIZER_BYTES = 4 * 3 * 4
 
-#: And what a step makes anew on the CPU: a view's colors, their gradients and its parts by raster tile.
+#: Additional bytes per Gaussian allocated in each step on the CPU: a view's colors and their gradients, also by raster
+#: tile.
 STEP_BYTES = 4 * 3 * 4
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Of a Gaussian of a scene in float32: position, rotation, scale, opacity and coefficients of three colors."""
+    """Return the bytes of a float32 Gaussian: position, rotation, scale, opacity and coefficients of three channels."""
     return 4 * (3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2)
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Seconds a pixel: `forward` alone (with statistics), and `both` passes.
+    """Seconds per pixel of the feature network, including statistics.
 
     Attributes:
-        search: seconds of the search for a position's nearest style vector, for each of them; 0 where none is searched.
+        forward: Seconds per pixel of the forward pass alone.
+        both: Seconds per pixel of both passes.
+        search: Seconds per pair of position and style vector in the nearest-neighbor search; 0 without one.
     """
 
     forward: float
@@ -42,17 +45,17 @@ class Rate:
 
 @dataclass(frozen=True)
 class RasterCost:
-    """Of the views' blend weights.
+    """Cost of the views' blend weights.
 
     Attributes:
-        seconds: of a render and its gradient with weights computed anew, mean over some views.
-        kept_seconds: the same with kept weights; None where not even one view's fit the memory.
-        bytes: of the kept weights of all views, float32; None where they would not be kept anyway.
-        half_bytes: the same, half precision.
-        keeping_seconds: of making a view's kept weights; None where that was not measured, on the CPU.
-        first_seconds: that the first render of a view takes beside later ones: its lists of Gaussians are made then.
-        lists_bytes: of a view's lists, mean; 0 where that is not known.
-        colors_seconds: of what spherical harmonics add to the colors of a view.
+        seconds: Seconds of a render and its gradient with recomputed weights, mean over some views.
+        kept_seconds: Seconds of the same with cached weights; None if those of even one view do not fit in memory.
+        bytes: Size of the cached weights of all views, float32; None if the rasterizer cannot cache them.
+        half_bytes: Size of the same in half precision.
+        keeping_seconds: Seconds to compute a view's cached weights; None if not measured, on the CPU.
+        first_seconds: Additional seconds of a view's first render, which computes its tile intersections.
+        lists_bytes: Mean size of a view's tile intersections; 0 if unknown.
+        colors_seconds: Seconds for the contribution of spherical harmonics to the colors of a view.
     """
 
     seconds: float
@@ -66,25 +69,25 @@ class RasterCost:
 
     @property
     def least_visits(self) -> float | None:
-        """Visits of a view from which on kept weights save time; None where they never do, or it was not measured."""
+        """Visits of a view from which cached weights save time; None if they never do, or it was not measured."""
         if self.kept_seconds is None or self.keeping_seconds is None or self.kept_seconds >= self.seconds:
             return None
         return self.keeping_seconds / (self.seconds - self.kept_seconds)
 
 
-#: Share of the seconds of a view's loss that a graph must save to be worth its memory.
+#: Minimum fraction of the time of a view's loss that a graph must save to be worth its memory.
 LEAST_SAVING = 0.03
 
 
 @dataclass(frozen=True)
 class LaunchCost:
-    """Of the loss of a view and its gradient.
+    """Cost of the loss of a view and its gradient.
 
     Attributes:
-        seconds: with its kernels launched one by one.
-        replayed: as a graph.
-        capture: of capturing the graph, once.
-        problem: why there is no graph, and nothing was measured; None where there is one.
+        seconds: Seconds with kernels launched one by one.
+        replayed: Seconds as a graph.
+        capture: Seconds to capture the graph, once.
+        problem: Reason why there is no graph and nothing was measured; None if there is one.
     """
 
     seconds: float = 0.0
@@ -94,22 +97,24 @@ class LaunchCost:
 
     @property
     def saved(self) -> float:
-        """Seconds that a graph saves at each visit; 0 where they are too few."""
+        """Seconds that a graph saves per visit; 0 if too few to matter."""
         saved = self.seconds - self.replayed
         return saved if self.problem is None and saved > LEAST_SAVING * self.seconds else 0.0
 
     @property
     def least_visits(self) -> float | None:
-        """Visits of views that share a graph from which on it saves time; None where it never does."""
+        """Visits of views that share a graph from which it saves time; None if it never does."""
         return FIRST_VISITS + self.capture / self.saved if self.saved else None
 
 
 def pieces_of(size: Size, tiling: Tiling, region: Rectangle | None, *, coarsest: bool = False) -> tuple[Piece, ...]:
-    """What of a view goes through the network: one piece for each scale that counts, or for the coarsest alone.
+    """Return the pieces of a view that go through the network: one per scale, or only that of the coarsest.
 
     Args:
         size: (height, width) of the view.
-        region: that holds every covered pixel; None where uncovered pixels go through too.
+        tiling: Partitioning rules.
+        region: Rectangle that contains all covered pixels; None if uncovered pixels are processed too.
+        coarsest: Whether to return only the coarsest scale.
     """
     scales = tiling.scales(size)
     return tuple(_piece(size, scale, region) for scale in (scales[-1:] if coarsest else scales))
@@ -121,8 +126,8 @@ def _piece(size: Size, scale: int, region: Rectangle | None) -> Piece:
     return Piece(scale, scaled, part)
 
 
-#: Of what a pass on a CPU needs beside the activations that it keeps, when all of them are held (measured: 0.4 at
-#: 512x384, where it is 40 MB, and 0.15 at most at 990x742).
+#: Temporary memory of a pass on a CPU, as a fraction of the working memory, if all activations are cached (measured:
+#: 0.4 at 512x384, where it is 40 MB, and at most 0.15 at 990x742).
 WORKING_SHARE = 0.25
 
 
@@ -131,12 +136,12 @@ class Work:
     """Pixels through the network in one iteration, mean over views.
 
     Attributes:
-        pixels: forward and backward, halos included.
-        again: forward a second time, because activations do not fit.
-        without_region: what `pixels` would be if uncovered pixels were not left out.
-        tiles: of the full-size view with most tiles.
-        peak: most pixels that are held at a time, and what a pass needs beside them counted as such.
-        pairs: of a position and a style vector, which the search for the nearest would compare.
+        pixels: Pixels that go forward and backward, including halos.
+        again: Pixels that go forward twice because their activations do not fit.
+        without_region: Value of `pixels` if uncovered pixels were processed too.
+        tiles: Maximum number of tiles of a view at one scale.
+        peak: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
+        pairs: Pairs of position and style vector compared by the nearest-neighbor search.
     """
 
     pixels: float
@@ -155,12 +160,15 @@ class Work:
         coarsest: bool = False,
         working_share: float = 1.0,
     ) -> Work:
-        """The work of all scales, or of the coarsest alone.
+        """Count the work of all scales, or of the coarsest alone.
 
         Args:
             sizes: (height, width) of each view.
-            regions: of each view, that hold every covered pixel; None where uncovered pixels go through too.
-            working_share: see `WORKING_SHARE`; 1 where it is not known.
+            tiling: Partitioning rules.
+            regions: Rectangle of each view that contains all covered pixels; None if uncovered pixels are processed
+                too.
+            coarsest: Whether to count only the coarsest scale.
+            working_share: See `WORKING_SHARE`; 1 if unknown.
         """
         pixels = again = without = pairs = 0.0
         tiles = 0
@@ -176,7 +184,8 @@ class Work:
                 without += sum(tile.outer.pixels for tile in tiling.tiles(piece.size))
                 tiles = max(tiles, len(areas))
                 once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
-                # Where all is held, what a pass needs beside it comes when some of it is not there yet, or gone.
+                # If everything is cached, the temporary memory is needed when part of the activations is not there yet,
+                # or is gone.
                 working = tiling.working * (1.0 if twice else working_share)
                 held = sum(areas) - twice + working * max(areas, default=0)
                 peak = max(peak, held, (1 + tiling.working) * once)
@@ -184,31 +193,34 @@ class Work:
         return Work(pixels / views, again / views, without / views, tiles, peak, pairs / views)
 
     def seconds(self, rate: Rate) -> float:
-        """Of the feature network and the statistics in one iteration."""
+        """Return the seconds of feature network and statistics in one iteration."""
         return self.pixels * rate.both + self.again * rate.forward + self.pairs * rate.search
 
     def evaluation(self, rate: Rate) -> float:
-        """Of the loss alone, without its gradient."""
+        """Return the seconds of the loss without its gradient."""
         return self.pixels * rate.forward + self.pairs * rate.search
 
 
 def pairs_of(piece: Piece) -> int:
-    """Positions of a piece, each with every vector of a style that is as large as the view."""
+    """Return the number of pairs of a piece's positions with the vectors of a style as large as the view."""
     return piece.cells(_MATCHED) * _vectors(piece.size)
 
 
 def _vectors(size: Size) -> int:
-    """Of a style as large as a scaled view of a size (height, width)."""
+    """Return the number of vectors of a style as large as a scaled view of size (height, width)."""
     stride = layer_stride(_MATCHED)
     return min((size[0] // stride) * (size[1] // stride), MOST_VECTORS)
 
 
 def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: int, device: str) -> int:
-    """Style vectors of every size of views (height, width) at all scales, matches and buffers of the search.
+    """Return the bytes for matching: style vectors of all view sizes at all scales, matches, and search buffers.
 
     Args:
-        channels: of a vector; 0 where nothing is matched.
-        value: bytes of a value.
+        sizes: (height, width) of each view.
+        tiling: Partitioning rules.
+        channels: Length of a vector; 0 if nothing is matched.
+        value: Bytes per value.
+        device: "cpu" or "cuda".
     """
     if not channels:
         return 0
@@ -221,7 +233,7 @@ def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: i
 
 
 def content_bytes(sizes: Sequence[Size], tiling: Tiling, cell: int) -> int:
-    """Content features of views of some sizes (height, width) at all scales, of so many bytes a cell."""
+    """Return the bytes of the content features of views at all scales, given the bytes per cell."""
     cells = sum(
         (height >> scale + 3) * (width >> scale + 3)
         for height, width in sizes
@@ -231,5 +243,5 @@ def content_bytes(sizes: Sequence[Size], tiling: Tiling, cell: int) -> int:
 
 
 def image_bytes(sizes: Sequence[Size]) -> int:
-    """Images of one iteration: the render, its gradient, and their float32 copies on the way."""
+    """Return the bytes of the images of one iteration: render, gradient, and their temporary float32 copies."""
     return max(height * width for height, width in sizes) * 3 * 4 * 6

@@ -1,6 +1,6 @@
-"""What a scene does not need is left out: every decision before the first iteration, from a probe and the settings.
+"""All decisions before the first iteration, as a pure function of probe and settings.
 
-Nothing is rendered or timed here, and the machine is not looked at: the same probe and settings give the same plan.
+Nothing is rendered or timed, and the machine is not inspected: the same probe and settings give the same plan.
 """
 
 from __future__ import annotations
@@ -41,26 +41,29 @@ from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_r
 from sgsst_core.planning.visits import Visits
 from sgsst_core.settings import CachedWeights, Settings
 
-#: With this share of pixels uncovered, views are taken for those of an object scan, with an empty surround.
+#: Above this fraction of uncovered pixels, views are taken for an object scan with an empty background.
 UNCOVERED_SHARE = 0.01
-#: Trying cuDNN's algorithms on pictures of a size takes about ten passes and speeds the others up by a few percent.
+#: Minimum passes per image size for benchmarking cuDNN's algorithms, which takes about ten passes and makes the others
+#: a few percent faster.
 LEAST_PASSES = 200
 
 
 def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
-    """The plan for a job.
+    """Plan a job.
 
     Args:
-        measured: the job will be measured between its steps and reported, as `sgsst stylize` does it.
+        probe: Measured facts.
+        settings: Settings of the job.
+        measured: Whether the job will be measured between its steps and reported, as in `sgsst stylize`.
 
     Raises:
-        SettingsError: pruning would leave no Gaussian.
+        SettingsError: If pruning would leave no Gaussian.
     """
     return _Deciding(probe, settings, measured=measured).plan()
 
 
 class _Deciding:
-    """Everything that follows from a probe and settings, step by step."""
+    """Derivation of a plan from a probe and settings, step by step."""
 
     def __init__(self, probe: Probe, settings: Settings, *, measured: bool) -> None:
         self.probe = probe
@@ -91,7 +94,7 @@ class _Deciding:
         self.visits = Visits.of(self.base, probe, settings, self.work, self.coarse, content)
 
     def plan(self) -> Plan:
-        """Decisions and prediction."""
+        """Return the plan with decisions and prediction."""
         expected, activations, ranks, line = (
             self._one_rank() if self.probe.machine.ranks == 1 else self._several_ranks()
         )
@@ -155,13 +158,16 @@ class _Deciding:
         )
 
     def _passes_of_a_size(self, steps_coarse: int, weighted: bool) -> int:
-        """How often pictures of one size go through the network; weighted views are cut to what each of them covers."""
+        """Return how often images of one size pass through the network.
+
+        Weighted views count one by one, because each is cropped to what it covers.
+        """
         views = self.probe.distinct
         sizes = len(views) if weighted else len({self.probe.sizes[index] for index in views})
         return (steps_coarse + self.settings.steps_sos) * self.settings.views_per_step // sizes
 
     def _graphs_pay(self, steps_coarse: int, weighted: bool) -> bool:
-        """Whether graphs of the loss save more time than it takes to capture them, one for each size and phase."""
+        """Return whether graphs of the loss save more time than capturing one per size and phase takes."""
         launches, settings = self.probe.launches, self.settings
         if self.probe.machine.device != "cuda" or launches is None or "launches" in settings.keep:
             return False
@@ -171,7 +177,10 @@ class _Deciding:
         return self._passes_of_a_size(steps_coarse, weighted) >= phases * launches.least_visits
 
     def _kept_form(self, visits: float) -> CachedWeights:
-        """How blend weights are kept: exactly where they fit, in half precision where only that fits, where it pays."""
+        """Return the format of cached blend weights.
+
+        It is float32 if that fits, else half precision, and none if caching does not pay off.
+        """
         raster, form = self.probe.raster, self.settings.cached_weights
         if raster.bytes is None or raster.half_bytes is None or "blend-weights" in self.settings.keep:
             return "none"
@@ -183,14 +192,16 @@ class _Deciding:
         return "float32" if exactly else "half"
 
     def _keeping_pays(self, visits: float) -> bool:
-        """Whether kept blend weights save more time in so many visits of each view than it takes to make them."""
+        """Return whether cached blend weights save more time in this many visits per view than it takes to compute
+        them.
+        """
         raster = self.probe.raster
         if self.probe.rasterizer not in GPU_RASTERIZERS:
             return visits >= LEAST_VISITS
         return raster.least_visits is not None and visits >= raster.least_visits
 
     def _keeps_coarse(self, form: CachedWeights, visits: float) -> bool:
-        """Whether phase 1, with so many visits of each view, keeps the weights of the coarsest scale only."""
+        """Return whether phase 1, with this many visits per view, caches only the weights of the coarsest scale."""
         on_cpu = self.probe.machine.device == "cpu" and self.probe.rasterizer not in GPU_RASTERIZERS
         if form == "none" or self.settings.cached_weights != "auto" or not on_cpu:
             return False
@@ -215,19 +226,24 @@ class _Deciding:
         found += [ranks] if ranks else []
         return (*found, *decisions.of_precision(probe, settings))
 
-    # --- what is expected ------------------------------------------------------------------------------------------
+    # --- predictions
+    # ---------------------------------------------------------------------------------------------------
 
     def _content_bytes(self, views: Iterable[int]) -> int:
         sizes = [self.probe.sizes[index] for index in views]
         return content_bytes(sizes, self.tiling, self.probe.network.content_bytes)
 
     def _nearest_bytes(self) -> int:
-        """What matching features with the style's takes; every rank has all of the style's vectors."""
+        """Return the memory for feature matching in bytes; every rank has all of the style's vectors."""
         network, device = self.probe.network, self.probe.machine.device
         return nearest_bytes(self.sizes, self.tiling, network.vector_channels, 4, device)
 
     def _one_rank(self) -> tuple[Prediction, int, int, None]:
-        """What is expected of the only rank, bytes of its activations, how many take part, and why."""
+        """Return the prediction for a single rank.
+
+        Returns:
+            Prediction, bytes of activations, number of ranks, and no decision about ranks.
+        """
         rate, visits = self.probe.network.rate, self.visits
         turns = self.settings.views_per_step
         seconds, seconds_coarse = (
@@ -237,7 +253,11 @@ class _Deciding:
         return Prediction(seconds, seconds_coarse, 0), int(self.work.peak * self.probe.network.held_bytes), 1, None
 
     def _several_ranks(self) -> tuple[Prediction, int, int, Decision]:
-        """What is expected of the ranks that take part, bytes of each one's activations, how many they are, and why."""
+        """Choose the number of ranks, and return the prediction for it.
+
+        Returns:
+            Prediction, bytes of each rank's activations, number of ranks, and the decision about ranks.
+        """
         available, link = self.probe.machine.ranks, self.probe.link
         samples = [self._sampled(coarsest=True), self._sampled(coarsest=False)]
         phases = list(zip((self.base.steps_coarse, self.settings.steps_sos), samples, strict=True))
@@ -250,7 +270,7 @@ class _Deciding:
     def _expected(
         self, choice: RanksChoice, coarse: list[IterationWork], sos: list[IterationWork]
     ) -> tuple[Prediction, int]:
-        """Of the ranks that take part; those that form groups take a view each, at the same time."""
+        """Return the prediction for the ranks that take part; groups of ranks process one view each in parallel."""
         link, network = self.probe.link, self.probe.network
         groups = math.gcd(self.settings.views_per_step, choice.ranks)
         each, turns = choice.ranks // groups, self.settings.views_per_step // groups
@@ -261,7 +281,7 @@ class _Deciding:
 
         largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
         sharing = self.probe.machine.sharing
-        memory = self.activations * sharing / min(choice.ranks, sharing)  # of fewer ranks, each has more
+        memory = self.activations * sharing / min(choice.ranks, sharing)  # with fewer ranks, each has more
         activations = int(min(largest * (network.held_bytes + network.working_bytes), memory))
         expected = Prediction(
             mean(work.seconds(each, link, groups) for work in sos),
@@ -273,7 +293,7 @@ class _Deciding:
         return expected, activations
 
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:
-        """Iterations of some views, for the model of several ranks: of phase 1, or on all scales."""
+        """Return iterations of some views for the model of several ranks: of phase 1, or on all scales."""
         network, sharing = self.probe.network, self.probe.machine.sharing
         step = max(1, len(self.sizes) // SAMPLED_VIEWS)
         found = []

@@ -1,4 +1,4 @@
-"""The lines of a plan that people read: what was decided, and the evidence for it."""
+"""Plan lines for display: each decision with its evidence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ANOTHER_LOSS = "it is another loss than the paper's"
 
 
 def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
-    """Gaussians and spherical harmonics."""
+    """Return the lines about Gaussians and spherical harmonics."""
     scene = probe.scene
     pruned = int(pruned_gaussians(plan.survey, plan.seen).sum())
     unseen = int((~plan.seen).sum()) - pruned
@@ -100,7 +100,7 @@ def _of_sh_attenuation(probe: Probe, attenuation: float) -> Decision:
 
 
 def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_bytes: int) -> list[Decision]:
-    """Views and their pixels; content_bytes: what leaving out similar views saves."""
+    """Return the lines about views and their pixels. `content_bytes` is the memory saved by dropping similar views."""
     decisions = []
     total = len(probe.sizes)
     blind = total - len(plan.survey.covered)
@@ -140,7 +140,7 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
 
 
 def of_training_background(plan: Plan, settings: Settings, visits: Visits) -> list[Decision]:
-    """What is behind the Gaussians in a step, and what their colors begin with, where it is not the plain way."""
+    """Return the lines about the training background and the initial colors, unless they are the plain ones."""
     share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
     decisions = []
     if plan.training_background != "background":
@@ -176,7 +176,7 @@ def of_training_background(plan: Plan, settings: Settings, visits: Visits) -> li
 
 
 def of_colors(settings: Settings) -> list[Decision]:
-    """What becomes of the scene's colors, where they do not simply become the style's."""
+    """Return the line about color preservation, if luminance alone is stylized."""
     if settings.preserve_colors != "luminance":
         return []
     return [
@@ -190,7 +190,7 @@ def of_colors(settings: Settings) -> list[Decision]:
 
 
 def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -> list[Decision]:
-    """Layers, content, partition and forward passes; activations: bytes that they may take."""
+    """Return the lines about layers, content, partition and forward passes. `activations` is their budget in bytes."""
     layers = f"{probe.network.deepest}, the deepest one used"
     decisions = [Decision("network layers", f"none behind {layers}", "the loss reads no deeper one")]
     if settings.style_loss != "sos":
@@ -218,7 +218,7 @@ def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -
 
 
 def _of_style_loss(probe: Probe, settings: Settings, work: Work) -> Decision:
-    """Where features are matched with the style's."""
+    """Return the line about a style loss that matches features."""
     weight, network = NEAREST_WEIGHTS[settings.style_loss], probe.network
     what = "takes the place of the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
     return Decision(
@@ -231,7 +231,7 @@ def _of_style_loss(probe: Probe, settings: Settings, work: Work) -> Decision:
 
 
 def of_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
-    """Of several style pictures, how they are mixed."""
+    """Return the line about the mixture of several style images."""
     reason = f"{len(style.pictures)} pictures were given"
     if not has_statistics(settings.style_loss):
         reason += "; features are matched with those of all of them, whose weights count where there are too many"
@@ -239,11 +239,13 @@ def of_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
 
 
 def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
-    """What each region becomes, and what their maps take.
+    """Return the lines about the regions and the cost of their maps.
 
     Args:
-        asked: the regions as they were given.
-        resolved: as the views see them.
+        asked: Regions as requested.
+        resolved: Regions after `Regions.resolved`.
+        plan: Plan under construction.
+        cameras: Cameras of all views.
     """
     weights = plan.survey.total_blend_weights
     found = []
@@ -262,7 +264,7 @@ def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[
         elif place and place not in resolved.active:
             done = f"warning: left out, because no view sees its {int(own.sum()):,} Gaussians: they are of the rest"
         elif place not in resolved.active:
-            continue  # an empty rest
+            continue  # the rest is empty
         else:
             done = f"{what} take {region.style.text if region.style else 'the style'}"
             done += f", with weight {region.weight:g}" if region.weight != 1 else ""
@@ -281,7 +283,7 @@ def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[
 
 
 def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
-    """On a GPU, which rasterizer renders; on the CPU there is nothing to choose."""
+    """Return the line about the rasterizer on a GPU; on the CPU there is no choice."""
     if plan.device != "cuda":
         return []
     names = {"cuda": "gsplat", "triton": "Triton"}
@@ -295,7 +297,7 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
 
 
 def of_search(plan: Plan, passes: int) -> list[Decision]:
-    """On a GPU, how cuDNN chooses its algorithms; passes: of pictures of one size through the network."""
+    """Return the line about cuDNN's algorithms on a GPU. `passes` is the number of passes per image size."""
     if plan.device != "cuda":
         return []
     reason = f"pictures of one size go through the network about {passes:,} times"
@@ -305,12 +307,12 @@ def of_search(plan: Plan, passes: int) -> list[Decision]:
 
 
 def ranks_of_a_view(probe: Probe, settings: Settings) -> int:
-    """Ranks that evaluate a view together, if all take part."""
+    """Return the number of ranks that evaluate a view together if all take part."""
     return probe.machine.ranks // math.gcd(settings.views_per_step, probe.machine.ranks)
 
 
 def of_launches(probe: Probe, plan: Plan, settings: Settings, visits: int) -> list[Decision]:
-    """On a GPU, how the kernels of a view's loss are launched; visits: of views that share a graph."""
+    """Return the line about kernel launches on a GPU. `visits` is the number of visits of views that share a graph."""
     if plan.device != "cuda":
         return []
     launches, come = probe.launches, f"views of one size come about {visits:,} times"
@@ -335,7 +337,7 @@ def of_launches(probe: Probe, plan: Plan, settings: Settings, visits: int) -> li
 
 
 def _against_graphs(launches: LaunchCost) -> str:
-    """Graphs against single launches, as was measured."""
+    """Return the measured times of graphs and of single launches as text."""
     return (
         f"{1e3 * launches.replayed:.3g} ms a view were measured as a graph, {1e3 * launches.seconds:.3g} ms kernel by "
         f"kernel, {1e3 * launches.capture:.3g} ms to capture it"
@@ -343,7 +345,7 @@ def _against_graphs(launches: LaunchCost) -> str:
 
 
 def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) -> Decision:
-    """Whether blend weights are kept, in `budget` bytes."""
+    """Return the line about caching blend weights. `budget` is their memory in bytes."""
     raster = probe.raster
     if plan.cached_weights == "none":
         visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
@@ -375,7 +377,7 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
 
 
 def _why_not_on_a_gpu(raster: RasterCost, visits: str) -> str:
-    """Why no weights are kept there, as was measured."""
+    """Return the reason, from measurements, why no weights are cached on a GPU."""
     if raster.kept_seconds is None:
         return "those of one view do not fit"
     if raster.least_visits is None:
@@ -384,14 +386,14 @@ def _why_not_on_a_gpu(raster: RasterCost, visits: str) -> str:
 
 
 def _against(raster: RasterCost) -> str:
-    """Kept weights against new ones, as was measured."""
+    """Return the measured times of cached and of recomputed weights as text."""
     return (
         f"{1e3 * (raster.kept_seconds or 0):.3g} ms a view were measured, {1e3 * raster.seconds:.3g} ms computed anew"
     )
 
 
 def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[Decision]:
-    """Scales, of which the views have so many each, phase 1 and the end."""
+    """Return the lines about scales, phase 1 and early stopping. `counts` are the numbers of scales of the views."""
     decisions = []
     scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
     reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
@@ -435,7 +437,7 @@ def _of_scale_weights(settings: Settings, most: int) -> Decision:
 
 
 def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
-    """How many ranks take part."""
+    """Return the line about the number of ranks."""
     speed = f"{choice.speed_up:.2f} times as fast as one"
     measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
     if choice.ranks == available:
@@ -446,7 +448,7 @@ def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
 
 
 def of_precision(probe: Probe, settings: Settings) -> list[Decision]:
-    """The network's precision, where another one than float32 was asked for."""
+    """Return the line about the network's precision, unless float32 was requested."""
     asked, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
     if asked == "float32":
         return []

@@ -1,4 +1,4 @@
-"""What a whole job is expected to take: steps, first visits of views, and measuring, which is kept to its share."""
+"""Predicted time of a whole job: steps, first visits of views, and measurements within their budget."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.visits import RENDER, Visits
 from sgsst_core.settings import Settings
 
-#: From the last step to the last file: seconds in any case, for pictures and report, and for each Gaussian, whose
-#: neighbors are searched and which is written (measured at 4 million on two cores; a guess elsewhere).
+#: Time from the last step to the last file: constant seconds for images and report, and seconds per Gaussian for the
+#: neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
 ENDING_SECONDS = 1.5
 ENDING_SECONDS_A_GAUSSIAN = 4e-6
-#: Of them the search, which every moment takes where some Gaussians are unseen.
+#: Part of it for the search, which every moment repeats if some Gaussians are unseen.
 _NEIGHBORS_SECONDS_A_GAUSSIAN = 1.5e-6
-#: Renders that the depth of a novel view takes.
+#: Renders needed for the depth of a novel view.
 _DEPTH_RENDERS = 2
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What is measured beside the steps: `Plan.measuring` and `Plan.loss_views`."""
+    """Measurements outside the steps: `Plan.measuring` and `Plan.loss_views`."""
 
     level: int
     loss_views: int
@@ -43,13 +43,15 @@ class Measured:
 def whole_job(
     expected: Prediction, plan: Plan, probe: Probe, settings: Settings, *, work: Work, visits: Visits
 ) -> tuple[Prediction, Measured]:
-    """The prediction with what the whole job takes, and what is measured in it.
+    """Extend a prediction to the whole job, and choose its measurements.
 
     Args:
-        expected: of the steps.
-        plan: but for prediction and measuring.
-        work: of an iteration on all scales.
-        visits: what views cost beside it.
+        expected: Prediction for the steps.
+        plan: Plan, complete except for prediction and measurements.
+        probe: Measured facts.
+        settings: Settings of the job.
+        work: Work of an iteration on all scales.
+        visits: Additional costs of views.
     """
     expected = replace(
         expected,
@@ -65,7 +67,7 @@ def whole_job(
     once = RENDER * visits.rasterized() + visits.later(coarse=False) + work.evaluation(probe.network.rate)
     unvisited = max(1 - settings.steps_sos * settings.views_per_step / views, 0.0)
     price = 2 * once + unvisited * expected.first_visit
-    # A target is a share of the loss before: how long that takes must not decide where the job ends.
+    # A target is relative to the loss before: how long that takes must not determine where the job ends.
     share = settings.measure
     loss_views = min(LOSS_VIEWS[0], views) if settings.target_loss else choose_loss_views(share, steps, price, views)
     ending = ENDING_SECONDS + ENDING_SECONDS_A_GAUSSIAN * probe.scene.gaussians
@@ -77,7 +79,7 @@ def whole_job(
 
 
 def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> float:
-    """Of all steps with their first visits and the style."""
+    """Return the seconds of all steps, including first visits and style."""
     phases = (
         (plan.steps_coarse, expected.seconds_coarse, expected.first_visit_coarse),
         (settings.steps_sos, expected.seconds, expected.first_visit),
@@ -90,7 +92,7 @@ def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> floa
 
 
 def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, work: Work) -> Prices:
-    """What novel views are expected to cost; they lie between the job's, and are taken to be like them."""
+    """Return the expected costs of novel views, assuming that they are like the job's views, between which they lie."""
     raster, forward = probe.raster, work.pixels * probe.network.rate.forward
     render = RENDER * raster.seconds
     pruned = bool(pruned_gaussians(plan.survey, plan.seen).any())
@@ -105,7 +107,7 @@ def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, 
 
 
 def of_measuring(plan: Plan, expected: Prediction, settings: Settings) -> Decision:
-    """The line that says what is measured beside the steps, and what it costs."""
+    """Return the plan's line about measurements outside the steps and their cost."""
     steps = expected.job - expected.measuring
     cost = f"about {expected.measuring:.2g} s beside {steps:.3g} s of steps"
     losses = f"the loss before and after on {_count(plan.loss_views, 'view')}"

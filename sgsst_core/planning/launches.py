@@ -1,4 +1,4 @@
-"""What it takes to launch the kernels of a view's loss: one by one, or as a captured graph."""
+"""Measurement of the kernel launches of a view's loss: one by one, and as a CUDA graph."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sgsst_core.planning.cost import LaunchCost
 from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.timing import Timer
 
-#: Of which the fastest counts: whatever else the machine does makes launches slower only.
+#: Number of runs, of which the fastest counts, because other activity on the machine only makes launches slower.
 RUNS = 3
 
 
 def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
-    """Time the loss of a made-up view of a size (height, width), with its gradient, in both ways."""
+    """Time the loss of a synthetic view of size (height, width), with its gradient, in both ways."""
     if not has_graphs(loss.network.device):
         return LaunchCost(problem="only NVIDIA GPUs are known to replay them")
     picture = soft_picture(max(size))[: size[0], : size[1]].contiguous().to(loss.network.device)
@@ -27,7 +27,7 @@ def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
     def evaluate() -> SosResult:
         return graphs.evaluate(picture, style, view, scales)
 
-    evaluate()  # as ever, for the first time: it prepares what kernels need
+    evaluate()  # eager first run: warms up the kernels
     seconds = min(_seconds(loss, lambda: loss.evaluate(picture, style, view, scales)) for _ in range(RUNS))
     first = _seconds(loss, evaluate)
     if graphs.problem is not None:

@@ -1,8 +1,9 @@
-"""Which Gaussians masks of some views show: each votes by its blend weights.
+"""Selection of Gaussians by image masks: each Gaussian votes with its blend weights.
 
-A Gaussian's share is that part of its blend weights in the masked views that lies where masks are white. Most are in or
-out by a wide margin; those between, of which views disagree, follow the majority of their neighbors, and so do those
-that no masked view shows: a border runs between Gaussians, not through a cloud of single votes.
+The vote of a Gaussian is the fraction of its blend weights in the masked views that lies where masks are white. Most
+are inside or outside by a wide margin. Undecided ones, on which views disagree, follow the majority of their neighbors,
+and so do those that no masked view shows. A border therefore runs between Gaussians, not through a cloud of single
+votes.
 """
 
 from __future__ import annotations
@@ -16,26 +17,27 @@ from torch import Tensor
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 
-#: A Gaussian of more than the first share of votes is in, of less than the second out.
+#: A Gaussian is inside if its vote is above the first value, and outside if it is below the second.
 IN, OUT = 0.6, 0.4
-#: Neighbors that decide about a Gaussian between, or not shown.
+#: Number of neighbors that decide about an undecided or invisible Gaussian.
 NEIGHBORS = 8
 
 
 def count_votes(
     rasterizer: Rasterizer, cameras: Sequence[Camera], masks: Sequence[Callable[[], Tensor]], gaussians: int
 ) -> tuple[Tensor, Tensor]:
-    """Blend weights that lie where masks are white, and all in the masked views: [N], [N] float64.
+    """Return each Gaussian's blend weights where masks are white, and in all masked views: [N], [N] float64.
 
     Args:
-        rasterizer: of a scene of so many Gaussians.
-        cameras: of the masked views.
-        masks: load the mask [H, W] in 0..1 of each.
+        rasterizer: Rasterizer of the scene.
+        cameras: Cameras of the masked views.
+        masks: Functions that load the mask [H, W] in 0..1 of each view.
+        gaussians: N, number of Gaussians of the scene.
     """
     inside, total = (torch.zeros(gaussians, dtype=torch.float64) for _ in range(2))
     for camera, load in zip(cameras, masks, strict=True):
         mask = load().to(rasterizer.device, rasterizer.dtype)
-        # The gradient of a rendered color is what a Gaussian contributes to it: the transpose of blending.
+        # The gradient of a rendered color is the contribution of each Gaussian to it: the transpose of blending.
         votes = rasterizer.color_gradient(torch.stack([mask, torch.ones_like(mask), mask], dim=2), camera).cpu()
         inside += votes[:, 0].double()
         total += votes[:, 1].double()
@@ -43,9 +45,14 @@ def count_votes(
 
 
 def decide_by_votes(means: Tensor, inside: Tensor, total: Tensor) -> Tensor:
-    """[N] bool, which Gaussians at means [N, 3] are in, by votes [N] of `count_votes`.
+    """Return which Gaussians are inside, [N] bool.
 
-    Where nothing is decided by a margin, the larger share is; what nothing is known of is out.
+    If no Gaussian is decided by a margin, the larger fraction counts. Gaussians without votes or neighbors are outside.
+
+    Args:
+        means: [N, 3].
+        inside: [N], blend weights where masks are white, from `count_votes`.
+        total: [N], all blend weights in the masked views.
     """
     share = inside / torch.where(total > 0, total, 1.0)
     shown = total > 0

@@ -1,10 +1,10 @@
-"""What a job measures beside its steps, so that it takes no more than a share of the job's time.
+"""Choice of measurements outside the steps, such that they take only a given fraction of the job's time.
 
-The loss before and after is taken on some of the job's views; novel views are measured at moments of a run. Half of
-what is allowed goes to the loss at most, and its views are fewer where they would take more. What it leaves is for
-novel views: they and their moments become fewer from level to level (`LEVELS`). The plan takes the first level whose
-expected seconds are allowed; the first view that is really measured says whether a later level is needed
-(`quality.measure`). Nothing is measured before the first step, and nothing changes a color.
+The loss before and after is evaluated on some of the job's views; novel views are measured at certain moments of a run.
+The loss gets at most half of the time allowed, on fewer views if necessary. The rest is for novel views, whose number
+and moments decrease from level to level (`LEVELS`). The plan takes the first level whose predicted time is allowed. The
+first novel view that is measured shows whether a later level is needed (`quality.measure`). Nothing is measured before
+the first step, and measurements never change a color.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from dataclasses import dataclass
 
 from sgsst_core.planning.plan import Prediction
 
-#: So many seconds are always allowed, so that short jobs are measured too: of those whose steps take less than five
-#: minutes, they may be more than a tenth.
+#: Seconds that are always allowed, so that short jobs are measured too. If the steps take less than five minutes, this
+#: may be more than a tenth of them.
 LEAST_ALLOWED = 30.0
-#: Prices are right within a fifth or so: what is planned takes no more than this share of what is allowed.
+#: Planned measurements may use this fraction of the time allowed, because predictions are accurate to about a fifth.
 _PLANNED = 0.8
-#: Views on which the loss is taken before and after: the most of these that half of the allowed seconds pay for. One is
-#: taken whatever it costs, because a job that cannot say what it has reached is worth little.
+#: Candidate numbers of views for the loss before and after; the largest that half of the time allowed covers is used.
+#: At least one view is always evaluated, because a job that cannot report what it has achieved is of little use.
 LOSS_VIEWS = (4, 2, 1)
-#: Novel views of a `Level.views` that are rendered: one for the Gram distance, the others of its pairs.
+#: Novel views rendered per view of a `Level`: one for the Gram distance, the others for its pairs.
 RENDERED = 4
 
 
 @dataclass(frozen=True)
 class Level:
-    """How much is measured.
+    """Amount of measurements.
 
     Attributes:
-        views: whose Gram distance is measured, and pairs of each range that are compared, at most.
-        halvings: h for each moment, after total / 2^h steps; 0 is the end.
-        start: the unstylized scene is measured too, when the first of the other moments comes.
+        views: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
+        halvings: Exponents h of the moments, each after total / 2^h steps; 0 is the end.
+        start: Whether to measure the unstylized scene too, together with the first of the other moments.
     """
 
     views: int
@@ -40,12 +40,12 @@ class Level:
     start: bool = True
 
     def moments(self, total: int) -> list[int]:
-        """Steps after which a run of `total` is measured."""
+        """Return the steps after which a run of `total` steps is measured."""
         later = {total >> halvings for halvings in self.halvings if total >> halvings}
         return sorted({0, *later} if self.start else later)
 
 
-#: From all to nothing; the last but one is the end alone.
+#: From everything to nothing; the last but one measures only the end.
 LEVELS = (
     Level(4, (0, 1, 2, 3, 4, 5)),
     Level(4, (0, 2, 4)),
@@ -55,18 +55,18 @@ LEVELS = (
     Level(1, (0,), start=False),
     Level(0, (), start=False),
 )
-#: Place of the level without any novel view.
+#: Index of the level without novel views.
 NOTHING = len(LEVELS) - 1
 
 
 @dataclass(frozen=True)
 class Prices:
-    """Seconds of measuring.
+    """Seconds of measurements.
 
     Attributes:
-        setup: once, for each of `Level.views`: the poses' surroundings, depth and warps.
-        view: at each moment, for each of them; and once more, to judge them at the end.
-        moment: at each moment beside them: the gradient against the exact one.
+        setup: Seconds once per view of `Level.views`, for neighboring poses, depth and warps.
+        view: Seconds per view and moment, and once more for evaluating the views at the end.
+        moment: Additional seconds per moment, for comparing the gradient with the exact one.
     """
 
     setup: float
@@ -74,41 +74,47 @@ class Prices:
     moment: float = 0.0
 
     def again(self, level: Level) -> float:
-        """Of a moment after the first."""
+        """Return the seconds of a moment after the first."""
         return level.views * self.view + self.moment
 
     def of(self, level: Level, moments: int) -> float:
-        """Of so many moments, and of judging the last one."""
+        """Return the seconds of this many moments, including the evaluation of the last one."""
         return level.views * (self.setup + self.view) + moments * self.again(level)
 
 
 def allowed_seconds(share: float, steps: float) -> float:
-    """Seconds that all measuring may take beside so many seconds of steps."""
+    """Return the seconds that all measurements may take, given the seconds of the steps."""
     return max(LEAST_ALLOWED, share * steps)
 
 
 def novel_view_seconds(share: float, expected: Prediction) -> float:
-    """Seconds that novel views may take: what the loss before and after leaves; none without a share."""
+    """Return the seconds that novel views may take: what the loss before and after leaves; 0 if `share` is 0."""
     if not share:
         return 0.0
     return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)
 
 
 def choose_loss_views(share: float, steps: float, price: float, views: int) -> int:
-    """On how many of a job's `views` the loss is taken before and after, beside so many seconds of steps.
+    """Choose the number of views on which the loss is evaluated before and after.
 
     Args:
-        price: seconds of both losses of a view.
+        share: Fraction of the steps' time allowed for measurements.
+        steps: Seconds of all steps.
+        price: Seconds of both losses of one view.
+        views: Number of views of the job.
     """
     half = _PLANNED * allowed_seconds(share, steps) / 2
     return min(next((count for count in LOSS_VIEWS if min(count, views) * price <= half), LOSS_VIEWS[-1]), views)
 
 
 def choose_level(prices: Prices, allowed: float, total: int, first: int = 0) -> int:
-    """Place in `LEVELS`, from `first` on, of the first one that takes no more than `allowed` seconds.
+    """Return the index in `LEVELS` of the first level, from `first` on, that takes at most `allowed` seconds.
 
     Args:
-        total: steps of the run.
+        prices: Seconds of measurements.
+        allowed: Seconds allowed.
+        total: Number of steps of the run.
+        first: Index of the first level to consider.
     """
     for place in range(first, NOTHING):
         if prices.of(LEVELS[place], len(LEVELS[place].moments(total))) <= allowed:

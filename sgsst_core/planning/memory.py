@@ -1,4 +1,4 @@
-"""The most memory that a rank of a job will hold: what it keeps to the end, and the largest of what comes and goes."""
+"""Prediction of a rank's peak memory: what it holds until the end, plus the largest of its temporary allocations."""
 
 from __future__ import annotations
 
@@ -12,28 +12,32 @@ from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.visits import COLOR_BYTES, Visits
 from sgsst_core.settings import Settings
 
-#: What measuring between steps and the report take beside the iterations and lists: libraries, LPIPS, pictures.
+#: Memory of measurements and report, apart from iterations and tile intersections: libraries, LPIPS, images.
 MEASURING_BYTES = 100 << 20
-#: Bytes of each Gaussian of a scene that is projected: of its shape, kept between views, and of its projection, its
-#: depth and their order while a view's lists are built.
+#: Bytes per Gaussian of a projected scene: for its shape, cached between views, and for its projection, depth and order
+#: while the tile intersections of a view are computed.
 SHAPE_BYTES, BUILDING_BYTES = 32, 104
-#: Of each Gaussian while neighbors of unseen ones are searched: the result, its difference, positions, their tree.
+#: Bytes per Gaussian during the neighbor search for unseen ones: result, its difference, positions, and search tree.
 SEARCH_BYTES = 120
-#: Of a view's lists, what gradients of their entries take in a rasterizer's backward pass.
+#: Memory of the entries' gradients in a rasterizer's backward pass, as a fraction of a view's tile intersections.
 SLOTS_SHARE = 0.25
-#: Of a pixel of a novel view: its coverage, and the two warps that lead to or from it.
+#: Bytes per pixel of a novel view: its coverage, and its two warps.
 _COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
 
 
 @dataclass(frozen=True)
 class PeakMemory:
-    """What follows for memory from a plan, as far as it is made.
+    """Memory that follows from a plan under construction.
 
     Attributes:
-        level: how much is measured beside the steps, a place in `LEVELS`; None where nothing is.
-        loss_views: on which the loss is taken before and after.
-        activations: bytes that are held at a time in an iteration.
-        matching: bytes that it takes to match features with the style's.
+        plan: Plan under construction.
+        probe: Measured facts.
+        settings: Settings of the job.
+        visits: Data that are computed per view.
+        level: Level of measurements as an index into `LEVELS`; None if nothing is measured.
+        loss_views: Number of views on which the loss is evaluated before and after.
+        activations: Peak size of activations in an iteration in bytes.
+        matching: Memory for matching features with the style's, in bytes.
     """
 
     plan: Plan
@@ -46,13 +50,14 @@ class PeakMemory:
     matching: int
 
     def bytes(self) -> tuple[int, int | None]:
-        """Of a rank: of its process, and of its GPU, which holds what is computed with; None where a CPU computes.
+        """Return the peak memory of a rank's process and of its GPU, which holds the operands; None on a CPU.
 
-        What grows with the Gaussians is counted where a CPU computes; a GPU's share of it is small beside its tensors.
+        Data that grow with the number of Gaussians are counted on a CPU; on a GPU they are small compared to its
+        tensors.
         """
         probe, gaussians = self.probe, int(self.plan.seen.sum())
         measuring = 0 if self.level is None else MEASURING_BYTES
-        # What a graph computes with is its own: the same work without it has a place beside it.
+        # The memory of a graph is exclusive: the same work without the graph must fit beside it.
         passing = image_bytes(probe.sizes) + self.activations * (2 if self.plan.graphs else 1) + self.matching
         if probe.machine.device != "cpu":
             computing = passing + self._content() + self._weights()
@@ -71,7 +76,7 @@ class PeakMemory:
         return self.probe.machine.ranks
 
     def _visited(self, steps: int) -> float:
-        """Share of the views that so many steps come to, and the loss before and after."""
+        """Return the fraction of views visited by this many steps and by the loss before and after."""
         looked_at = self.loss_views if self.level is not None else 0
         return min((steps * self.settings.views_per_step + looked_at) / len(self.plan.covered), 1.0)
 
@@ -80,9 +85,9 @@ class PeakMemory:
         return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
 
     def _content(self) -> int:
-        """Content features: of the coarsest scale from phase 1 on, of all of them from phase 2 on; or their images.
+        """Return the bytes of content features: the coarsest scale's from phase 1 on, all of them from phase 2 on.
 
-        Maps of regions are counted here, too.
+        Content images, if they are cached instead, and maps of regions are included.
         """
         content, coarse = self.visits.content, self.visits.content_coarse
         whole = self._visited(self.settings.steps_sos)
@@ -101,24 +106,24 @@ class PeakMemory:
         return int(min(self._all_visited * colors.bytes, colors.room))
 
     def _lists_and_weights(self) -> int:
-        """What they take beside the lists that the survey has kept, all in one budget."""
+        """Return the bytes of weights and tile intersections beyond those cached by the survey; both share a budget."""
         memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
         room = int(memory * MEMORY_SHARES["rasterizer"]) - weights
         lists = visits.lists.bytes + self._other_lists()
-        if visits.weights is not None:  # a view's lists go when its weights are there
+        if visits.weights is not None:  # the tile intersections of a view are dropped once its weights are cached
             room = max(room, memory // LISTS_BESIDE_WEIGHTS)
             lists -= visits.weights.kept * self._all_visited * visits.lists.bytes
         return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
 
     def _other_lists(self) -> int:
-        """Lists of novel views, and of the exact twin where it has a scene of its own."""
+        """Return the bytes of tile intersections of novel views, and of the reference if it has its own scene."""
         views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
         if self.level is not None and self._pruned():
             views += self.loss_views
         return views * self.probe.raster.lists_bytes
 
     def _scene(self) -> int:
-        """Copies of some of the scene's Gaussians, and the shapes of those whose lists are built."""
+        """Return the bytes of partial copies of the scene, and of the shapes needed to compute tile intersections."""
         probe, gaussians, everything = self.probe, int(self.plan.seen.sum()), self.probe.scene.gaussians
         each = gaussian_bytes(probe.scene.held_degree)
         copies = 0
@@ -131,7 +136,7 @@ class PeakMemory:
         return copies
 
     def _novel_views(self) -> int:
-        """What is kept of novel views beside their lists, and of the exact twin's views."""
+        """Return the bytes cached for novel views and for the reference's views, without tile intersections."""
         if self.level is None:
             return 0
         memory, kept = measuring_memory(self.probe.machine.memory), 0
@@ -149,14 +154,14 @@ class PeakMemory:
         return kept
 
     def _exact_activations(self) -> int:
-        """What activations of the exact twin take beside the job's."""
+        """Return the bytes that the reference's activations take beyond the job's."""
         if self.level is None or not self._approximated():
             return 0
         budget = int(self.probe.machine.memory * MEMORY_SHARES["activations"])
         return max(min(int(self.activations * self._exact_size()), budget) - self.activations, 0)
 
     def _exact_size(self) -> float:
-        """Bytes of a value of the exact twin's network, in those of the job's."""
+        """Return the size of a value in the reference's network relative to the job's."""
         return 2.0 if self.plan.precision == "bfloat16" else 1.0
 
     def _pruned(self) -> bool:

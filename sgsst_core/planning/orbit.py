@@ -1,4 +1,4 @@
-"""An orbit around a scene: which way is up, and rings of cameras as far as they show more of its surface."""
+"""Choice of an orbit around a scene: the up direction, and rings of cameras as far as they show more of its surface."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ from sgsst_core.scene.orbit import ELEVATION, middle_of, orbit
 from sgsst_core.scene.subject import Subject, find_subject
 from sgsst_core.scene.up import Up, find_up
 
-#: Elevations, degrees, of the rings that may be added to the first; those from below to a subject by itself, that
-#: neither a ground nor a room is under.
+#: Elevations in degrees of rings that may be added to the first. Those from below are only for an isolated subject,
+#: with neither ground nor room beneath it.
 _ABOVE, _BELOW = (40.0, 70.0), (-20.0,)
-#: A ring is added where it shows so much more of the surface.
+#: Minimum fraction of the surface that a ring must add.
 _LITTLE = 0.03
-#: Views of a level ring whose number is left to need: 49 with all rings.
+#: Default number of views of a level ring; 49 views with all rings.
 _AROUND = 16
-#: Views of a ring, at least, where there are several.
+#: Minimum number of views per ring if there are several rings.
 _LEAST_VIEWS = 6
-#: What is seen at so much of the area at which it can be seen best (a surface turned by 45 degrees) is seen.
+#: Fraction of the best visible area at which a surface counts as fully seen (rotated by 45 degrees).
 _ENOUGH = 0.7
-#: What is seen at less than this share of its own area lies inside, and how much may do so without a word.
+#: A surface seen at less than this fraction of its area is inside; maximum fraction of such surfaces without a warning.
 _HARDLY, _INSIDE = 0.02, 0.3
-#: Trial views: of a level ring, their resolution, and Gaussians that are looked at.
+#: Trial views: number in a level ring, resolution, and number of sampled Gaussians.
 _TRIALS, _TRIAL_SIDE, _TRIAL_GAUSSIANS = 8, 160, 50_000
-#: A view of which less shows the subject is one of what stands before it.
+#: If the subject makes up less than this fraction of a view, other things hide it.
 _SHOWS = 0.7
-#: Share of a scene that may lie outside its subject without a word.
+#: Maximum fraction of a scene outside its subject without a warning.
 _OUTSIDE = 0.03
 
 
 @dataclass(frozen=True)
 class OrbitRequest:
-    """What is asked of an orbit; None leaves it to the scene.
+    """Requested properties of an orbit; None leaves them to the scene.
 
     Attributes:
-        count: of views.
-        up: [3] world direction.
-        elevation: of its one ring, degrees.
-        radius: distance of the cameras from the middle, world units.
-        near: near plane, world units.
+        count: Number of views.
+        up: [3], world direction of up.
+        elevation: Elevation of its single ring in degrees.
+        radius: Distance of the cameras from the center in world units.
+        near: Near plane in world units.
     """
 
     count: int | None = None
@@ -61,19 +61,19 @@ class OrbitRequest:
 
 @dataclass(frozen=True)
 class Orbit:
-    """An orbit's cameras, and why they are these.
+    """Cameras of an orbit, and the reasons for their choice.
 
     Attributes:
-        cameras: ring by ring.
-        up: which way is up, and why.
-        elevations: of the rings, degrees.
-        radius: distance of the cameras from the subject's middle, world units.
-        tried: elevations that were tried.
-        shown: share of the surface that the rings show, of what all that were tried would.
-        next: what the best of the other rings would add to it; None where there is none.
-        outside: share of the scene that is no part of the subject.
-        hidden: share of the trial views that show more of other things than they may.
-        inside: share of the surface that none of the trial views shows.
+        cameras: Cameras, ring by ring.
+        up: Up direction with its reason.
+        elevations: Elevations of the rings in degrees.
+        radius: Distance of the cameras from the center of the subject in world units.
+        tried: Elevations that were tried.
+        shown: Surface that the rings show, as a fraction of what all tried rings would show.
+        next: Fraction that the best remaining ring would add; None if there is none.
+        outside: Fraction of the scene that is not part of the subject.
+        hidden: Fraction of the trial views in which other things hide the subject too much.
+        inside: Fraction of the surface that no trial view shows.
     """
 
     cameras: list[Camera]
@@ -89,10 +89,10 @@ class Orbit:
 
 
 def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
-    """The orbit that was asked for, and the rest of it by need.
+    """Create the requested orbit, and choose everything that was not specified.
 
     Raises:
-        SettingsError: see `scene.orbit.orbit`.
+        SettingsError: If an option is out of range; see `scene.orbit.orbit`.
     """
     subject = find_subject(scene)
     up = find_up(subject) if request.up is None else _asked_up(request.up)
@@ -127,11 +127,12 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
 
 
 def orbit_decisions(made: Orbit, cameras: Sequence[Camera], looked: Survey) -> list[Decision]:
-    """What was decided about an orbit, for the plan.
+    """Return the plan's lines about an orbit.
 
     Args:
-        cameras: as they are stylized, in their sizes.
-        looked: what they show.
+        made: The orbit.
+        cameras: Its cameras at the sizes used for stylization.
+        looked: Survey of their views.
     """
     decisions = [Decision("up", made.up.name, made.up.reason)]
     angles = _listed([f"{angle:g}" for angle in made.elevations])
@@ -156,7 +157,7 @@ def orbit_decisions(made: Orbit, cameras: Sequence[Camera], looked: Survey) -> l
 
 
 def _doubts(made: Orbit) -> list[Decision]:
-    """What speaks against an orbit around this scene."""
+    """Return warnings about reasons against an orbit around this scene."""
     found = []
     better = "cameras of its capture (--cameras) would show it better"
     if made.outside > _OUTSIDE:
@@ -182,11 +183,11 @@ def _listed(words: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class _Ring:
-    """What the trial views of a ring show.
+    """Result of the trial views of a ring.
 
     Attributes:
-        areas: [n], of each Gaussian the largest area that one of them shows, in world units.
-        subject: for each view that shows anything, the share of that which is the subject.
+        areas: [n], largest area of each Gaussian that one of the views shows, in squared world units.
+        subject: For each view that shows anything, the fraction of it that is the subject.
     """
 
     areas: Tensor
@@ -194,7 +195,7 @@ class _Ring:
 
 
 class _Trial:
-    """Small views of a scene, or of some of its Gaussians enlarged, that tell what rings show."""
+    """Small views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
 
     def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest) -> None:
         self._subject, self._up, self._request = subject, up, request
@@ -204,19 +205,19 @@ class _Trial:
         self._framed = subject.holds(self._scene.means)
 
     def cameras(self, count: int, elevations: Sequence[float]) -> list[Camera]:
-        """Those of the orbit with these rings."""
+        """Return the cameras of the orbit with these rings."""
         axis, request = self._up.direction.tolist(), self._request
         return orbit(self._subject, count, up=axis, elevations=elevations, radius=request.radius, near=request.near)
 
     def share_inside(self, areas: Sequence[Tensor]) -> float:
-        """How much of the surface is hidden from all rings, of which each shows some areas [n]."""
+        """Return the fraction of the surface that is hidden from all rings, given the areas [n] that each shows."""
         lengths = self._scene.scales.double().clamp(-60, 60).exp().sort(dim=1).values
         own = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
         shown = torch.stack(list(areas)).amax(0)
         return float(own[shown < _HARDLY * own].sum() / own.sum().clamp_min(1e-300))
 
     def of_ring(self, elevation: float) -> _Ring:
-        """What a ring shows."""
+        """Render the trial views of a ring."""
         count = max(4, round(_TRIALS * math.cos(math.radians(elevation))))
         areas = torch.zeros(len(self._scene), dtype=torch.float64)
         subject = []
@@ -224,7 +225,7 @@ class _Trial:
             small = resized(camera, _TRIAL_SIDE)
             weights = self._rasterizer.survey(small)[1].double()
             depths = self._scene.means.double() @ small.world_to_camera[2, :3] + small.world_to_camera[2, 3]
-            # a pixel shows so much area at a depth, across the view
+            # area of a pixel at this depth, perpendicular to the view
             shown = weights * (depths / small.fx) ** 2
             areas = torch.maximum(areas, shown)
             if float(shown.sum()) > 0:
@@ -233,18 +234,17 @@ class _Trial:
 
 
 def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float | None]:
-    """Which rings show the surface: the first, then the one that adds most, until the next would add little.
+    """Choose rings: the first, then repeatedly the one that adds most of the surface, until it would add little.
 
-    Rings' share of the surface is the sum over all Gaussians of the largest area [n] that one of their views shows,
-    over that of the views of all rings. What is seen from the side counts for as much as is seen of it, and for all
-    from `_ENOUGH` on.
+    The surface of a set of rings is the sum over all Gaussians of the largest area [n] that one of their views shows,
+    relative to that of all rings. A Gaussian seen from the side counts in proportion, and fully from `_ENOUGH` on.
 
     Args:
-        areas: of each ring.
-        most: of the rings to choose.
+        areas: Areas [n] for each ring.
+        most: Maximum number of rings to choose.
 
     Returns:
-        The rings chosen, in the order of `areas`; the share that they show; what the best of the others would add.
+        Chosen rings in the order of `areas`, fraction of the surface that they show, and what the best other would add.
     """
     best_of_all = torch.stack(list(areas)).amax(0)
     areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]

@@ -1,4 +1,4 @@
-"""Pictures for measuring, where the job's own are not at hand."""
+"""Synthetic images for measurements, for use when the job's own are not available."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def soft_picture(side: int) -> Tensor:
-    """Random colors 16 pixels apart and all between them, [side, side, 3] in 0..1, always the same ones."""
+    """Return a smooth image [side, side, 3] in 0..1: fixed random colors 16 pixels apart, interpolated."""
     cells = torch.rand((1, 3, side // 16 + 1, side // 16 + 1), generator=torch.Generator().manual_seed(0))
     picture = torch.nn.functional.interpolate(cells, size=(side, side), mode="bilinear")[0]
     return picture.permute(1, 2, 0).contiguous()

@@ -1,4 +1,4 @@
-"""What was decided for a scene before the first iteration, for people and for the stylizer that follows it."""
+"""Plan of a job: what was decided before the first iteration, for users and for the stylizer that follows it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Decision:
     """One line of a plan.
 
     Attributes:
-        item: what was looked at.
-        decision: what was decided.
-        reason: the evidence.
-        seconds: saved in every iteration, estimated; None where that is not known.
-        bytes: of memory saved; None likewise.
-        error: what it may cost in accuracy; "none" for what changes no result beyond rounding.
+        item: Subject of the decision.
+        decision: What was decided.
+        reason: Evidence for it.
+        seconds: Estimated seconds saved per iteration; None if unknown.
+        bytes: Memory saved in bytes; None if unknown.
+        error: Possible cost in accuracy; "none" if results change only by rounding.
     """
 
     item: str
@@ -38,23 +38,23 @@ class Decision:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the plan expects, mean over views.
+    """Predicted values of a job; per-iteration values are means over views.
 
     Attributes:
-        seconds: of an SOS iteration.
-        seconds_coarse: of an iteration of phase 1.
-        peak_bytes: of physical memory of a rank, at any time.
-        communication: seconds of an SOS iteration in which a rank waits for what others send.
-        seconds_one_rank: of an SOS iteration on one rank; None where there is only one.
-        device_bytes: of a GPU's memory, at any time; None where a CPU computes.
-        first_visit: seconds that a view's first visit in phase 2 takes beside those of an iteration.
-        first_visit_coarse: the same in phase 1.
-        style: seconds that the style's statistics take in the first step; the style is taken to be as large as a view.
-        evaluation: seconds of the loss on the evaluation views, once they have been visited.
-        losses: seconds of the loss before and after, with first visits of views that no step has visited.
-        measuring: seconds of all that is measured beside the steps.
-        job: seconds of all steps, with first visits and the style, and of measuring.
-        ending: seconds from the last step to the last file, beside measuring.
+        seconds: Seconds per SOS iteration.
+        seconds_coarse: Seconds per iteration of phase 1.
+        peak_bytes: Peak physical memory of a rank.
+        communication: Seconds per SOS iteration that a rank spends waiting for data from others.
+        seconds_one_rank: Seconds per SOS iteration on a single rank; None if there is only one.
+        device_bytes: Peak GPU memory; None on a CPU.
+        first_visit: Additional seconds of a view's first visit in phase 2.
+        first_visit_coarse: Additional seconds of a view's first visit in phase 1.
+        style: Seconds for the style's statistics in the first step, assuming a style as large as a view.
+        evaluation: Seconds for the loss on the evaluation views once they have been visited.
+        losses: Seconds for the loss before and after, including first visits of views that no step has visited.
+        measuring: Seconds for all measurements outside the steps.
+        job: Seconds for all steps, with first visits, style and measurements.
+        ending: Seconds from the last step to the last file, except for measurements.
     """
 
     seconds: float
@@ -75,33 +75,33 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Plan:
-    """What was decided for a scene. Nothing changes it afterwards.
+    """Decisions for a scene. They are final.
 
     Attributes:
-        survey: what the views show.
-        optimized: [N] bool, Gaussians whose colors the views decide.
+        survey: Survey of the views.
+        optimized: [N] bool, Gaussians whose colors are determined by the views.
         seen: [N] bool, Gaussians that are rendered: the optimized ones, or all for comparison.
-        covered: indices of the views that are stylized.
-        weighted: statistics are weighted by coverage.
-        training_background: what is behind the Gaussians in a step.
-        warm_start: the job begins with the style's colors.
-        steps_coarse: of phase 1; 0 where it is left out.
-        memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
-        device: on which the feature network computes.
-        rasterizer: that renders; "cached" keeps blend weights in the form `cached_weights`.
-        uncached: rasterizer that computes blend weights, and every time those that are not kept.
-        precision: of the feature network.
-        search: cuDNN tries its algorithms before it chooses (`FeatureNetwork.search`).
-        graphs: a view's loss is captured as a graph where it can be (`LossGraphs`).
-        cached_weights: in which form blend weights are kept between iterations.
-        coarse_weights: phase 1 keeps the weights of the coarsest scale only.
-        measured: the prediction counts what measuring between steps and the report take.
-        measuring: what is measured between steps, at most: place in `measuring.LEVELS`.
-        loss_views: on how many views the loss is taken before and after.
-        ranks: how many take part.
-        refinement: of the scene that was read, into that of which the plan tells; None where it is the same.
-        decisions: for people.
-        prediction: for comparison with what happens.
+        covered: Indices of the views that are stylized.
+        weighted: Whether statistics are weighted by coverage.
+        training_background: Background of the Gaussians in a step.
+        warm_start: Whether the job starts with the style's colors.
+        steps_coarse: Steps of phase 1; 0 if it is skipped.
+        memory_limit: Memory budget in bytes of all ranks on one machine together.
+        device: Device of the feature network.
+        rasterizer: Rasterizer of the job; "cached" stores blend weights in the format `cached_weights`.
+        uncached: Rasterizer that computes blend weights, and recomputes those that are not cached.
+        precision: Precision of the feature network.
+        search: Whether cuDNN benchmarks its algorithms first (`FeatureNetwork.search`).
+        graphs: Whether the loss of a view is captured as a CUDA graph where possible (`LossGraphs`).
+        cached_weights: Format of blend weights that are cached between iterations.
+        coarse_weights: Whether phase 1 caches only the weights of the coarsest scale.
+        measured: Whether the prediction includes measurements between steps and the report.
+        measuring: Maximum level of measurements between steps, as an index into `measuring.LEVELS`.
+        loss_views: Number of views on which the loss is evaluated before and after.
+        ranks: Number of ranks that take part.
+        refinement: Refinement that turned the input scene into the one planned for; None if they are the same.
+        decisions: Decisions for display.
+        prediction: Predicted values, for comparison with the measured ones.
     """
 
     survey: Survey
@@ -130,7 +130,7 @@ class Plan:
     prediction: Prediction | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return decisions and prediction in a JSON-serializable form."""
         return {
             "decisions": [asdict(decision) for decision in self.decisions],
             "prediction": asdict(self.prediction) if self.prediction else None,

@@ -1,4 +1,4 @@
-"""From inputs to a plan: look at every view, measure, decide."""
+"""Planner: survey all views, measure, and decide."""
 
 from __future__ import annotations
 
@@ -45,30 +45,32 @@ def make_plan(
     regions: Regions | None = None,
     refinement: Refinement | None = None,
 ) -> tuple[Plan, PlanningContext]:
-    """Plan a job. Every rank calls this with the same arguments, and gets the same plan.
+    """Plan a job. Every rank must call this with the same arguments, and gets the same plan.
 
     Args:
-        scene: as it was refined, where it was.
-        cameras: larger ones are brought down to `settings.max_resolution`.
-        weights: of the feature network; None loads VGG19, or VGG16 where only that is installed.
-        rasterizer: "cpu", "cuda" or "reference", to compute blend weights anew; None chooses.
-        looked: the survey of an earlier plan of the same job; None looks at the views.
-        measured: see `decide`.
-        show: told how far the survey has come.
-        timer: counts the seconds of `survey`, and of all else as `planning`.
-        orbit: that the cameras are of, for the plan to tell of it; None for those of files.
-        style: for the plan to tell of its pictures; None for one picture.
-        regions: of the scene; None where it has none.
-        refinement: what made the scene, None where it is as it was read.
+        scene: Scene, after refinement if there was one.
+        cameras: Cameras; larger ones are reduced to `settings.max_resolution`.
+        settings: Settings of the job.
+        weights: Weights of the feature network; None for VGG19, or VGG16 if only that is installed.
+        rasterizer: Rasterizer that computes blend weights: "cpu", "cuda" or "reference". None to choose one.
+        collectives: Ranks of the job.
+        looked: Survey from an earlier plan of the same job; None to survey the views.
+        measured: Whether the job will be measured between its steps; see `decide`.
+        show: Callback for the progress of the survey.
+        timer: Timer for `survey`, and for all else as `planning`.
+        orbit: Orbit that made the cameras, for the plan to report; None for cameras from files.
+        style: Style mixture, for the plan to report its images; None for one image.
+        regions: Regions of the scene; None if there are none.
+        refinement: Refinement that made the scene; None if there was none.
 
     Returns:
-        The plan, and what was built to make it, for a `Stylizer` to go on with.
+        The plan, and the planning context, whose objects a `Stylizer` continues to use.
 
     Raises:
-        CameraError: no cameras, or none sees a Gaussian.
-        SettingsError: pruning would leave no Gaussian, regions keep all that the views see, the views do not have the
-            scales that were asked for, or a rasterizer that cannot be used here.
-        WeightsError: no weights.
+        CameraError: If there are no cameras, or none sees a Gaussian.
+        SettingsError: If pruning leaves no Gaussian, regions freeze everything visible, views lack requested scales, or
+            the rasterizer does not work here.
+        WeightsError: If there are no weights.
     """
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
@@ -85,7 +87,7 @@ def make_plan(
         resolved = regions and regions.resolved(looked.total_blend_weights)
         maps = len(resolved.active) if resolved is not None and resolved.mapped else 0
         link = probe_link(collectives, planning_context.network.device)
-        # Timings differ from rank to rank: one decides for all.
+        # Timings differ between ranks, so one rank decides for all.
         plan = collectives.broadcast(
             lambda: _decide(measure(planning_context, looked, link, maps), settings, measured, style, resolved)
         )
@@ -102,7 +104,7 @@ def make_plan(
 def _decide(
     probe: Probe, settings: Settings, measured: bool, style: StyleMixture | None, regions: Regions | None
 ) -> Plan:
-    """The plan of a style of one picture or several, for one region or several, as `Regions.resolved` gives them."""
+    """Plan for one or several style images, and for one or several regions as resolved by `Regions.resolved`."""
     if regions is not None:
         own = [regions.every[place].style or style for place in regions.active]
         count = sum(len(each.pictures) if each else 1 for each in own)

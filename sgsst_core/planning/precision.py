@@ -1,4 +1,4 @@
-"""The feature network's precision: what another one than float32 gains here, and what it costs in accuracy."""
+"""Trade-off of the feature network's precision: its speed-up over float32 on this machine, and its gradient error."""
 
 from __future__ import annotations
 
@@ -23,18 +23,20 @@ from sgsst_core.settings import Precision, StyleLossName
 from sgsst_core.timing import Timer
 
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16}
-#: Channels and side of the convolution that is timed: what a core computes in a millisecond, and what fills a GPU.
+#: Channels and side of the timed convolution: about a millisecond of work on a CPU core, and enough to fill a GPU.
 _CHANNELS: dict[Device, int] = {"cpu": 128, "cuda": 256}
 _SIDE: dict[Device, int] = {"cpu": 24, "cuda": 256}
-#: Seconds that its repetitions take together at least, so that those of a launch do not count.
+#: Minimum total seconds of the repetitions, so that the launch time is negligible.
 _LEAST_SECONDS: dict[Device, float] = {"cpu": 0.0, "cuda": 5e-3}
 
 
 def precision_ratio(asked: Precision, device: Device, collectives: Collectives) -> float | None:
-    """Seconds of a convolution in float32, over those in the precision that was asked for. Every rank calls this.
+    """Return how many times faster a convolution is in the requested precision than in float32.
+
+    All ranks must call this.
 
     Returns:
-        The ratio that the first rank has measured; None where float32 was asked for, or TF32 where a rank has none.
+        Ratio measured on the first rank. None if float32 was requested, or TF32 is missing on some rank.
     """
     if asked == "float32" or (asked == "tf32" and not all(collectives.all_gather(has_tf32(device)))):
         return None
@@ -42,12 +44,12 @@ def precision_ratio(asked: Precision, device: Device, collectives: Collectives) 
 
 
 def convolution_ratio(precision: Precision, device: Device) -> float:
-    """Seconds of a convolution in float32, over those in another precision."""
+    """Return the seconds of a convolution in float32 divided by those in another precision."""
     return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
 
 
 def _convolution_seconds(precision: Precision, device: Device) -> float:
-    """Of a 3x3 convolution."""
+    """Return the seconds of a 3x3 convolution."""
     channels, side, dtype = _CHANNELS[device], _SIDE[device], DTYPES[precision]
     image = torch.ones((1, channels, side, side), dtype=dtype, device=device)
     kernel = torch.ones((channels, channels, 3, 3), dtype=dtype, device=device)
@@ -65,10 +67,11 @@ def _convolution_seconds(precision: Precision, device: Device) -> float:
 
 
 def seconds_of(run: Callable[[int], float], least: float) -> float:
-    """Seconds of one of so many repetitions that they take `least` seconds together. What comes first prepares.
+    """Return the seconds of one repetition, from enough repetitions to take `least` seconds after a warm-up.
 
     Args:
-        run: repeats something some times and returns the seconds of them all.
+        run: Function that repeats something a number of times and returns the total seconds.
+        least: Minimum total seconds.
     """
     run(1)
     times = 1
@@ -87,17 +90,20 @@ def gradient_error(
     side: int,
     style_loss: StyleLossName = "sos",
 ) -> Difference | None:
-    """The pixel gradient of a view against that of the same network in whole float32, with a made-up style.
+    """Compare the pixel gradient of a view with that of the same network in full float32, for a synthetic style.
 
     Args:
-        network: as it will run.
-        camera: of the view, rendered unstylized and brought down until its longer side is at most `side`.
-        rasterizer: of the whole scene.
-        memory: bytes that activations may take.
-        style_loss: of the job.
+        network: Network as the job will run it.
+        weights: Weights of the network.
+        scene: Whole scene.
+        camera: View, which is rendered unstylized and then downscaled.
+        rasterizer: Rasterizer of the whole scene.
+        memory: Memory budget for activations in bytes.
+        side: Maximum longer side of the downscaled view in pixels.
+        style_loss: Style loss of the job.
 
     Returns:
-        The difference; None where the network is in float32.
+        Difference of the gradients; None if the network runs in float32.
     """
     if network.precision == "float32":
         return None

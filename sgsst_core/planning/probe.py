@@ -1,7 +1,7 @@
-"""What is measured before anything is decided, on the rasterizer and the device that will do the work.
+"""Measurements before planning, on the rasterizer and the device that will do the work.
 
-A `Probe` holds plain facts; `decide` makes a plan of them. What measuring builds is a `PlanningContext`, which the job
-continues to use.
+A `Probe` contains plain facts, from which `decide` makes a plan. The objects created for measuring form the planning
+context (`PlanningContext`), which the job continues to use.
 """
 
 from __future__ import annotations
@@ -59,32 +59,31 @@ from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Precision, Settings
 from sgsst_core.timing import Timer, wait_for
 
-#: Largest side of the picture that the network is timed on: large enough that its rate is that of a partition tile.
-#: A GPU has more to do before the seconds of its launches do not count.
+#: Maximum side of the image for timing the network: large enough for the rate of a partition tile. A GPU needs more
+#: work before launch times become negligible.
 PROBE_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 1024}
-#: Visits of views of one size below which no graph of their loss pays, whatever it saves.
+#: Minimum visits per view size for which a graph of the loss can pay off, whatever it saves.
 LEAST_GRAPH_VISITS = 20
-#: Views whose blend weights are counted and timed; the others are taken to be like them.
+#: Number of views whose blend weights are counted and timed, as representatives of all.
 SAMPLED_VIEWS = 3
 
-#: Made-up vectors that are compared with each other to measure the search.
+#: Number of synthetic vectors compared with each other to time the nearest-neighbor search.
 SEARCHED = {"cpu": 1 << 11, "cuda": 1 << 14}
-#: Runs of the network, of which the fastest counts.
+#: Number of runs of the network, of which the fastest counts.
 _RATE_RUNS = 2
-#: Of kept blend weights, the exact one first.
+#: Precisions of cached blend weights, the exact one first.
 _FORMS: tuple[WeightPrecision, ...] = ("float32", "half")
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Of the scene.
+    """Facts about the scene.
 
     Attributes:
         gaussians: N.
-        sh_degree: of its file.
-        used_degree: highest SH degree with a coefficient that is not 0 after fading, among the Gaussians that are
-            rendered.
-        held_degree: of what is in memory; 0 where coefficients stay in the file.
+        sh_degree: SH degree of its file.
+        used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
+        held_degree: SH degree in memory; 0 if coefficients stay in the file.
     """
 
     gaussians: int
@@ -95,20 +94,20 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """Of the feature network, in the precision in which it will run.
+    """Facts about the feature network, in the precision in which it will run.
 
     Attributes:
-        halo: pixels around a partition tile.
-        held_bytes: a pixel, that a forward pass keeps for the backward pass.
-        working_bytes: a pixel, that a pass needs beside them.
-        content_bytes: of a cell of the content layer.
-        rate: seconds a pixel.
-        fixed: seconds that a partition tile of hardly any pixel takes.
-        precision_ratio: seconds of a convolution in float32, over those in the precision that was asked for; None where
-            that is float32, or what there is not here.
-        gradient_error: of a view's pixel gradient, against float32; None where that is what runs.
-        vector_channels: of a vector that is matched with the style's; 0 where none is.
-        deepest: layer that it reports.
+        halo: Pixels around a partition tile.
+        held_bytes: Bytes per pixel stored by a forward pass for the backward pass.
+        working_bytes: Additional bytes per pixel needed by a pass.
+        content_bytes: Bytes per cell of the content layer.
+        rate: Seconds per pixel.
+        fixed: Seconds of a partition tile with almost no pixels.
+        precision_ratio: Seconds of a convolution in float32 divided by those in the requested precision; None if
+            float32 was requested, or the requested one is unavailable.
+        gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
+        vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
+        deepest: Deepest reported layer.
     """
 
     halo: int
@@ -125,14 +124,14 @@ class NetworkFacts:
 
 @dataclass(frozen=True)
 class Machine:
-    """Of the machine and the ranks on it.
+    """Facts about the machine and its ranks.
 
     Attributes:
-        device: that computes.
-        memory_limit: bytes to plan with, of the ranks that share a machine's memory together.
-        sharing: most ranks that share it.
-        ranks: that there are.
-        problems: why GPU rasterizers cannot be used there, by their name; none on the CPU.
+        device: Device that computes.
+        memory_limit: Memory budget in bytes of all ranks on one machine together.
+        sharing: Maximum number of ranks on one machine.
+        ranks: Number of available ranks.
+        problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
     """
 
     device: Device
@@ -143,28 +142,31 @@ class Machine:
 
     @property
     def memory(self) -> int:
-        """Bytes that one rank may plan with."""
+        """Memory budget of one rank in bytes."""
         return self.memory_limit // self.sharing
 
 
 @dataclass(frozen=True)
 class Probe:
-    """Everything that decisions follow from, besides the settings.
+    """All facts from which decisions follow, apart from the settings.
 
     Attributes:
+        scene: Facts about the scene.
         sizes: (height, width) of each view.
-        survey: what the views show.
-        distinct: indices of the views that are not nearly another one.
-        pruned_error: of leaving out Gaussians that a view shows; None where there are none.
-        rasterizer: that was timed: it computes blend weights anew.
-        raster: what it takes, and what kept weights would.
-        link: between ranks.
-        process_bytes: of physical memory, with scene and network loaded.
-        device_bytes: of a GPU's memory, likewise; 0 where a CPU computes.
-        launches: of a view's loss on a GPU; None on a CPU, and where nothing follows from it.
-        styles: pictures that the style is mixed of.
-        kept: [N] bool, Gaussians that stay as they are; None where none do.
-        maps: regions whose share is rendered in each view.
+        survey: Survey of the views.
+        distinct: Indices of the views that do not nearly repeat another one.
+        network: Facts about the feature network.
+        rasterizer: Timed rasterizer, which computes blend weights.
+        raster: Cost of rendering with recomputed and with cached weights.
+        machine: Facts about the machine.
+        link: Connection between ranks.
+        process_bytes: Physical memory of the process with scene and network loaded.
+        pruned_error: Error of leaving out visible Gaussians; None if there are none.
+        device_bytes: GPU memory with scene and network loaded; 0 on a CPU.
+        launches: Cost of launching a view's loss on a GPU; None on a CPU, or if no decision depends on it.
+        styles: Number of images in the style mixture.
+        kept: [N] bool, frozen Gaussians; None if there are none.
+        maps: Number of regions whose maps are rendered in each view.
     """
 
     scene: SceneFacts
@@ -187,16 +189,18 @@ class Probe:
 
 @dataclass(frozen=True)
 class PlanningContext:
-    """What measuring needs, and a job that follows the plan goes on to use.
+    """Planning context: objects that are needed for measuring and that the job continues to use.
 
     Attributes:
-        scene: the whole scene, with its spherical harmonics faded as the settings say.
-        sh_degree: of the scene as it came.
-        cameras: at the size at which they are stylized.
-        weights: of the network.
-        network: in the precision in which it will run.
-        precision_ratio: see `NetworkFacts`.
-        rasterizer: of the whole scene, computes blend weights anew.
+        scene: Whole scene, with the SH attenuation of the settings applied.
+        cameras: Cameras at the size used for stylization.
+        settings: Settings of the job.
+        machine: Facts about the machine.
+        weights: Weights of the network.
+        network: Network in the precision in which it will run.
+        precision_ratio: See `NetworkFacts`.
+        rasterizer: Rasterizer of the whole scene that computes blend weights.
+        sh_degree: SH degree of the original scene.
     """
 
     scene: Scene
@@ -218,11 +222,15 @@ def equip(
     collectives: Collectives,
     rasterizer: str | None = None,
 ) -> PlanningContext:
-    """See what there is to work with. Every rank calls this, and gets the same but for rounding.
+    """Create the planning context. Every rank must call this, and gets the same result up to rounding.
 
     Args:
-        cameras: at the size at which they are stylized.
-        rasterizer: that computes blend weights anew; None chooses.
+        scene: Scene as it was read.
+        cameras: Cameras at the size used for stylization.
+        settings: Settings of the job.
+        weights: Weights of the network.
+        collectives: Ranks of the job.
+        rasterizer: Rasterizer that computes blend weights; None to choose one.
     """
     sh_degree, scene = scene.sh_degree, scene.attenuated(settings.sh_attenuation)
     device = common_device(collectives)
@@ -232,7 +240,7 @@ def equip(
     limit = settings.memory_limit or default_memory_limit(network.device)
     machine = Machine(
         device,
-        # The partition follows from it, and so does rounding: it must be the same on all ranks.
+        # The partition, and thereby rounding, depends on it, so it must be identical on all ranks.
         memory_limit=min(collectives.all_gather(limit)),
         sharing=sharing_memory(collectives, device),
         ranks=collectives.size,
@@ -244,14 +252,14 @@ def equip(
 
 
 def common_device(collectives: Collectives) -> Device:
-    """What all ranks can compute on."""
+    """Return the device that is available on all ranks."""
     return "cuda" if all(collectives.all_gather(torch.cuda.is_available())) else "cpu"
 
 
 def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Why GPU rasterizers cannot be used, by their name, the preferred one first: what one rank cannot do, none does.
+    """Return the reasons, by name, why preferred GPU rasterizers do not work on some rank.
 
-    A rasterizer is only tried where every preferred one has failed.
+    A rasterizer is tried only if all preferred ones have failed.
     """
     problems: dict[str, str] = {}
     for name in GPU_RASTERIZERS:
@@ -263,30 +271,33 @@ def gpu_problems(collectives: Collectives) -> dict[str, str]:
 
 
 def rasterizer_problem(collectives: Collectives, name: RasterizerName) -> str | None:
-    """Why one of the ranks cannot draw with a GPU rasterizer; None where all can."""
+    """Return the reason why a GPU rasterizer does not work on some rank; None if it works on all."""
     return next(filter(None, collectives.all_gather(drawing_problem(name))), None)
 
 
 def sharing_memory(collectives: Collectives, device: Device) -> int:
-    """Most ranks that have to share the memory of a machine; each GPU has its own."""
+    """Return the maximum number of ranks that share the memory of a machine; GPUs do not share theirs."""
     return max(collectives.all_gather(1 if device == "cuda" else collectives.local_size))
 
 
 def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
-    """The feature network, with layers up to the deepest one used."""
+    """Create the feature network with layers up to the deepest one used."""
     layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
     use_whole_float32()
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
 def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps: int = 0) -> Probe:
-    """Time and count; one rank does it for all, because timings differ from rank to rank.
+    """Time and count. One rank does this for all, because timings differ between ranks.
 
     Args:
-        maps: regions whose share is rendered in each view.
+        workshop: Planning context.
+        looked: Survey of the views.
+        link: Connection between ranks.
+        maps: Number of regions whose maps are rendered in each view.
 
     Raises:
-        SettingsError: pruning would leave no Gaussian.
+        SettingsError: If pruning would leave no Gaussian.
     """
     scene, cameras, settings = planning_context.scene, planning_context.cameras, planning_context.settings
     seen = rendered_gaussians(optimized_gaussians(looked, settings), settings)
@@ -323,14 +334,14 @@ def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps:
 
 
 def _network_facts(planning_context: PlanningContext, first: Camera, maps: int) -> NetworkFacts:
-    """Of the network on made-up pictures, and where it is not in float32, its error on the first view."""
+    """Benchmark the network on synthetic images; if it is not float32, measure its gradient error on the first view."""
     network, settings, loss = planning_context.network, planning_context.settings, _loss(planning_context)
     side = min(
         _side(planning_context, loss), max(max(camera.width, camera.height) for camera in planning_context.cameras)
     )
     fixed = 0.0
     rate = measure_rate(loss, side, maps)
-    if planning_context.machine.ranks > 1:  # as good as no pixel: what it takes is the same for any number
+    if planning_context.machine.ranks > 1:  # with almost no pixels: the time that does not depend on their number
         fixed = measure_rate(loss, ALIGNMENT).both * ALIGNMENT**2
     return NetworkFacts(
         network.halo,
@@ -356,7 +367,7 @@ def _network_facts(planning_context: PlanningContext, first: Camera, maps: int) 
 
 
 def _loss(planning_context: PlanningContext, scales: ScaleWeights = EVEN) -> SosLoss:
-    """As one rank's."""
+    """Return the loss of a single rank."""
     settings = planning_context.settings
     return SosLoss(
         planning_context.network,
@@ -370,7 +381,7 @@ def _loss(planning_context: PlanningContext, scales: ScaleWeights = EVEN) -> Sos
 
 
 def _launch_cost(planning_context: PlanningContext, views: Sequence[Camera]) -> LaunchCost | None:
-    """Of the first view, on a GPU, where views of one size come often enough for graphs to be thought of."""
+    """Measure the first view on a GPU, if views of one size are visited often enough to consider graphs."""
     settings, sizes = planning_context.settings, {(camera.height, camera.width) for camera in views}
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
     if planning_context.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
@@ -379,7 +390,7 @@ def _launch_cost(planning_context: PlanningContext, views: Sequence[Camera]) -> 
 
 
 def _side(planning_context: PlanningContext, loss: SosLoss) -> int:
-    """Largest side of pictures for measuring; on a GPU, of those whose activations fit."""
+    """Return the maximum side of images for measuring; on a GPU, their activations must fit in memory."""
     most = PROBE_SIDE[planning_context.machine.device]
     if planning_context.machine.device == "cpu":
         return most
@@ -388,14 +399,20 @@ def _side(planning_context: PlanningContext, loss: SosLoss) -> int:
 
 
 def measure_rate(loss: SosLoss, side: int, maps: int = 0) -> Rate:
-    """Time the feature network on a small picture of side x side pixels, with statistics of so many regions, if any.
+    """Time the feature network on a small synthetic image.
 
-    The first run prepares, the fastest of the others counts: what disturbs one of them is no property of the network.
+    The first run is a warm-up, and the fastest of the others counts, because disturbances are not a property of the
+    network.
+
+    Args:
+        loss: Loss with the network.
+        side: Side of the square image in pixels.
+        maps: Number of regions that have statistics of their own; 0 for none.
     """
     image = soft_picture(side).to(loss.network.device)
     style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
     vectors = style[0].vectors
-    if vectors is not None:  # its time grows with their number, and is not the pixels'
+    if vectors is not None:  # the search time depends on their number and is measured separately
         style = {0: replace(style[0], vectors=replace(vectors, units=vectors.units[:1]))}
     if maps:
         share = torch.full((side, side), 1 / maps, device=loss.network.device)
@@ -415,7 +432,7 @@ def measure_rate(loss: SosLoss, side: int, maps: int = 0) -> Rate:
 
 
 def _search_seconds(units: Tensor) -> float:
-    """Of a position and a style vector in the search for the nearest one."""
+    """Return the seconds per pair of position and style vector in the nearest-neighbor search."""
     size = SEARCHED[units.device.type]
     made = torch.rand((size, units.shape[1]), generator=torch.Generator().manual_seed(0)).to(units)
 
@@ -433,7 +450,7 @@ def _search_seconds(units: Tensor) -> float:
 
 
 def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], budget: int) -> RasterCost:
-    """Count and time blend weights on a few of some views, evenly spread; `budget`: bytes for kept ones."""
+    """Count and time blend weights on a few evenly spread views. `budget` is the memory for cached weights in bytes."""
     scene, rasterizer = planning_context.scene, planning_context.rasterizer
     count = min(SAMPLED_VIEWS, len(cameras))
     sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
@@ -442,13 +459,13 @@ def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], b
         _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles
         seconds = []
         for camera in sample:
-            rasterizer.lists(camera)  # the survey's, where it could keep them
+            rasterizer.lists(camera)  # the survey's, if it could cache them
             seconds += _raster_seconds(rasterizer, len(scene), camera)
         more, lists_bytes = _lists_cost(scene, sample, planning_context.settings.near)
     else:
         timed = [_raster_seconds(rasterizer, len(scene), camera, visits=2) for camera in sample]
         seconds = [later for _, later in timed]
-        # The least: one of them may have compiled something, or waited for memory.
+        # Minimum, because one of them may include compilation or waiting for memory.
         more, lists_bytes = max(min(first - later for first, later in timed), 0.0), 0
     mean = sum(seconds) / count
     known: dict[str, Any] = {
@@ -471,22 +488,22 @@ def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], b
     if not fitting:
         return RasterCost(mean, None, total, half, **known)
     keeping = None
-    if isinstance(uncached, TritonRasterizer):  # on the CPU it is known: see `decide.LEAST_VISITS`
+    if isinstance(uncached, TritonRasterizer):  # known on the CPU: see `choices.LEAST_VISITS`
         keeping = _keeping_seconds(cached, sample[middle], fitting[0])
     cached = CachedRasterizer(scene, precision=fitting[0], uncached=uncached)
     kept = _raster_seconds(cached, len(scene), sample[middle], visits=2)[1]
-    # Of the mean view, as the seconds it is compared with.
+    # Scaled to the mean view, like the seconds that it is compared with.
     return RasterCost(mean, kept * mean / seconds[middle], total, half, keeping, **known)
 
 
 def _comes_too_seldom(settings: Settings, views: int) -> bool:
-    """Whether a view comes so seldom that its kept weights, which nobody asked for, do not pay on a CPU."""
+    """Return whether visits are so few that cached weights, which were not requested, do not pay off on a CPU."""
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / views
     return settings.cached_weights == "auto" and visits < LEAST_VISITS
 
 
 def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
-    """Seconds and bytes of a view's lists, made once more; mean over some views."""
+    """Return seconds and bytes of a view's tile intersections, recomputed; mean over some views."""
     seconds, size, shapes = 0.0, 0, Shapes.of(scene)
     for camera in cameras:
         started = time.perf_counter()
@@ -496,7 +513,7 @@ def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[f
 
 
 def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
-    """Of what spherical harmonics add to a view's colors, for the second time: the first one compiles."""
+    """Return the seconds of a view's SH colors on the second run; the first one compiles."""
     seconds = 0.0
     if scene.sh_degree:
         sh_rest, means = scene.sh_rest.to(device), scene.means.to(device)
@@ -509,7 +526,7 @@ def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float
 
 
 def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPrecision) -> float:
-    """Of making a view's kept weights for the second time: the first one compiles."""
+    """Return the seconds to compute a view's cached weights on the second run; the first one compiles."""
     seconds = 0.0
     for _ in range(2):
         started = time.perf_counter()
@@ -520,7 +537,7 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
 
 
 def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
-    """Of some renders with gradient: the first one prepares the view, where that has not been done."""
+    """Return the seconds of each of several renders with gradient; the first one prepares the view if necessary."""
     colors = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
     seconds = []
     for _ in range(visits):

@@ -1,4 +1,4 @@
-"""How far a survey has come: on large scenes it takes minutes, and somebody waits for it."""
+"""Progress of a survey, which takes minutes for large scenes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PlanningProgress:
-    """Views looked at.
+    """Number of surveyed views.
 
     Attributes:
-        done: by all ranks together.
-        total: to look at.
-        seconds_left: until the survey ends, at the pace so far; None before the first view is done.
+        done: Views surveyed by all ranks together.
+        total: Views to survey.
+        seconds_left: Remaining seconds of the survey at the current rate; None before the first view is done.
     """
 
     done: int
@@ -22,7 +22,7 @@ class PlanningProgress:
 
     @property
     def fraction(self) -> float:
-        """0 to 1."""
+        """Fraction of the views, 0 to 1."""
         return self.done / max(self.total, 1)
 
 
@@ -30,6 +30,6 @@ ShowPlanning = Callable[[PlanningProgress], None]
 
 
 def progress_of(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
-    """After so many views of this rank: the others are taken to be as far."""
+    """Return the progress after this many views on this rank, assuming that the other ranks are equally fast."""
     done = min(total, own * ranks)
     return PlanningProgress(done, total, seconds * (total - done) / done if done else None)

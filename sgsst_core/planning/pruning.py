@@ -1,4 +1,4 @@
-"""What may be left out on request, and what it costs: hardly visible Gaussians, views that nearly repeat another."""
+"""Optional pruning and its error: hardly visible Gaussians, and views that nearly repeat another one."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Gaussians that are followed from one view to another.
+#: Number of Gaussians that are tracked between views.
 _FOLLOWED = 2000
 
 
 @dataclass(frozen=True)
 class ImageError:
-    """Bounds on what leaving Gaussians out changes in a pixel, per unit of the colors' range: largest and mean."""
+    """Maximum and mean change of a pixel if Gaussians are left out, as upper bounds.
+
+    Both are relative to the range of colors.
+    """
 
     largest: float
     mean: float
@@ -28,16 +31,18 @@ class ImageError:
 def pruned_image_error(
     pruned: Tensor, cameras: Sequence[Camera], covered: Sequence[int], rasterizer: Rasterizer
 ) -> ImageError:
-    """Bound the change of every pixel of every view when some Gaussians are not rendered.
+    """Bound the change of every pixel of every view if some Gaussians are not rendered.
 
-    Take them away one by one, the farthest first. What is taken away showed w (c - b) of its pixel, with its blend
-    weight w, its color c, and b the blend of what lies behind it; the weights of those in front stay the same. So
-    no pixel changes by more than the sum of the pruned weights times the range of the colors, plus the transmittance
-    at which blending stops.
+    Remove them one by one, the farthest first. Each contributed w (c - b) to its pixel, where w is its blend weight, c
+    its color, and b the blend of everything behind it; the weights of those in front do not change. Therefore no pixel
+    changes by more than the sum of the pruned weights times the range of colors, plus the transmittance at which
+    blending stops.
 
     Args:
-        pruned: [N] bool.
-        rasterizer: of the whole scene.
+        pruned: [N] bool, Gaussians that are left out.
+        cameras: Cameras of all views.
+        covered: Indices of the views to consider.
+        rasterizer: Rasterizer of the whole scene.
     """
     marks = pruned[:, None].to(torch.float32).expand(-1, 3).contiguous()
     nothing = torch.zeros_like(marks)
@@ -53,14 +58,17 @@ def pruned_image_error(
 def distinct_views(
     scene: Scene, cameras: Sequence[Camera], covered: Sequence[int], weights: Tensor, share: float
 ) -> list[int]:
-    """Of the covered views, those whose picture is not nearly that of one before.
+    """Return the covered views that do not nearly repeat an earlier one.
 
-    The most visible Gaussians are projected into both views; a view is left out when the median of their shifts is less
-    than `share` of the longer side. Where a view shows too few of those of the other, the two are distinct.
+    The most visible Gaussians are projected into both views. A view is dropped if the median of their shifts is less
+    than `share` of the longer side. Views that have too few of these Gaussians in common are distinct.
 
     Args:
+        scene: Whole scene.
+        cameras: Cameras of all views.
+        covered: Indices of the covered views.
         weights: [N] float64, total blend weights.
-        share: 0 keeps all.
+        share: Minimum shift as a fraction of the longer side; 0 keeps all views.
     """
     if not share:
         return list(covered)
@@ -76,7 +84,7 @@ def distinct_views(
 
 
 def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Positions [n, 2] in units of the longer side, and [n] whether they lie in the view."""
+    """Return positions [n, 2] in units of the longer side, and whether they are inside the view [n]."""
     pose = camera.world_to_camera.double()
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     depth = torch.where(z > 0, z, 1.0)
@@ -86,7 +94,7 @@ def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _shift(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
-    """Median shift, in units of the longer side, of what both views show; infinite where that is less than half."""
+    """Return the median shift of common points in units of the longer side; infinite if fewer than half are common."""
     both = first[1] & second[1]
     if int(both.sum()) * 2 < max(int(first[1].sum()), int(second[1].sum()), 1):
         return float("inf")

@@ -1,8 +1,8 @@
-"""How long an iteration takes on several ranks: the planner's model, from measured constants.
+"""Model of the iteration time on several ranks, from measured constants.
 
-Computing is shared out by `division`; what the ranks tell each other is counted in bytes and messages, as rings move
-them. One model serves the planner, which leaves out ranks that would only add communication, and the forecast for
-machines that are not at hand (`benchmarks.scaling`).
+Computation is divided by `division`; communication is counted in bytes and messages, assuming ring algorithms. The
+planner uses the model to leave out ranks that would only add communication, and `benchmarks.scaling` uses it to
+forecast machines that are not available.
 """
 
 from __future__ import annotations
@@ -20,56 +20,57 @@ from sgsst_core.parallel.division import Piece, divide, rounds
 from sgsst_core.parallel.shown import gaussians_sent
 from sgsst_core.timing import wait_for
 
-#: Channels of the style layers: their statistics travel as n, mean and one half of C, in float64.
+#: Channels of the style layers. Their statistics are sent as n, mean and one half of C, in float64.
 _STYLE_CHANNELS = (64, 128, 256, 512, 512)
 _FIRST_BYTES = 8 * sum(c + 1 for c in _STYLE_CHANNELS)
 _SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
-#: Bytes on which a link is timed, between processors and between GPUs: enough to fill it, and no more than some views'
-#: images.
+#: Bytes for timing a link between CPUs and between GPUs: enough to saturate it, and no more than the images of a few
+#: views.
 _PROBE_BYTES = {"cpu": 4 << 20, "cuda": 64 << 20}
-#: Further ranks must save at least this share of an iteration.
+#: Minimum fraction of an iteration that additional ranks must save.
 LEAST_GAIN = 0.03
 
 
 @dataclass(frozen=True)
 class Link:
-    """What connects the ranks.
+    """Connection between ranks.
 
     Attributes:
-        bandwidth: bytes a second that a rank sends while it receives as many.
-        latency: seconds of the shortest message from one rank to the next.
+        bandwidth: Bytes per second that a rank sends while receiving as many.
+        latency: Seconds of the shortest message from one rank to the next.
     """
 
     bandwidth: float
     latency: float
 
     def all_gather(self, size: int, ranks: int) -> float:
-        """Seconds to bring `size` bytes in all from everybody to everybody; as many to scatter and add them."""
+        """Return the seconds of an all-gather of `size` bytes in total; a reduce-scatter takes as long."""
         return (ranks - 1) * (self.latency + size / ranks / self.bandwidth)
 
     def all_reduce(self, size: int, ranks: int) -> float:
-        """Seconds to add up `size` bytes of every rank."""
+        """Return the seconds of an all-reduce of `size` bytes per rank."""
         return 2 * self.all_gather(size, ranks)
 
 
 @dataclass(frozen=True)
 class IterationWork:
-    """One view's iteration.
+    """Work of an iteration of one view.
 
     Attributes:
-        pieces: one for each scale that is computed.
-        halo: pixels around a partition tile.
-        pixel: seconds a pixel through the network, both passes and statistics.
-        raster: seconds of render and gradient on one rank.
-        fixed: seconds that every rank needs, however many there are: comparing statistics, the optimizer.
-        gaussians: that are optimized.
-        shown: that the view shows, for which alone its gradient travels; None for all.
-        matching: seconds of the search for nearest style vectors on one rank.
-        whole_image: the full-size image and its gradient are exchanged (phase 1 with kept weights needs neither).
-        forward: seconds a pixel of a forward pass alone, for pixels whose activations do not stay in memory.
-        held, working: pixels whose activations one rank alone can hold, and what a pass needs beside them as a share of
-            them (see `choose_tile_size`).
-        sharing: ranks among which that memory is divided.
+        pieces: One piece for each computed scale.
+        halo: Pixels around a partition tile.
+        pixel: Seconds per pixel through the network: both passes and statistics.
+        raster: Seconds of render and gradient on one rank.
+        fixed: Seconds that every rank needs regardless of their number: comparing statistics, and the optimizer.
+        gaussians: Number of optimized Gaussians.
+        whole_image: Whether the full-size image and its gradient are exchanged (phase 1 with cached weights needs
+            neither).
+        forward: Seconds per pixel of a forward pass alone, for pixels whose activations are not cached.
+        held: Number of pixels whose activations a single rank can hold (see `choose_tile_size`).
+        working: Memory of a pass in addition to the activations, as a fraction of them.
+        sharing: Number of ranks that divide this memory.
+        shown: Number of Gaussians that the view shows, whose gradients are sent; None for all.
+        matching: Seconds of the nearest-neighbor search on one rank.
     """
 
     pieces: tuple[Piece, ...]
@@ -87,7 +88,7 @@ class IterationWork:
     matching: float = 0.0
 
     def computing(self, ranks: int, groups: int = 1) -> float:
-        """Seconds of the rank with most work, where so many groups of ranks take a view each."""
+        """Return the seconds of the rank with most work, if this many groups of ranks take a view each."""
         shares = divide(self.pieces, self.halo, (1.0,) * ranks)
         held = self.held / min(ranks * groups, self.sharing)
         return (
@@ -97,7 +98,7 @@ class IterationWork:
         )
 
     def _network(self, share: Sequence[Piece], ranks: int, held: float) -> float:
-        """Seconds of a rank's pieces, cut into partition tiles as its memory allows."""
+        """Return the seconds of a rank's pieces, split into partition tiles as its memory requires."""
         areas = {piece.scale: self._areas(piece, held) for piece in share if piece.region.pixels}
         seconds = 0.0
         for scales in rounds(list(areas), ranks):
@@ -111,7 +112,10 @@ class IterationWork:
         return [tile.outer.pixels for tile in partition(*piece.size, size, self.halo, piece.region)]
 
     def communication(self, ranks: int, link: Link) -> float:
-        """Seconds in which ranks wait for what others send. Statistics of all scales but the last travel meanwhile."""
+        """Return the seconds that ranks wait for data.
+
+        Only the statistics of the last scale count; the others overlap.
+        """
         if ranks == 1:
             return 0.0
         image = 2 * link.all_gather(self._image_bytes, ranks) if self.whole_image else 0.0
@@ -119,8 +123,8 @@ class IterationWork:
         return image + statistics + link.all_reduce(self._gradient_bytes, ranks)
 
     def sent(self, ranks: int) -> dict[Traffic, int]:
-        """Bytes that a rank sends for each purpose, of all scales; what `Collectives.sent` counts."""
-        twice = 2 * (ranks - 1) / ranks  # once to bring in what belongs together, once to share it out
+        """Return the bytes that a rank sends for each purpose, at all scales, as counted by `Collectives.sent`."""
+        twice = 2 * (ranks - 1) / ranks  # once to reduce, once to distribute
         statistics = len(self.pieces) * (_FIRST_BYTES + _SECOND_BYTES)
         return {
             "image": int(twice * self._image_bytes) if self.whole_image else 0,
@@ -130,7 +134,7 @@ class IterationWork:
 
     @property
     def _image_bytes(self) -> int:
-        # Of full size, whichever scales are computed of it.
+        # full size, whichever scales are computed from it
         height, width = max((piece.size[0] << piece.scale, piece.size[1] << piece.scale) for piece in self.pieces)
         return 12 * height * width
 
@@ -139,12 +143,15 @@ class IterationWork:
         return int(12 * (self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)))
 
     def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
-        """Of one iteration of one view, on each of so many groups of ranks."""
+        """Return the seconds of an iteration of one view, on each of this many groups of ranks."""
         return self.computing(ranks, groups) + self.communication(ranks, link)
 
 
 def probe_link(collectives: Collectives, device: torch.device) -> Link:
-    """Time sums over all ranks; the same result on every rank. One rank has nobody to send to."""
+    """Time all-reduces over all ranks; the result is identical on all ranks.
+
+    A single rank has an infinitely fast link.
+    """
     if collectives.size == 1:
         return Link(math.inf, 0.0)
     largest = _PROBE_BYTES[device.type]
@@ -155,10 +162,10 @@ def probe_link(collectives: Collectives, device: torch.device) -> Link:
 
 
 def _slowest_sum(collectives: Collectives, device: torch.device, size: int) -> float:
-    """Seconds of the rank that waits longest for the sum of tensors of so many bytes; the last of three counts."""
+    """Return the seconds of an all-reduce of this many bytes on the slowest rank, from the last of three runs."""
     tensor = torch.zeros(size // 4, device=device)
     seconds = 0.0
-    for _ in range(3):  # the first one makes the connections
+    for _ in range(3):  # the first run opens the connections
         wait_for(device)
         collectives.all_gather(None)
         started = time.perf_counter()
@@ -170,11 +177,11 @@ def _slowest_sum(collectives: Collectives, device: torch.device, size: int) -> f
 
 @dataclass(frozen=True)
 class RanksChoice:
-    """How many ranks take part.
+    """Chosen number of ranks.
 
     Attributes:
-        ranks: how many.
-        seconds: of the whole schedule for each number that was looked at.
+        ranks: Number of ranks that take part.
+        seconds: Seconds of the whole schedule for each number of ranks considered.
     """
 
     ranks: int
@@ -182,20 +189,20 @@ class RanksChoice:
 
     @property
     def speed_up(self) -> float:
-        """Over one rank."""
+        """Speed-up over one rank."""
         return self.seconds[1] / self.seconds[self.ranks]
 
 
 def choose_ranks(
     phases: Sequence[tuple[int, Sequence[IterationWork]]], views_per_step: int, available: int, link: Link
 ) -> RanksChoice:
-    """The fewest ranks with which no larger number would be worth its communication.
+    """Return the smallest number of ranks beyond which more ranks would not be worth their communication.
 
     Args:
-        phases: steps of each phase, and an iteration of some of its views.
-        views_per_step: groups of ranks take views of their own.
-        available: most ranks that there are.
-        link: between them.
+        phases: Number of steps of each phase, and iterations of some of its views.
+        views_per_step: Views per step, which groups of ranks process in parallel.
+        available: Number of available ranks.
+        link: Connection between the ranks.
     """
     seconds = {ranks: _schedule_seconds(phases, views_per_step, ranks, link) for ranks in _candidates(available)}
     best = min(seconds.values())
@@ -204,7 +211,7 @@ def choose_ranks(
 
 
 def _candidates(available: int) -> list[int]:
-    """Numbers of ranks worth a look: up to eight all of them, then at steps of a quarter."""
+    """Return the numbers of ranks to consider: all up to eight, then in steps of a quarter."""
     found, ranks = [], 1
     while ranks < available:
         found.append(ranks)

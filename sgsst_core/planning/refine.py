@@ -1,7 +1,7 @@
-"""Which Gaussians are cut into smaller ones before a job (`Settings.refine`), and into how many.
+"""Choice of the Gaussians to split before a job (`Settings.refine`), and of the number of pieces.
 
-A Gaussian can carry one color from each side, so that no stroke is finer than it. Those are cut that are large where
-the views show them, as far as the loss's gradient asks for different colors within them.
+A Gaussian has a single color per viewing direction, so strokes cannot be finer than it. Gaussians that are large in the
+views are split if the gradient of the loss asks for different colors within them.
 """
 
 from __future__ import annotations
@@ -17,30 +17,31 @@ from sgsst_core.scene.split import MOST_PIECES, Refinement, piece_counts, pieces
 from sgsst_core.scene.subject import rotations
 from sgsst_core.settings import Settings
 
-#: What the unstylized picture must keep, dB, in each measured view.
+#: Minimum PSNR of the unstylized image in dB, in each measured view.
 LEAST_PSNR = 40.0
-#: Sizes that are tried, standard deviations in pixels of the views, from the coarsest. Finer than the last one, a
-#: Gaussian is hardly larger than the pixels that are averaged in it.
+#: Candidate sizes as standard deviations in the views in pixels, coarsest first. Below the last one, a Gaussian is
+#: hardly larger than the pixels that are averaged in it.
 SIZES = tuple(256 * 2 ** (-step / 4) for step in range(30))
-#: Gaussians that all views together show in fewer pixels carry no stroke.
+#: Minimum total pixels of a Gaussian over all views; smaller ones carry no stroke.
 _LEAST_WEIGHT = 8.0
-#: Of one Gaussian; a flat one in the most pieces along both axes.
+#: Maximum number of children: those of a flat Gaussian split into the most pieces along both axes.
 _MOST_CHILDREN = MOST_PIECES**2
-#: A Gaussian's deviation over its distance from a camera that shows it: beyond, its parts lie elsewhere in the picture
-#: than the projection of the whole, which takes the perspective as linear about the center.
+#: Maximum ratio of a Gaussian's deviation to its distance from a camera that shows it. Beyond it, its pieces appear
+#: elsewhere than the projection of the whole, which linearizes the perspective at the center.
 _LARGEST_REACH = 1.0
-#: Of the gradient's magnitude under a Gaussian, what must cancel in its sum; with less, it asks for one color.
+#: Minimum fraction of the gradient's magnitude under a Gaussian that cancels in its sum. Below it, the gradient asks
+#: for a single color.
 _LEAST_DISAGREEMENT = 0.1
-#: Gaussians whose sizes are computed together: some tens of megabytes in float64.
+#: Number of Gaussians whose sizes are computed at a time; takes some tens of megabytes in float64.
 _CHUNK = 1 << 17
 
 
 class Footprints:
-    """What views show of each Gaussian, added up view by view in memory that does not grow with their number.
+    """Sizes of each Gaussian in the views, accumulated view by view in constant memory.
 
     Attributes:
-        weights: [N] float64, blend weights over all pixels, in pixels.
-        reach: [N] float64, its largest deviation over its depth, in the view where that is most.
+        weights: [N] float64, blend weights summed over all pixels, in pixels.
+        reach: [N] float64, maximum over views of the largest deviation divided by depth.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -50,7 +51,7 @@ class Footprints:
         self._squares = torch.zeros((len(scene), 3), dtype=torch.float64)
 
     def add(self, camera: Camera, weights: Tensor) -> None:
-        """Count a view; weights [N] of `Rasterizer.survey` on the CPU."""
+        """Add a view, given weights [N] of `Rasterizer.survey` on the CPU."""
         for part in (weights > 0).nonzero()[:, 0].split(_CHUNK):
             lengths, reach = axes_in_view(self._scene, part, camera)
             own = weights[part].double()
@@ -60,24 +61,24 @@ class Footprints:
 
     @property
     def parts(self) -> tuple[Tensor, Tensor]:
-        """What adds up over views: [N, 4]; and what is the largest: [N]."""
+        """Values to be summed [N, 4] and to be maximized [N] over ranks."""
         return torch.cat([self.weights[:, None], self._squares], dim=1), self.reach
 
     def take(self, sums: Tensor, reach: Tensor) -> None:
-        """Have the `parts` of all ranks together."""
+        """Replace the values by those of all ranks together."""
         self.weights, self._squares, self.reach = sums[:, 0].contiguous(), sums[:, 1:].contiguous(), reach
 
     @property
     def lengths(self) -> Tensor:
-        """[N, 3] float64: deviation of each axis in pixels, root of the mean square over what the views show of it."""
+        """[N, 3] float64, deviation of each axis in pixels: root mean square over the views, weighted by visibility."""
         return (self._squares / self.weights.clamp_min(1e-300)[:, None]).sqrt()
 
 
 def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Of some Gaussians that a view shows, the axes' deviations in pixels [n, 3], and the largest over depth [n].
+    """Return the projected deviations of the axes of some Gaussians in pixels [n, 3], and the largest over depth [n].
 
-    As the rasterizer projects them, but for its limit on directions far beside the image. What float64 cannot hold
-    (huge Gaussians) is infinite.
+    They are those of the rasterizer's projection, without its limit on directions far outside the image. Values that
+    overflow float64 (huge Gaussians) are infinite.
     """
     pose = camera.world_to_camera.double()
     centers = scene.means[rows].double() @ pose[:3, :3].T + pose[:3, 3]
@@ -92,11 +93,11 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
 
 
 def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """How much of a picture's gradient [H, W, 3] cancels under each Gaussian, and how much there is: both [N] float64.
+    """Return how much of an image gradient [H, W, 3] cancels under each Gaussian, and its total: both [N] float64.
 
-    There is sum |g| w over pixels and channels, w the blend weights; of it |sum g w| reaches the Gaussian's color. The
-    difference is what its pixels disagree about. Two passes of the rasterizer, of |g| and of g: G-Style (Kovács,
-    Hermosilla, Raidou 2024) cuts by the magnitude of gradients, too, which it accumulates over steps.
+    The total is sum |g| w over pixels and channels, with blend weights w, and |sum g w| of it reaches the Gaussian's
+    color. The difference is what its pixels disagree about. It takes two passes of the rasterizer, for |g| and g.
+    G-Style (Kovács, Hermosilla, Raidou 2024) also splits by gradient magnitudes, which it accumulates over steps.
     """
     whole = rasterizer.color_gradient(image_gradient.abs(), camera).double()
     summed = rasterizer.color_gradient(image_gradient, camera).double().abs()
@@ -104,11 +105,13 @@ def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor)
 
 
 def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, there_is: Tensor) -> Tensor:
-    """[N] bool, Gaussians that may be cut.
+    """Return the mask [N] bool of Gaussians that may be split.
 
     Args:
-        splittable: see `can_be_split`.
-        cancels, there_is: of the gradient, see `disagreement`, over all views.
+        footprints: Sizes in the views.
+        splittable: [N] bool, see `can_be_split`.
+        cancels: [N], part of the gradient that cancels over all views, see `disagreement`.
+        there_is: [N], total of the gradient over all views.
     """
     asked = cancels > _LEAST_DISAGREEMENT * there_is
     large = footprints.weights >= _LEAST_WEIGHT
@@ -116,7 +119,7 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, ther
 
 
 def most_children(weights: Tensor) -> Tensor:
-    """[N], what each Gaussian may become: those that views show in so few pixels carry no stroke.
+    """Return the maximum number of Gaussians [N] that each may become; children that cover few pixels carry no stroke.
 
     Args:
         weights: [N], blend weights over all pixels of all views.
@@ -127,18 +130,21 @@ def most_children(weights: Tensor) -> Tensor:
 def choose_pieces(
     lengths: Tensor, allowed: Tensor, cancels: Tensor, most: Tensor, budget: int
 ) -> tuple[Tensor, float | None]:
-    """Pieces [N, 3] uint8 of each Gaussian, and the size in pixels to which they were cut; None where none is.
+    """Choose the number of pieces of each Gaussian within a budget.
 
-    Round after round all that are allowed are cut to a smaller size, but for those that would become more than they
-    may: blobs, which are cut along three axes where views need two. In the round that the budget does not hold, those
-    go first that disagree most for each Gaussian that they would become.
+    In every round, all allowed Gaussians are split to a smaller size, except those that would exceed their maximum:
+    blobs, which are split along three axes although views need only two. In the round that exceeds the budget,
+    Gaussians with the largest disagreement per new Gaussian go first.
 
     Args:
         lengths: [N, 3], see `Footprints`.
-        allowed: [N] bool.
+        allowed: [N] bool, Gaussians that may be split.
         cancels: [N], see `disagreement`.
-        most: [N], what each may become at most, see `most_children`.
-        budget: Gaussians that there may be.
+        most: [N], maximum number of children, see `most_children`.
+        budget: Maximum total number of Gaussians.
+
+    Returns:
+        Pieces [N, 3] uint8, and the size in pixels to which Gaussians were split; None if none is split.
     """
     rows = allowed.nonzero()[:, 0]
     own, rest = lengths[rows], budget - (len(lengths) - len(rows))
@@ -164,7 +170,7 @@ def choose_pieces(
 
 
 def refine_decision(refinement: Refinement, settings: Settings) -> Decision:
-    """The line of a plan that tells what was cut."""
+    """Return the plan's line about split Gaussians."""
     before, item = len(refinement.pieces), "refined Gaussians"
     back = f"; {refinement.taken_back:,} stay whole, whose parts would change the picture"
     back = back if refinement.taken_back else ""

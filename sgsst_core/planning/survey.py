@@ -1,6 +1,6 @@
-"""A look at every view before the work: what each Gaussian contributes, and what of each view is covered.
+"""Survey of all views before the job: blend weights per Gaussian, and covered pixels per view.
 
-One pass of the rasterizer a view (`Rasterizer.survey`); no feature network. Of several ranks, each looks at some of the
+It takes one pass of the rasterizer per view (`Rasterizer.survey`) and does not use the feature network. Ranks share the
 views.
 """
 
@@ -21,17 +21,17 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Below this coverage nothing can be seen of a pixel's color in 8 bits.
+#: Below this coverage, the color of a pixel is invisible in 8 bits.
 SEEN_COVERAGE = 1 / 255
 
 
 def sees_something(coverage: Tensor) -> bool:
-    """Whether anything can be seen of a view's coverage [H, W]."""
+    """Return whether anything is visible in a view, given its coverage [H, W]."""
     return float(coverage.amax()) > SEEN_COVERAGE
 
 
 def nothing_seen(cameras: int) -> CameraError:
-    """The error of so many cameras, none of which sees a Gaussian."""
+    """Return the error for cameras none of which sees a Gaussian."""
     return CameraError(
         f"None of the {cameras} cameras sees a Gaussian. Check that cameras and scene belong together (same training "
         "run, same world), or let an orbit make the cameras."
@@ -40,16 +40,15 @@ def nothing_seen(cameras: int) -> CameraError:
 
 @dataclass(frozen=True)
 class Survey:
-    """What the views show.
+    """Result of surveying the views.
 
     Attributes:
-        total_blend_weights: [N] float64, sum of each Gaussian's blend weights over all pixels of all views.
-        covered: indices of the views that see anything.
-        regions: for each view, the rectangle that holds every covered pixel.
-        uncovered_share: share of uncovered pixels in the views that see anything.
-        shown: Gaussians that such a view shows, their mean; None in surveys that did not count them.
-        uncovered: for each view, its share of uncovered pixels, 1 where nothing is seen; None in surveys that did not
-            tell them apart.
+        total_blend_weights: [N] float64, blend weights of each Gaussian summed over all pixels of all views.
+        covered: Indices of the views that see anything.
+        regions: Rectangle of each view that contains all covered pixels.
+        uncovered_share: Fraction of uncovered pixels in the views that see anything.
+        shown: Mean number of Gaussians visible in such a view; None if it was not counted.
+        uncovered: Fraction of uncovered pixels of each view, 1 if nothing is seen; None if not recorded per view.
     """
 
     total_blend_weights: Tensor
@@ -62,7 +61,7 @@ class Survey:
 
 @dataclass(frozen=True)
 class _Look:
-    """What one view shows."""
+    """Survey of one view."""
 
     region: Rectangle
     uncovered: float  # pixels
@@ -78,13 +77,17 @@ def survey(
     collectives: Collectives = ALONE,
     show: ShowPlanning | None = None,
 ) -> Survey:
-    """Look at every view once; every rank gets the same survey.
+    """Survey every view once; all ranks get the same result.
 
     Args:
-        show: told before the first view of this rank, and after each.
+        scene: Scene with N Gaussians.
+        cameras: Cameras of the views.
+        rasterizer: Rasterizer of the scene.
+        collectives: Ranks that share the work.
+        show: Callback, called before the first view of this rank and after each view.
 
     Raises:
-        CameraError: no camera sees a Gaussian.
+        CameraError: If no camera sees a Gaussian.
     """
     weights = torch.zeros(len(scene), dtype=torch.float64)
     looks: dict[int, _Look] = {}
@@ -111,7 +114,7 @@ def survey(
 
 
 def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
-    """What a view shows; its blend weights are added to weights [N] float64."""
+    """Survey a view, and add its blend weights to weights [N] float64."""
     coverage, summed = rasterizer.survey(camera)
     seen = sees_something(coverage)
     uncovered = float((1 - coverage).sum(dtype=torch.float64))

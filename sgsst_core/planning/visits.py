@@ -1,8 +1,8 @@
-"""What a view costs beside an iteration's passes: what is made at its first visit, and made anew where it is not kept.
+"""Costs of a view apart from an iteration's passes: data computed at its first visit, or at each visit if not cached.
 
-Lists of Gaussians, colors of spherical harmonics, blend weights and content features of a view are made when it is
-first visited, and kept as far as each of them fits its share of the memory. What fits costs seconds once; what does not
-costs them at every visit.
+Tile intersections, SH colors, blend weights and content features of a view are computed at its first visit, and cached
+as far as each of them fits its part of the memory. What fits costs its seconds once; what does not fit costs them at
+every visit.
 """
 
 from __future__ import annotations
@@ -15,31 +15,32 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.settings import Settings
 
-#: Making a view's kept weights on the CPU, in renders with gradient.
+#: Cost of computing a view's cached weights on the CPU, in renders with gradient.
 KEEPING_RENDERS = 3
-#: A render without its gradient, in renders with it.
+#: Cost of a render without its gradient, in renders with it.
 RENDER = 0.5
-#: Bytes of the colors of a Gaussian in a view: what its spherical harmonics add.
+#: Bytes per Gaussian of a view's colors: the contribution of spherical harmonics.
 COLOR_BYTES = 12
-#: Of a pixel of the content image at all scales, float32, which is kept where steps have different colors behind it.
+#: Bytes per pixel of the content image at all scales, float32. It is cached if the background changes from step to
+#: step.
 _IMAGE_BYTES = 16
-#: Of a pixel of a region's map at all scales, float32.
+#: Bytes per pixel of a region's map at all scales, float32.
 MAP_BYTES = 16 / 3
-#: Regions whose maps come with one render.
+#: Number of region maps computed by one render.
 MAPS_OF_A_RENDER = 3
-#: Cutting the survey's lists of a view down to the Gaussians of the job, in making them.
+#: Cost of restricting the survey's tile intersections to the Gaussians of the job, relative to computing them.
 _CUT = 0.25
 
 
 @dataclass(frozen=True)
 class Made:
-    """Something that is made for each view.
+    """Data that are computed for each view.
 
     Attributes:
-        seconds: of making it.
-        bytes: of all views together.
-        room: bytes that there are for them.
-        views: how many, where a view's is kept whole or not at all; None where any share of it is.
+        seconds: Seconds to compute the data of a view.
+        bytes: Size of the data of all views.
+        room: Memory budget in bytes.
+        views: Number of views, if the data of a view are cached completely or not at all; None if any fraction can be.
     """
 
     seconds: float
@@ -49,26 +50,26 @@ class Made:
 
     @property
     def kept(self) -> float:
-        """The share of the views for which it is kept."""
+        """Fraction of the views whose data are cached."""
         return self.fitting() / self.bytes if self.bytes else 1.0
 
     @property
     def once(self) -> float:
-        """Seconds at a view's first visit beside those of every visit, mean over views."""
+        """Additional seconds of a view's first visit, mean over views."""
         return self.kept * self.seconds
 
     @property
     def always(self) -> float:
-        """Seconds at every visit of a view, mean over views."""
+        """Seconds of every visit of a view, mean over views."""
         return (1 - self.kept) * self.seconds
 
     @property
     def kept_bytes(self) -> int:
-        """Memory that it takes at last."""
+        """Final memory use in bytes."""
         return int(self.fitting())
 
     def fitting(self, ranks: int = 1) -> float:
-        """Bytes that are kept on each of some ranks, among which every view is divided."""
+        """Return the bytes cached on each of some ranks, among which every view is divided."""
         own = self.bytes / ranks
         if own <= self.room:
             return own
@@ -77,20 +78,22 @@ class Made:
 
 @dataclass(frozen=True)
 class Visits:
-    """Everything that is made for the views of a job.
+    """All data that are computed for the views of a job.
 
     Attributes:
-        lists: of the rasterizer that computes weights anew.
-        surveyed: lists that the survey has made, of all views.
-        handed: share of the seconds of lists that are kept which the survey's save the job.
-        colors: of spherical harmonics.
-        weights: kept ones; None where none are.
-        content: features at all scales, with the render that they are of; `content_coarse`: of the coarsest alone.
-        maps: of the regions' shares.
-        images: of the content, which features with another color behind them are computed from.
-        raster: seconds of a render and its gradient, weights computed anew; `raster_kept`: with kept ones.
-        in_coarse: phase 1 makes lists, colors and weights, so that phase 2 finds them.
-        coarse_weights: phase 1 makes weights of its own.
+        lists: Tile intersections of the rasterizer that computes weights.
+        surveyed: Tile intersections cached by the survey, of all views.
+        handed: Fraction of the time for cached tile intersections that the survey's save.
+        colors: SH colors.
+        weights: Cached weights; None if there are none.
+        content: Content features at all scales, including their render.
+        content_coarse: Content features of the coarsest scale alone.
+        images: Content images, from which features are computed with another background color.
+        maps: Maps of the regions.
+        raster: Seconds of a render and its gradient with recomputed weights.
+        raster_kept: Seconds of a render and its gradient with cached weights.
+        in_coarse: Whether phase 1 already computes tile intersections, colors and weights for phase 2.
+        coarse_weights: Whether phase 1 computes weights of its own.
     """
 
     lists: Made
@@ -109,11 +112,15 @@ class Visits:
 
     @staticmethod
     def of(plan: Plan, probe: Probe, settings: Settings, work: Work, coarse: Work, content: int) -> Visits:
-        """Of a plan, as far as it is made.
+        """Predict the data for a plan under construction.
 
         Args:
-            work: of an iteration on all scales, and `coarse` on the coarsest alone.
-            content: bytes of the content features of all views.
+            plan: Plan under construction.
+            probe: Measured facts.
+            settings: Settings of the job.
+            work: Work of an iteration on all scales.
+            coarse: Work of an iteration on the coarsest scale.
+            content: Size in bytes of the content features of all views.
         """
         raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
         room = memory * MEMORY_SHARES["views"]
@@ -130,11 +137,11 @@ class Visits:
         rendered = RENDER * raster.seconds if settings.content_weight else 0.0
         forward = probe.network.rate.forward if settings.content_weight else 0.0
         room_of_content = 0 if "content" in settings.keep else room / (4 if probe.maps else 2)
-        share = coarse.pixels / work.pixels  # of the content's bytes, as of its pixels
+        share = coarse.pixels / work.pixels  # as a fraction of the content's bytes, equal to that of its pixels
         images = Made(0.0)
         if (
             plan.training_background != "background" and settings.content_weight
-        ):  # features are another color's at every visit
+        ):  # features depend on the step's background color
             pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
             room_of_images, room_of_content = room_of_content / 2, 0
             images, rendered = Made(rendered, _IMAGE_BYTES * pixels, room_of_images), 0.0
@@ -155,18 +162,18 @@ class Visits:
         )
 
     def rasterized(self) -> float:
-        """Seconds of a render and its gradient at a later visit, mean over views."""
+        """Return the seconds of a render and its gradient at a later visit, mean over views."""
         uncached = self.raster + self.lists.always
         if self.weights is not None:
             uncached = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * uncached
         return uncached + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
-        """Seconds of every visit beside rendering and the network: content that is not kept."""
+        """Return the seconds of every visit apart from rendering and network, for content that is not cached."""
         return (self.content_coarse if coarse else self.content).always + self.images.always + self.maps.always
 
     def first(self, *, coarse: bool) -> float:
-        """Seconds of a view's first visit in a phase beside those of its later visits."""
+        """Return the additional seconds of a view's first visit in a phase."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
         lists = (1 - self.handed) * self.lists.once + self.colors.once + self.maps.once
         keeping = self.weights.once if self.weights else 0.0
@@ -178,9 +185,9 @@ class Visits:
 
 
 def _maps(plan: Plan, probe: Probe, room: float) -> Made:
-    """Of the regions' shares in all views."""
+    """Return the cost of the region maps of all views."""
     if not probe.maps:
         return Made(0.0)
     pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
-    renders = 1 + -(-probe.maps // MAPS_OF_A_RENDER)  # and one of what lies behind
+    renders = 1 + -(-probe.maps // MAPS_OF_A_RENDER)  # plus one for the background
     return Made(RENDER * renders * probe.raster.seconds, MAP_BYTES * probe.maps * pixels, room)
