@@ -192,9 +192,7 @@ class _Deciding:
         return "float32" if exactly else "half"
 
     def _keeping_pays(self, visits: float) -> bool:
-        """Return whether cached blend weights save more time in this many visits per view than it takes to compute
-        them.
-        """
+        """Return whether caching blend weights pays off for this many visits of each view."""
         raster = self.probe.raster
         if self.probe.rasterizer not in GPU_RASTERIZERS:
             return visits >= LEAST_VISITS

@@ -1,1 +1,1 @@
-"""The optimizer: views, steps, phases, checkpoints."""
+"""Optimization: views, steps, phases and checkpoints."""

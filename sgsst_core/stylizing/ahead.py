@@ -1,4 +1,4 @@
-"""Photos for a GPU: the next one is read while the device works on a step."""
+"""Prefetching of photos for a GPU: the next one is read while the device works on a step."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-#: Content image [H, W, 3] of a view by its index, on the CPU.
+#: Function that loads the content image [H, W, 3] of a view by its index, on the CPU.
 PhotoLoader = Callable[[int], Tensor]
 
 
 class PhotosAhead:
-    """Hands out photos on a GPU without a wait for it, and has a thread read one of them in advance.
+    """Loader that copies photos to a GPU without synchronizing, and prefetches one of them in a thread.
 
-    Photos lie in pinned memory until they are copied, so that the copy is only one more entry in the device's stream.
-    Their memory is not written to before it is done: PyTorch marks pinned memory with an event at each such copy, and
-    gives it out again only once the device has come there. There is never more than one photo in advance, and no thread
-    but between `begin` and `end`.
+    Photos are loaded into pinned memory, so that a copy is just another entry in the device's stream. This memory is
+    not overwritten before the copy is done: PyTorch marks pinned memory with an event at each such copy, and reuses it
+    only once the device has reached that event. At most one photo is prefetched at a time, and the thread exists only
+    between `begin` and `end`.
 
-    The thread reserves pinned memory whenever it comes to it, which CUDA takes for a mistake of a graph that is
-    captured at the time, unless the capture heeds its own thread alone (`capture_error_mode="thread_local"`).
+    The thread may allocate pinned memory while a graph is being captured, which CUDA treats as an error of the capture
+    unless it is restricted to its own thread (`capture_error_mode="thread_local"`).
 
     Args:
-        load: reads a photo; called in the thread too.
-        device: a CUDA device.
+        load: Function that reads a photo; also called in the thread.
+        device: CUDA device.
     """
 
     def __init__(self, load: PhotoLoader, device: torch.device) -> None:
         self._load = load
-        # A thread begins with the first device as its own: it has to be told which one is meant.
+        # A new thread starts on the first device, so the device must be explicit.
         self._device = torch.device("cuda", torch.cuda.current_device()) if device.index is None else device
         self._thread: ThreadPoolExecutor | None = None
         self._next: tuple[int, Future[Tensor]] | None = None
 
     def begin(self, index: int) -> None:
-        """Let the thread read a photo; the one that was read in advance, if it is another one, is given up."""
+        """Start reading a photo in the thread; a different prefetched photo is discarded."""
         if self._next is not None:
             if self._next[0] == index:
                 return
@@ -47,10 +47,10 @@ class PhotosAhead:
         self._next = index, self._thread.submit(self._pinned, index)
 
     def __call__(self, index: int) -> Tensor:
-        """A photo [H, W, 3] on the device: the one that was read in advance, or another one, read now.
+        """Return a photo [H, W, 3] on the device: the prefetched one, or another one that is read now.
 
         Raises:
-            ImageError: whatever `load` raises, in the thread or here.
+            ImageError: If reading fails, in the thread or here.
         """
         if self._next is not None and self._next[0] == index:
             photo, self._next = self._next[1], None
@@ -58,7 +58,7 @@ class PhotosAhead:
         return self._copied(self._pinned(index))
 
     def end(self) -> None:
-        """Wait until the thread is gone, and give up what it has read. `begin` would start another one."""
+        """Stop the thread, and discard what it has read. `begin` starts a new one."""
         if self._thread is not None:
             self._thread.shutdown(cancel_futures=True)
         self._thread = self._next = None

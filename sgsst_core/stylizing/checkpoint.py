@@ -1,7 +1,6 @@
-"""Checkpoints: one safetensors file with everything that a resumed run needs, tied to its job by a fingerprint.
+"""Checkpoints: safetensors files with everything that a resumed run needs, tied to their job by a fingerprint.
 
-The last two are kept. Each holds a digest of its own content, so that one that was damaged is noticed, and the one
-before takes its place.
+The last two are stored. Each contains a digest of its content. If one is damaged, the previous one is used.
 """
 
 from __future__ import annotations
@@ -37,27 +36,27 @@ from sgsst_core.settings import Settings
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 
-#: Raised whenever the meaning of a stored value changes.
+#: Increased whenever the meaning of a stored value changes.
 FORMAT_VERSION = "5"
-#: Its predictions count the memory of a GPU as the process's, nothing else is said of it, and cuDNN tries nothing.
+#: Version whose predictions count GPU memory as process memory, and whose plans never use cuDNN's search.
 _ONE_MEMORY = "4"
-#: Its plans do not say which network and rasterizer run; see `_completed`.
+#: Version whose plans do not specify precision and rasterizer; see `_completed`.
 _PLANS_WITHOUT_DEVICE = "3"
-#: Settings that may differ between a checkpoint and the run that goes on from it: they only end it or say what is
-#: measured, or (the memory limit, which decides the partition) change no more than its rounding.
+#: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
+#: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit", "measure"}
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What an unfinished job goes on from.
+    """State from which an unfinished job resumes.
 
     Attributes:
-        state: of the stylizer.
-        plan: that the job follows; with it a resumed run need not look at every view again.
-        ranks: that there were when the plan was made.
-        run: identifies the run of the program that wrote it.
-        written_by: versions of the program and of PyTorch.
+        state: State of the stylizer.
+        plan: Plan of the job, which saves a resumed run from surveying the views again.
+        ranks: Number of ranks when the plan was made.
+        run: Identifier of the program run that wrote it.
+        written_by: Versions of the program and of PyTorch.
     """
 
     state: StylizerState
@@ -68,10 +67,10 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """The last two checkpoints of a job.
+    """Last two checkpoints of a job.
 
     Args:
-        latest: file of the newer one; the older one lies beside it.
+        latest: Path of the newer file; the older one is in the same folder.
     """
 
     def __init__(self, latest: Path) -> None:
@@ -80,14 +79,14 @@ class Checkpoints:
 
     @property
     def exist(self) -> bool:
-        """Whether there is one, of whatever job."""
+        """Whether there is a checkpoint, of any job."""
         return self.latest.exists() or self.previous.exists()
 
     def save(self, checkpoint: Checkpoint, job: str) -> None:
-        """Write the newest one, and keep the one before; at any moment there is a whole one.
+        """Write a new checkpoint and keep the previous one. There is a complete one at any moment.
 
         Raises:
-            OutputError: the file cannot be written; the newest of those that are there stays.
+            OutputError: If the file cannot be written; the newest existing checkpoint remains.
         """
         with atomic_path(self.latest) as temporary:
             _write(temporary, checkpoint, job)
@@ -95,14 +94,15 @@ class Checkpoints:
                 self.latest.replace(self.previous)
 
     def load(self, job: str, warn: Callable[[str], None], run: str | None = None) -> Checkpoint:
-        """The newest one that can be used by the job with that fingerprint.
+        """Return the newest usable checkpoint of the job with this fingerprint.
 
         Args:
-            warn: told why one was passed over.
-            run: take only what this run of the program has written.
+            job: Fingerprint of the job.
+            warn: Callback for the reason why a checkpoint was skipped.
+            run: Program run whose checkpoints are accepted; None for any.
 
         Raises:
-            CheckpointError: there is none, or none that can be used.
+            CheckpointError: If there is no usable checkpoint.
         """
         try:
             return load_checkpoint(self.latest, job, run)
@@ -117,13 +117,13 @@ class Checkpoints:
             return found
 
     def remove(self) -> None:
-        """Delete both."""
+        """Delete both checkpoints."""
         self.latest.unlink(missing_ok=True)
         self.previous.unlink(missing_ok=True)
 
 
 def versions() -> dict[str, str]:
-    """Of this program ("unknown" where it is not installed) and of PyTorch."""
+    """Return the versions of this program ("unknown" if it is not installed) and of PyTorch."""
     try:
         program = version("sgsst-service")
     except PackageNotFoundError:
@@ -140,12 +140,16 @@ def fingerprint(
     photos: str = "",
     regions: Regions | None = None,
 ) -> str:
-    """SHA-256 over all that decides the course of a job.
+    """Return a SHA-256 digest of everything that determines the course of a job.
 
     Args:
-        weights: digest of the feature network's.
-        photos: whatever identifies the content images; empty for unstylized renders.
-        regions: of the scene; None where it has none.
+        scene: Scene to stylize.
+        cameras: Cameras of the views.
+        style: Style image [H, W, 3], or a mixture.
+        settings: Settings of the job.
+        weights: Digest of the feature network's weights.
+        photos: Identifier of the content images; empty for unstylized renders.
+        regions: Regions of the scene; None if there are none.
     """
     digest = hashlib.sha256(repr((weights, photos)).encode())
     mixture = StyleMixture.of(style)
@@ -166,13 +170,13 @@ def fingerprint(
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
     digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
-    if settings.feature_scale == "even":  # factors that a later version may choose otherwise: a run keeps to one loss
+    if settings.feature_scale == "even":  # later versions may choose other factors, but a run must stay with one loss
         digest.update(repr((EVEN_SCALE, EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE)).encode())
     return digest.hexdigest()
 
 
 def _add_regions(digest: Any, regions: Regions) -> None:
-    """Which Gaussians belong together, and what becomes of them; not what they are called."""
+    """Add the grouping and treatment of Gaussians to a digest, without the names of the regions."""
     digest.update(regions.labels.contiguous().numpy().data)
     for region in regions.every:
         pictures, weights = (region.style.pictures, region.style.weights) if region.style else ((), ())
@@ -182,10 +186,10 @@ def _add_regions(digest: Any, regions: Regions) -> None:
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, job: str) -> None:
-    """Write a checkpoint of the job with that fingerprint; it appears whole or not at all.
+    """Write a checkpoint of the job with this fingerprint, atomically.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     with atomic_path(path) as temporary:
         _write(temporary, checkpoint, job)
@@ -218,17 +222,17 @@ def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
     }
     try:
         save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
-    except SafetensorError as error:  # what the system said is in the text alone
+    except SafetensorError as error:  # the operating system's error is contained only in the text
         if "os error" not in str(error).lower():
             raise
         raise OSError(_error_number(str(error)), str(error)) from error
 
 
 def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
-    """Read a checkpoint of the job with that fingerprint; with `run`, only one that this run of the program wrote.
+    """Read a checkpoint of the job with this fingerprint; with `run`, only one written by that program run.
 
     Raises:
-        CheckpointError: missing or corrupt file, or another job's.
+        CheckpointError: If the file is missing, corrupt, or from another job.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint to resume from. Start again without --resume.")
@@ -261,7 +265,7 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
-    """SHA-256 of everything that a checkpoint holds."""
+    """Return a SHA-256 digest of a checkpoint's content."""
     digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name].contiguous()
@@ -271,7 +275,7 @@ def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
 
 
 def _error_number(text: str) -> int:
-    """The number in "No space left on device (os error 28)"; 0 where there is none."""
+    """Return the number in "No space left on device (os error 28)"; 0 if there is none."""
     digits = text.lower().rpartition("os error")[2].strip(" )")
     return int(digits) if digits.isdigit() else 0
 
@@ -293,11 +297,11 @@ def _state(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Styliz
 
 
 def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """A plan's tensors, and the rest for JSON."""
+    """Split a plan into its tensors and JSON-serializable values."""
     tensors = {
         "plan.total_weights": plan.survey.total_blend_weights,
         "plan.optimized": plan.optimized,
-        "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not take twice
+        "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not accept twice
     }
     nothing = torch.empty(0)  # `asdict` would copy them
     refinement = plan.refinement
@@ -315,7 +319,7 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _plan_values(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """A plan's values, whichever version wrote them."""
+    """Return the values of a plan from any supported format version."""
     values: dict[str, Any] = json.loads(metadata["plan"])
     if metadata["version"] == _PLANS_WITHOUT_DEVICE:
         return _completed(values, json.loads(metadata["memory"]))
@@ -323,9 +327,9 @@ def _plan_values(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _completed(values: dict[str, Any], memory: int) -> dict[str, Any]:
-    """A plan of version 3 with what it left to the stylizer: on the CPU, as all of its measurements.
+    """Add to a plan of version 3 what it left to the stylizer, for a CPU, where all measurements of that version ran.
 
-    On a GPU gsplat may have run instead, which a new plan decides there.
+    On a GPU gsplat may have run instead; there, a new plan decides.
     """
     precision = "features in bfloat16" in [line["decision"] for line in values["decisions"]]
     return {

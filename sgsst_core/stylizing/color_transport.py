@@ -1,10 +1,11 @@
-"""Colors with the distribution of other colors: which one becomes which, by transport along one axis after another.
+"""Transport of colors to the distribution of other colors, along one axis after another.
 
-Along one axis the optimal transport is known: the smallest value becomes the smallest one wanted, the median the
-median. Done along three axes that are at right angles, then along three others, and so on, the distributions come
-together (Pitié, Kokaram and Dahyot, "Automated color grading using color distribution transfer", 2007). It is a map
-of colors, so that equal ones stay equal, and nearly one into the wanted colors' hull, so that nothing is cut off:
-a dark scene gets the bright style's dark strokes too, where its mean and spread alone would end in white.
+Along a single axis the optimal transport is known: sorted values map to sorted target values, so the minimum maps to
+the minimum and the median to the median. Repeating this for three perpendicular axes, then for three others, and so on,
+makes the distributions converge (Pitié, Kokaram and Dahyot, "Automated color grading using color distribution
+transfer", 2007). The result is a function of color, so equal colors stay equal. It maps almost into the convex hull of
+the target colors, so nothing is clipped: a dark scene also gets the dark strokes of a bright style, whereas matching
+only mean and spread would end in white.
 """
 
 from __future__ import annotations
@@ -18,30 +19,30 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.stylizing import color_transport_kernels
 
-#: Sets of axes. The distance that is left falls to that of the samples within so many.
+#: Number of rounds, each with its own axes; enough to reduce the remaining distance to that between samples.
 ROUNDS = 16
-#: Colors of each side that distributions are taken from, at most, and values by which one axis is told (a power of 2).
+#: Maximum number of colors sampled from each side, and number of knots per axis (a power of 2).
 _SAMPLES = 1 << 16
 _KNOTS = 1 << 9
-#: Values that are nearer to each other than this are one: a flat scene must not be pulled apart by its rounding.
+#: Values closer to each other than this count as equal: a flat scene must not be stretched by its rounding errors.
 _APART = 1e-6
-#: What colors are brought to first: beyond it their order counts for nothing, and turning them would lose digits.
+#: Colors are first clamped to this magnitude. Beyond it their order is irrelevant, and rotating them would lose digits.
 _FARTHEST = 10.0
-#: Root of x^4 = x + 4, from which, with the square root of 2, turns spread evenly: Alexa, "Super-Fibonacci Spirals:
-#: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
+#: Root of x^4 = x + 4. Together with the square root of 2, it generates evenly distributed rotations: Alexa,
+#: "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
 _PSI = 1.533751168755204288118041
 
-#: A transport along one axis: values, rising, and what they become, [k] each.
+#: Transport along one axis: values in ascending order and their targets, [k] each.
 _Map = tuple[Tensor, Tensor]
 
 
 def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
-    """Colors with the distribution of others.
+    """Transform colors to the distribution of other colors.
 
     Args:
         colors: [N, 3] float64, finite.
-        weights: [N] float64, how much each counts; none negative, at least one positive.
-        wanted: [M, 3] float64 in 0..1, at least one, each of which counts alike.
+        weights: [N] float64, non-negative and at least one positive.
+        wanted: [M, 3] float64 in 0..1, at least one, with equal weights.
 
     Returns:
         [N, 3] float64.
@@ -52,7 +53,7 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
 
 
 def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
-    """Axes [3, 3] of each round with the map along each of them, for samples [n, 3] of either side."""
+    """Return the axes [3, 3] of each round with the maps along them, given samples [n, 3] of both sides."""
     found: list[tuple[Tensor, list[_Map]]] = []
     for axes in _turns():
         axes = axes.to(source.device)
@@ -63,7 +64,7 @@ def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
 
 
 def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """Colors [n, 3] after some rounds."""
+    """Transform colors [n, 3] by some rounds."""
     for axes, maps in rounds:
         along = zip((colors @ axes).unbind(1), maps, strict=True)
         colors = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
@@ -71,7 +72,7 @@ def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Ten
 
 
 def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """`_through` on CPUs, for many colors."""
+    """Compute `_through` for many colors on the CPU."""
     knots = torch.full((len(rounds), 3, _KNOTS), math.inf, dtype=torch.float64)
     targets = torch.empty_like(knots)
     for number, (_, maps) in enumerate(rounds):
@@ -87,14 +88,17 @@ def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]
 
 
 def _drawn(weights: Tensor) -> Tensor:
-    """Places [_SAMPLES] of colors, each as often as it counts: at equal steps of the running sum."""
+    """Return indices [_SAMPLES] of colors with frequencies proportional to their weights.
+
+    They are at equal steps of the cumulative weights.
+    """
     running = weights.cumsum(0)
     steps = (torch.arange(_SAMPLES, dtype=running.dtype, device=running.device) + 0.5) * (running[-1] / _SAMPLES)
     return torch.searchsorted(running, steps).clamp_max(len(weights) - 1)
 
 
 def _turns() -> Iterator[Tensor]:
-    """Axes [3, 3] of each round, as columns: red, green and blue first, then evenly spread turns of these."""
+    """Yield the axes [3, 3] of each round as columns: red, green and blue first, then evenly distributed rotations."""
     yield torch.eye(3, dtype=torch.float64)
     for number in range(ROUNDS - 1):
         part, angle = (number + 0.5) / (ROUNDS - 1), 2 * math.pi * (number + 0.5)
@@ -104,7 +108,7 @@ def _turns() -> Iterator[Tensor]:
 
 
 def _turn(w: float, x: float, y: float, z: float) -> Tensor:
-    """The rotation [3, 3] of a unit quaternion."""
+    """Return the rotation matrix [3, 3] of a unit quaternion."""
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -114,9 +118,9 @@ def _turn(w: float, x: float, y: float, z: float) -> Tensor:
 
 
 def _along(values: Tensor, wanted: Tensor) -> _Map:
-    """The transport along one axis, from some values [n] to others [m]: knots, rising, and what they become.
+    """Return the transport along one axis from values [n] to others [m].
 
-    Values that are one become the mean of all that they would have to become.
+    Equal values map to the mean of all their targets.
     """
     knots, targets = _quantiles(values), _quantiles(wanted)
     apart = torch.diff(knots, prepend=knots[:1] - 1) > _APART
@@ -127,14 +131,14 @@ def _along(values: Tensor, wanted: Tensor) -> _Map:
 
 
 def _quantiles(values: Tensor) -> Tensor:
-    """Of values [n], [_KNOTS] from the least to the largest."""
+    """Return [_KNOTS] quantiles of values [n], from the minimum to the maximum."""
     ordered = values.sort().values
     places = torch.linspace(0, len(ordered) - 1, _KNOTS, dtype=torch.float64, device=values.device)
     return ordered[places.round().long()]
 
 
 def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
-    """Values [n] through a piecewise linear map, whose ends hold beyond it."""
+    """Map values [n] by a piecewise linear function that is constant beyond its ends."""
     if len(knots) == 1:
         return targets.expand(len(values))
     place = torch.searchsorted(knots, values.contiguous()).clamp(1, len(knots) - 1)

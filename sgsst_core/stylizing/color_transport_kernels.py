@@ -1,6 +1,6 @@
-"""Compiled kernel of `color_transport` on CPUs: all rounds in one pass over the colors, on all cores."""
+"""Numba kernel of `color_transport`: all rounds in one pass over the colors, on all CPU cores."""
 
-# The types of compiled functions are those of their arguments.
+# Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ import numpy as np
 
 from sgsst_core.compiled import compiled
 
-#: Colors that go through one round after another together: they and a round's maps stay in a core's nearest caches.
+#: Number of colors that pass through the rounds together; they and the maps of a round stay in a core's L1 and L2
+#: caches.
 _TOGETHER = 512
 
 
 @compiled()
 def _map(values, places, knots, targets, slopes):
-    """Values [n] through a piecewise linear map of knots [k], whose ends hold beyond it, in place."""
-    # One step of the search for all values, then the next: which half a value is in cannot be foretold, and so no
-    # branch hangs on it.
+    """Map values [n] in place by a piecewise linear function with knots [k], constant beyond its ends."""
+    # Each step of the binary search runs over all values before the next one starts. Which half a value is in is
+    # unpredictable, so the code contains no branch on it.
     for i in range(len(values)):
         values[i] = max(values[i], knots[0])
         places[i] = 0
@@ -34,12 +35,13 @@ def _map(values, places, knots, targets, slopes):
 
 @compiled(parallel=True)
 def through(colors, axes, knots, targets):
-    """Colors [n, 3] float64 after all rounds, in place.
+    """Transform colors by all rounds, in place.
 
     Args:
-        axes: [r, 3, 3], as columns.
-        knots, targets: [r, 3, k], k a power of 2: where each axis' map bends, rising, and what becomes of these values;
-            knots that are left over are infinite, and their targets the last one.
+        colors: [n, 3] float64.
+        axes: [r, 3, 3], axes of each round as columns.
+        knots: [r, 3, k] with k a power of 2, ascending: knots of each axis' map. Unused knots are infinite.
+        targets: [r, 3, k], values at the knots; for unused knots, the last value.
     """
     slopes = np.zeros_like(knots)
     slopes[..., :-1] = (targets[..., 1:] - targets[..., :-1]) / (knots[..., 1:] - knots[..., :-1])

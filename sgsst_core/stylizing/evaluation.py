@@ -1,4 +1,4 @@
-"""The SOS loss of colors on some views, split by scale."""
+"""SOS loss of given colors on some views, split by scale."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ StyleTargets = dict[int, ScaleTarget]
 
 
 def evaluation_views(covered: Sequence[int], most: int) -> list[int]:
-    """At most so many of some views, evenly spread; the contact sheet shows them too."""
+    """Return at most `most` views, evenly spread; the contact sheet shows the same ones."""
     count = min(most, len(covered))
     return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
 
@@ -26,7 +26,7 @@ def evaluation_views(covered: Sequence[int], most: int) -> list[int]:
 def evaluate(
     views: Views, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
 ) -> Evaluation:
-    """Mean SOS loss of colors [n, 3] over views, split by scale."""
+    """Return the mean SOS loss of colors [n, 3] over views, split by scale."""
     evaluations = []
     for index in indices:
         camera = views.cameras[index]
@@ -38,7 +38,7 @@ def evaluate(
 
 
 def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """Mean over views, scale by scale."""
+    """Return the mean over views, scale by scale."""
     total: Evaluation = {}
     for evaluation in evaluations:
         for scale, part in evaluation.items():
@@ -47,5 +47,5 @@ def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
 
 
 def mean_loss(evaluation: Evaluation, weights: ScaleWeights = EVEN) -> float:
-    """E_SOS: the weighted mean of the scales' losses."""
+    """Return E_SOS, the weighted mean of the losses of all scales."""
     return weights.mean({scale: terms.total for scale, terms in evaluation.items()})

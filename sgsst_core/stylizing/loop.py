@@ -1,7 +1,7 @@
-"""The optimizer loop: all steps of a job, and when it ends before them.
+"""Optimization loop: run all steps of a job, and decide when to stop early.
 
-The loop prints nothing and writes nothing; what is to be shown or saved goes through `Callbacks`. Of several ranks,
-each runs it; the first one decides when it ends.
+The loop neither prints nor writes; whatever is to be displayed or saved goes through `Callbacks`. With several ranks,
+each runs the loop, and the first one decides when it stops.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interr
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress bar shows.
+    """Progress of a job, as for a progress bar.
 
     Attributes:
-        stage: "coarse" or "sos", of the step that was made; "measuring" where the job is measured after it.
-        step: made so far, of `total`.
-        loss: of the step.
-        seconds: of all steps so far.
-        seconds_left: until the job ends, with all that is measured and written.
-        scales: loss of the step by scale, full size first; None for scales that it has left out.
+        stage: Phase of the completed step, "coarse" or "sos"; "measuring" if a measurement follows it.
+        step: Number of completed steps.
+        total: Total number of steps.
+        loss: Loss of the step.
+        seconds: Seconds of all steps so far.
+        seconds_left: Remaining seconds of the job, including measurements and output.
+        scales: Loss of the step by scale, full size first; None for skipped scales.
     """
 
     stage: str
@@ -51,30 +52,32 @@ class Progress:
 
 
 class Measuring(Protocol):
-    """Measures a job at moments between its steps."""
+    """Measurement of a job at certain steps."""
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Measure now; puts an entry into `Stylizer.measured`."""
+        """Measure now, and append an entry to `Stylizer.measured`."""
 
     def due(self, step: int) -> bool:
-        """Whether the job is to be measured after so many steps."""
+        """Return whether the job is to be measured after this many steps."""
 
     def seconds_left(self, step: int) -> float:
-        """That measuring is expected to take after so many steps."""
+        """Return the expected seconds of the remaining measurements after this many steps."""
 
 
 @dataclass
 class Callbacks:
-    """What the loop calls between iterations; each is optional.
+    """Optional callbacks of the loop, called between iterations.
 
-    `measure` is the same on every rank; the others are the first rank's alone.
+    `measure` must be the same on every rank; the others are only for the first rank.
 
     Attributes:
-        progress: after every iteration.
-        stop: asked before every iteration; True ends the loop as "interrupted".
-        checkpoint: called with the stylizer about every `checkpoint_seconds`, and once when the loop ends early.
-        preview: called with the stylizer before the first step and about every `preview_seconds`.
-        measure: called with the stylizer after each step for which it is due; its time does not count as the job's.
+        progress: Called after every iteration.
+        stop: Called before every iteration; True ends the loop as "interrupted".
+        checkpoint: Called with the stylizer about every `checkpoint_seconds`, and once if the loop ends early.
+        checkpoint_seconds: Seconds between checkpoints.
+        preview: Called with the stylizer before the first step and about every `preview_seconds`.
+        preview_seconds: Seconds between previews.
+        measure: Called with the stylizer after each step for which it is due; its time does not count as the job's.
     """
 
     progress: Callable[[Progress], None] | None = None
@@ -87,7 +90,7 @@ class Callbacks:
 
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
-    """Iterate to the end of the schedule, or until one of the settings' limits or `callbacks.stop` ends it before."""
+    """Iterate to the end of the schedule, unless a limit in the settings or `callbacks.stop` ends the run earlier."""
     try:
         return _iterate(stylizer, callbacks or Callbacks())
     finally:
@@ -95,12 +98,12 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
 
 
 def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
-    """As `run`, which clears up after it."""
+    """Iterate as `run` does, without its cleanup."""
     last_checkpoint = last_preview = time.perf_counter()
     pace = _pace(stylizer)
     if callbacks.preview and not stylizer.step:
         callbacks.preview(stylizer)
-    _measure(stylizer, callbacks)  # where a resumed job had not come to it
+    _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
     while stylizer.step < stylizer.total:
         reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
@@ -121,7 +124,7 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
 
 
 def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
-    """Whether the user or the clock ends the run before the next step; ranks may see these differently."""
+    """Return whether the user or the clock ends the run before the next step; ranks may disagree."""
     if callbacks.stop and callbacks.stop():
         return "interrupted"
     seconds = stylizer.settings.max_seconds
@@ -129,12 +132,12 @@ def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
 
 
 def _enough(stylizer: Stylizer) -> Stopped | None:
-    """Whether the losses end the run before the next step; they are the same on every rank."""
+    """Return whether the losses end the run before the next step; ranks always agree."""
     settings = stylizer.settings
     if not (settings.target_loss or settings.early_stop):
         return None
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]
-    if settings.target_loss and len(losses) >= stylizer.round_length:  # every view has been visited by then
+    if settings.target_loss and len(losses) >= stylizer.round_length:  # all views have been visited at this point
         target = settings.target_loss * mean_loss(stylizer.start(), stylizer.loss.weights)
         if stylizer.plan.training_background != "background":
             losses = _losses_on_background(stylizer)
@@ -144,7 +147,11 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
 
 
 def _losses_on_background(stylizer: Stylizer) -> list[float]:
-    """The loss as the start's was taken, once in a round, as often as it has steps: those of steps do not compare."""
+    """Return the current loss on the plain background, evaluated like the initial loss; empty within a round.
+
+    Losses of steps with different backgrounds are not comparable. At the end of a round, the loss is repeated for each
+    of its steps.
+    """
     if stylizer.step % stylizer.round_length:
         return []
     with stylizer.measuring():
@@ -158,7 +165,7 @@ def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
 
 
 def _pace(stylizer: Stylizer) -> SecondsLeft:
-    """What tells the seconds left, with the steps of sessions before this one."""
+    """Return the estimator of the remaining time, including the steps of earlier sessions."""
     expected = stylizer.plan.prediction or Prediction(0.0, 0.0, 0)
     seconds = {
         "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
@@ -167,7 +174,7 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
     phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.schedule]
     views_per_step = stylizer.settings.views_per_step
     pace = SecondsLeft(phases, stylizer.views.covered, views_per_step)
-    if views_per_step == 1:  # records name one view of each step
+    if views_per_step == 1:  # a record names only one view of its step
         before = 0.0
         for record in stylizer.history:
             pace.add_step(record.stage, [record.view], record.seconds - before, record.parts.get("prepare", 0.0))
@@ -177,7 +184,7 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
 
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
-    """Make a step and count what it took, but for the style, which comes once."""
+    """Run and time one step, without the one-off style setup."""
     before, style_before = stylizer.seconds, stylizer.style_seconds
     record = stylizer.run_step()
     style = stylizer.style_seconds - style_before
@@ -210,7 +217,7 @@ def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Sto
 
 
 def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
-    """Save, and count the seconds beside those of the steps."""
+    """Save a checkpoint, and record its time separately from the steps."""
     started = time.perf_counter()
     save(stylizer)
     parts = stylizer.seconds_by_part
@@ -227,11 +234,11 @@ def stylize(
     photos: PhotoLoader | None = None,
     callbacks: Callbacks | None = None,
 ) -> Tensor:
-    """Stylize a scene from beginning to end; the arguments are those of `Stylizer.planned`.
+    """Stylize a scene from start to finish. Arguments are those of `Stylizer.planned`.
 
     Returns:
-        The new sh_dc [N, 3], float32 on the CPU. Everything else of the scene stays as it is. (Of a refined scene
-        they are of its Gaussians: `Stylizer.planned` has it.)
+        New sh_dc [N, 3], float32 on the CPU; everything else of the scene is unchanged. For a refined scene, N is the
+            number of its Gaussians; use `Stylizer.planned` to get that scene.
     """
     stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, photos=photos)
     run(stylizer, callbacks)

@@ -1,4 +1,4 @@
-"""Adam on the DC colors, guarded against gradients that it cannot square."""
+"""Adam for DC colors, with protection against gradients that overflow when squared."""
 
 from __future__ import annotations
 
@@ -9,30 +9,32 @@ from torch.optim.adam import adam
 from sgsst_core.scene.luminance import with_chroma_of
 from sgsst_core.scene.screen import on_screen, on_screen_by_luminance
 
-#: Adam's epsilon: as good as none, so that Gaussians of any blend weight move at the learning rate (SGSST).
+#: Adam's epsilon: practically zero, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
-#: Decay of the first and the second moment, the usual ones.
+#: Decay rates of the first and second moment, the usual ones.
 _BETA1, _BETA2 = 0.9, 0.999
-#: Adam squares gradients in float32. Beyond this a square is infinite and its value would never move again, silently.
+#: Adam squares gradients in float32. Beyond this limit the square is infinite, and the value would silently stop
+#: moving.
 LARGEST_GRADIENT = 1e19
 
 
 class ColorOptimizer:
-    """Adam (Kingma and Ba 2015) on one tensor of colors.
+    """Adam (Kingma and Ba 2015) for a single tensor of colors.
 
-    On a GPU a step is one kernel, which looks itself whether it is to be made: the host need not wait to be told.
+    On a GPU, a step is one kernel that checks by itself whether the gradient is usable, so the host need not
+    synchronize.
 
-    The steps are PyTorch's function `adam`. Its class `Adam` makes the same ones, and imports PyTorch's compiler on the
-    way: two seconds of every process that optimizes, and nothing here is compiled.
+    Steps use PyTorch's function `adam`. Its class `Adam` gives the same steps but imports PyTorch's compiler, which
+    takes two seconds per process although nothing is compiled here.
 
     Args:
-        colors: [n, 3] float32, changed in place.
-        unit: of the features that gradients come from (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
-            gradients grow with its square, and would sooner be too large to be squared.
-        chroma_of: [n, 3], colors whose chroma is kept: what is optimized is then how far each color's luminance is
-            from theirs. None lets colors change freely.
-        bounded: bring colors back into 0..1 after each step (`scene.screen`).
-        kept: [n, 1], those that stay as they are, whose gradients are 0. None where there are none.
+        colors: [n, 3] float32, updated in place.
+        unit: Unit of the features behind the gradients (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
+            gradients grow with its square and would overflow earlier.
+        chroma_of: [n, 3], colors whose chroma is preserved: the optimized quantity is then each color's difference from
+            them in luminance. None to let colors change freely.
+        bounded: Whether to project colors to 0..1 after each step (`scene.screen`).
+        kept: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
     """
 
     def __init__(
@@ -53,21 +55,22 @@ class ColorOptimizer:
         self._steps = torch.zeros((), dtype=torch.float32, device=colors.device if self._fused else None)
 
     def update(self, gradient: Tensor, learning_rate: float) -> Tensor:
-        """One step, but for a gradient [n, 3] that is beyond `LARGEST_GRADIENT` or not finite: then nothing changes.
+        """Make one step. If the gradient [n, 3] is not finite or exceeds `LARGEST_GRADIENT`, nothing changes.
 
         Returns:
-            The largest magnitude in the gradient, in units of a 0-255 input: a scalar on the colors' device. The
-            caller looks whether it was too large, when it next waits for the device anyway.
+            Largest magnitude in the gradient, in units of a 0-255 input: a scalar on the colors' device. The caller
+                checks whether it was too large when it next synchronizes with the device.
         """
         if self._unit != 1:
             gradient = gradient / self._unit**2
         if self._chroma_of is not None:
-            # The derivative with respect to what is added to all three channels. Adam's steps are the same in each.
+            # The derivative with respect to a value added to all three channels. Adam's steps are then the same in each
+            # channel.
             gradient = gradient.sum(dim=1, keepdim=True).expand(-1, 3).contiguous()
         largest = gradient.abs().amax()
         self._colors.grad = gradient.to(self._colors.dtype)
         if self._fused:
-            # PyTorch's way to tell a fused step that its gradient cannot be used, made for scaled half precision.
+            # PyTorch's flag for an unusable gradient in a fused step, intended for scaled half precision.
             self._step(learning_rate, torch.logical_not(largest <= LARGEST_GRADIENT).float())
         elif not is_too_large(float(largest)):
             self._step(learning_rate)
@@ -78,7 +81,7 @@ class ColorOptimizer:
 
     @torch.no_grad()
     def _step(self, learning_rate: float, found_inf: Tensor | None = None) -> None:
-        """Where `found_inf` is not 0, nothing changes."""
+        """Make a step, unless `found_inf` is non-zero."""
         assert self._colors.grad is not None
         adam(
             [self._colors],
@@ -100,9 +103,9 @@ class ColorOptimizer:
 
     @torch.no_grad()
     def _constrain(self, largest: Tensor) -> None:
-        """Bring colors back to where they may be: within the bounds, with their chroma.
+        """Project colors to their constraints: range and chroma.
 
-        Where no step was made, and of kept Gaussians, nothing changes.
+        Frozen colors do not change, and neither does any color if no step was made.
         """
         if not self._bounded and self._chroma_of is None:
             return
@@ -113,23 +116,23 @@ class ColorOptimizer:
         self._colors.copy_(torch.where(unchanged, self._colors, found))
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        """First and second moment [n, 3], on the CPU; zeros before the first step."""
+        """Return the first and second moment [n, 3] on the CPU; zeros before the first step."""
         return self._first.cpu().clone(), self._second.cpu().clone()
 
     def load_moments(self, step: int, first: Tensor, second: Tensor) -> None:
-        """Go on after so many steps, at least one, with their moments [n, 3]."""
+        """Resume after at least one step, with its moments [n, 3]."""
         self._steps.fill_(step)
         self._first.copy_(first)
         self._second.copy_(second)
 
 
 def constrained(colors: Tensor, chroma_of: Tensor | None, *, bounded: bool) -> Tensor:
-    """DC coefficients [n, 3], brought into the bounds where there are some, without rounding of their chroma.
+    """Project DC coefficients [n, 3] to their constraints, without accumulating rounding errors in their chroma.
 
     Args:
         colors: [n, 3].
-        chroma_of: [n, 3], colors that they differ from in luminance alone; None where they may in anything.
-        bounded: whether colors stay in 0..1.
+        chroma_of: [n, 3], colors whose chroma is preserved; None if chroma may change.
+        bounded: Whether colors must be in 0..1.
     """
     if chroma_of is None:
         return on_screen(colors) if bounded else colors
@@ -137,5 +140,5 @@ def constrained(colors: Tensor, chroma_of: Tensor | None, *, bounded: bool) -> T
 
 
 def is_too_large(largest: float) -> bool:
-    """Whether a gradient of that largest magnitude (NaN included) cannot be used."""
+    """Return whether a gradient with this largest magnitude (possibly NaN) is unusable."""
     return not largest <= LARGEST_GRADIENT

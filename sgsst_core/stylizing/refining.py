@@ -1,7 +1,8 @@
-"""Cutting large Gaussians before a job: look at the views, ask the loss, cut, and prove that the picture stays.
+"""Refinement: split large Gaussians before a job, without changing the unstylized image.
 
-Nothing is stylized yet. The gradient is taken once for each view, of colors that have the style's mean and spread in
-closed form: what first steps would reach, and what is left to ask for is texture.
+It surveys the views, determines from the loss where finer Gaussians are needed, splits, and verifies the image. Nothing
+is stylized yet. The gradient is computed once per view, for colors that already have the style's mean and spread in
+closed form: this is what the first steps would reach, so the rest of the gradient asks for texture.
 """
 
 from __future__ import annotations
@@ -38,13 +39,14 @@ from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.warm_start import with_moments
 
-#: Views whose gradient is taken, evenly spread: each costs an iteration.
+#: Number of evenly spread views whose gradient is computed; each costs an iteration.
 GRADIENT_VIEWS = 24
-#: Views whose picture is compared.
+#: Number of views whose images are compared.
 MEASURED_VIEWS = 6
-#: Steps in which colors of what is cut are fitted to the unstylized picture.
+#: Steps for fitting the colors of split Gaussians to the unstylized image.
 _FITTING_STEPS = 5
-#: Rounds in which Gaussians are taken back, until the picture is close enough; and in each, their share of its error.
+#: Maximum number of rounds in which Gaussians are restored until the image is close enough, and fraction of the error
+#: that the Gaussians restored in a round account for.
 _ROUNDS, _TAKEN_BACK = 24, 0.25
 
 
@@ -60,13 +62,21 @@ def refine(
     regions: Regions | None = None,
     show: ShowPlanning | None = None,
 ) -> Refinement | None:
-    """Decide which Gaussians are cut into how many; every rank calls this, and gets the same. None where it is off.
+    """Decide which Gaussians to split, and into how many. All ranks must call this, and get the same result.
 
     Args:
-        cameras, style, weights: as a `Stylizer` takes them.
-        rasterizer: as `make_plan` takes it.
-        regions: of the scene; what they keep stays whole.
-        show: told before each view that is looked at, and before each whose gradient is taken.
+        scene: Scene to refine.
+        cameras: Cameras of the views.
+        style: Style image [H, W, 3] in 0..1, or a mixture.
+        settings: Settings of the job.
+        weights: Weights of the feature network.
+        rasterizer: Name of the rasterizer, as in `make_plan`.
+        collectives: Ranks of the job.
+        regions: Regions of the scene; frozen Gaussians are not split.
+        show: Callback, called before each view that is surveyed, and before each view whose gradient is computed.
+
+    Returns:
+        The refinement; None if `settings.refine` turns it off.
     """
     if settings.refine <= 1:
         return None
@@ -77,18 +87,19 @@ def refine(
 
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:
-    """The scene as it was refined; itself where it was not."""
+    """Return the refined scene, or the scene itself without a refinement."""
     return scene if refinement is None else refinement.of(scene)
 
 
 @dataclass(frozen=True)
 class _Change:
-    """What cutting does to the measured views.
+    """Effect of splitting on the measured views.
 
     Attributes:
-        psnr, lowest: of all views together, and of one, dB.
-        sh_dc: [M, 3] of the cut scene.
-        squared: [N] float64, the squared change under each Gaussian, by blend weights.
+        psnr: PSNR in dB of all views together.
+        lowest: PSNR in dB of the worst view.
+        sh_dc: [M, 3], fitted colors of the split scene.
+        squared: [N] float64, squared change under each Gaussian, weighted by blend weights.
     """
 
     psnr: float
@@ -98,13 +109,14 @@ class _Change:
 
 
 class _Refining:
-    """Refines one scene.
+    """Refinement of one scene.
 
     Args:
-        workshop: of the scene as it is.
-        style: as it was given: that of the job, whatever regions have.
-        kept: [N] bool, Gaussians that stay whole; None for none.
-        show: told how far it has come.
+        workshop: Planning context of the scene.
+        style: Style of the job as given; styles of regions are not considered.
+        collectives: Ranks of the job.
+        kept: [N] bool, frozen Gaussians, which are not split; None for none.
+        show: Progress callback.
     """
 
     def __init__(
@@ -122,7 +134,7 @@ class _Refining:
         self._footprints = Footprints(self._scene)
 
     def run(self) -> Refinement:
-        """Decide."""
+        """Run the refinement."""
         covered = self._look()
         count = len(self._scene)
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
@@ -143,16 +155,17 @@ class _Refining:
         return Refinement(kept, cut, int(counts.sum()), size, change.psnr, change.lowest, chosen - cut, change.sh_dc)
 
     def _may_be_split(self) -> Tensor:
-        """[N] bool."""
+        """Return the mask [N] bool of Gaussians that may be split."""
         sane = can_be_split(self._scene)
         return sane if self._kept is None else sane & ~self._kept
 
     def _as_far_as_the_picture_stays(
         self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]
     ) -> tuple[Tensor, _Change | None]:
-        """Fewer pieces, as many as leave the picture of some views what it is, and how much it changes.
+        """Reduce the pieces until the image of some views is preserved, and return them with the remaining change.
 
-        Colors of what is cut are fitted to others before. None where nothing is cut, or is left to be cut.
+        Colors of split Gaussians are first fitted to other views. The change is None if nothing is split or remains
+        split.
         """
         for _ in range(_ROUNDS):
             if not bool((pieces > 1).any()):
@@ -164,7 +177,7 @@ class _Refining:
         return torch.ones_like(pieces), None
 
     def _look(self) -> list[int]:
-        """Look at every view; returns those that see anything."""
+        """Survey every view, and return those that see anything."""
         collectives, cameras = self._collectives, self._planning_context.cameras
         covered = []
         for index in self._shown(range(len(cameras))):
@@ -178,7 +191,7 @@ class _Refining:
         return sorted(index for part in collectives.all_gather(covered) for index in part)
 
     def _ask_the_loss(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """`disagreement` of the gradient of the style's loss, over some views."""
+        """Return the sum over some views of the `disagreement` of the style loss gradient."""
         settings, cameras, total = self._settings, self._planning_context.cameras, self._footprints.weights
         device = self._planning_context.network.device
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
@@ -211,7 +224,7 @@ class _Refining:
         return cancels, there_is
 
     def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
-        """What pieces [N, 3] do to the unstylized picture of some views, once colors are fitted to others."""
+        """Return the effect of pieces [N, 3] on the unstylized image of some views, with colors fitted to others."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
         options = rasterizer_options(name, self._settings, self._planning_context.machine.memory)
         cut = make_rasterizer(name, scene, **options)
@@ -228,11 +241,11 @@ class _Refining:
         return _Change(psnr(sum(every) / len(every)), psnr(max(every)), scene.sh_dc, self._sum(squared))
 
     def _fit(self, scene: Scene, cut: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
-        """A cut scene whose children [M] bool have colors by which views look as before.
+        """Fit the colors of children [M] bool in a split scene so that views look as before.
 
-        Pictures are linear in colors. Each step adds to every child's what its pixels lack, their mean by blend
-        weights (simultaneous iterative reconstruction: Gilbert 1972), which converges because no pixel's weights add up
-        to more than 1; a child then has no color that its pixels do not ask for.
+        Images are linear in colors. Each step adds to every child the mean error of its pixels, weighted by blend
+        weights (simultaneous iterative reconstruction, Gilbert 1972). This converges because the weights of a pixel add
+        up to at most 1, and gives a child no color that its pixels do not need.
         """
         children = children.to(self._rasterizer.device)
         for _ in range(_FITTING_STEPS):
@@ -249,7 +262,7 @@ class _Refining:
         return scene
 
     def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
-        """Fewer pieces: Gaussians stay whole under which the picture changes most, with a share of all the change."""
+        """Restore the Gaussians under which the image changes most, up to a fraction of the total change."""
         cut = (piece_counts(pieces) > 1).nonzero()[:, 0]
         density = change.squared[cut] / self._footprints.weights[cut].clamp_min(1.0)
         order = torch.argsort(density, descending=True, stable=True)
@@ -260,11 +273,11 @@ class _Refining:
         return fewer
 
     def _own(self, views: Sequence[int]) -> Sequence[int]:
-        """This rank's share."""
+        """Return the views of this rank."""
         return views[self._collectives.rank :: self._collectives.size]
 
     def _shown(self, views: Sequence[int]) -> Iterator[int]:
-        """This rank's share, one after the other, while somebody is shown how far it is."""
+        """Yield the views of this rank one by one, and report progress."""
         started = time.perf_counter()
         for done, index in enumerate(self._own(views)):
             if self._show:
@@ -272,23 +285,26 @@ class _Refining:
             yield index
 
     def _sum(self, values: Tensor) -> Tensor:
-        """Over all ranks."""
+        """Return the sum over all ranks."""
         return self._collectives.all_reduce(values.to(self._rasterizer.device)).cpu()
 
 
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
-    """Image [H, W, 3] of a scene as it is, by a rasterizer of its geometry."""
+    """Return the image [H, W, 3] of a scene, using a rasterizer with its geometry."""
     device = rasterizer.device
     rest = rest_colors(scene.sh_rest.to(device), scene.means.to(device), camera)
     return rasterizer.render(view_colors(scene.sh_dc.to(device), rest), camera)
 
 
 def spread_evenly(views: Sequence[int], most: int) -> list[int]:
-    """At most so many of some views, the first of them included."""
+    """Return at most `most` views, evenly spread and including the first."""
     count = min(most, len(views))
     return [views[place * len(views) // count] for place in range(count)]
 
 
 def psnr(error: float) -> float:
-    """Of a mean squared error of values in 0..1, dB; 0 is taken for what float32 tells apart."""
+    """Return the PSNR in dB for a mean squared error of values in 0..1.
+
+    Errors are at least 1e-14, the float32 resolution.
+    """
     return -10 * math.log10(max(error, 1e-14))

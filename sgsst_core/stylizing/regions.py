@@ -1,4 +1,4 @@
-"""What a job draws its views to: one style, or one for each region of the scene."""
+"""Style targets of a job: one style, or one for each region of the scene."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from sgsst_core.stylizing.warm_start import luminance_start, warm_start
 
 @dataclass(frozen=True)
 class JobStyles:
-    """The styles of a job, as its settings want them.
+    """Styles of a job, prepared as its settings require.
 
     Attributes:
-        own: of what no region says otherwise; of the only region, where one is everything.
-        regions: None where there are none.
-        each: style of each of the regions' `active`; empty where the views need no maps of them.
+        own: Default style; if a single region is everything, the style of that region.
+        regions: Regions of the scene; None if there are none.
+        each: Style of each region in `active`; empty if views need no region maps.
     """
 
     own: StyleMixture
@@ -37,11 +37,14 @@ class JobStyles:
     def prepared(
         style: StyleMixture, regions: Regions | None, settings: Settings, sh_dc: Tensor, weights: Tensor
     ) -> JobStyles:
-        """Styles as the settings want them: see `prepared_style`.
+        """Prepare styles as the settings require; see `prepared_style`.
 
         Args:
-            regions: as `Regions.resolved` gives them.
-            sh_dc: [N, 3], of the scene; a region's style may take the colors of its own Gaussians.
+            style: Style of the job.
+            regions: Result of `Regions.resolved`; None if there are no regions.
+            settings: Settings of the job.
+            sh_dc: [N, 3], colors of the scene. A region's style may be matched to the colors of the region's own
+                Gaussians.
             weights: [N] float64, total blend weights.
         """
         if regions is None:
@@ -58,7 +61,7 @@ class JobStyles:
 
     @property
     def all(self) -> list[StyleMixture]:
-        """Every style that something is drawn to, once."""
+        """All distinct styles in use."""
         found: list[StyleMixture] = []
         for style in self.each or (self.own,):
             if all(style is not other for other in found):
@@ -66,7 +69,7 @@ class JobStyles:
         return found
 
     def to(self, device: torch.device) -> JobStyles:
-        """With their pictures on a device."""
+        """Return the styles with their images on a device."""
 
         def move(style: StyleMixture) -> StyleMixture:
             return style.map(lambda picture: picture.to(device))
@@ -74,7 +77,7 @@ class JobStyles:
         return replace(self, own=move(self.own), each=tuple(map(move, self.each)))
 
     def targets(self, loss: SosLoss, view_size: Size) -> dict[int, ScaleTarget]:
-        """What they ask of views of a size (height, width); see `SosLoss.style_targets`."""
+        """Compute the targets for views of a size (height, width); see `SosLoss.style_targets`."""
         if not self.each:
             return loss.style_targets(self.own, view_size)
         assert self.regions is not None
@@ -88,13 +91,16 @@ class JobStyles:
         }
 
     def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, keep_chroma: bool = False) -> Tensor:
-        """Colors [n, 3] with the colors of their region's style: see `warm_start`.
+        """Transfer to each Gaussian the colors of its region's style; see `warm_start`.
 
         Args:
-            sh_dc: [n, 3], of some of the scene's Gaussians.
+            sh_dc: [n, 3], colors of some of the scene's Gaussians.
             weights: [n] float64, total blend weights.
-            rows: [N] bool, which they are.
-            keep_chroma: in luminance alone.
+            rows: [N] bool, mask of these Gaussians.
+            keep_chroma: Whether to change luminance only.
+
+        Returns:
+            [n, 3].
         """
         transfer = luminance_start if keep_chroma else warm_start
         if not self.each:
@@ -108,10 +114,11 @@ class JobStyles:
         return result
 
     def maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> RegionMaps | None:
-        """Renders the share of each region in views; None where the views need none.
+        """Return the renderer of region maps; None if the views need none.
 
         Args:
-            rows: [N] bool, Gaussians that the rasterizer has; None for all.
+            rasterizer: Rasterizer of the maps.
+            rows: [N] bool, Gaussians that the rasterizer contains; None for all.
         """
         if not self.each:
             return None
@@ -121,15 +128,15 @@ class JobStyles:
 
 
 class RegionMaps:
-    """Renders what share of each pixel's blend weights the Gaussians of some regions have.
+    """Renderer of region maps: the fraction of each pixel's blend weights that belongs to each region.
 
-    Blending is linear in the colors: with 1 as the color of a region's Gaussians and 0 as that of all others, three
-    regions come with each pass.
+    Blending is linear in the colors. With color 1 for the Gaussians of a region and 0 for all others, a rendering shows
+    the region's fraction; three channels give three regions per pass.
 
     Args:
-        labels: [N] uint8, the region of each Gaussian of the rasterizer.
-        active: the regions.
-        rasterizer: of any kind.
+        labels: [N] uint8, region of each Gaussian of the rasterizer.
+        active: Regions to render.
+        rasterizer: Any rasterizer.
     """
 
     def __init__(self, labels: Tensor, active: tuple[int, ...], rasterizer: Rasterizer) -> None:
@@ -138,7 +145,10 @@ class RegionMaps:
         self._labels, self._active = labels.to(rasterizer.device), active
 
     def render(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """[h, w, regions] in 0..1, of a view or some rows of it; exactly 0 where a region has no Gaussian."""
+        """Return the maps [h, w, regions] in 0..1 of a view, or of some of its rows.
+
+        They are exactly 0 where a region has no Gaussian.
+        """
         behind = self._pass(camera, rows, ())
         parts = [
             self._pass(camera, rows, self._active[first : first + 3]) - behind for first in range(0, self.count, 3)
@@ -146,7 +156,10 @@ class RegionMaps:
         return torch.cat(parts, dim=2)[:, :, : self.count].clamp(0, 1)
 
     def _pass(self, camera: Camera, rows: Rows | None, places: tuple[int, ...]) -> Tensor:
-        """Up to three regions. Without any it is what lies behind them, which all have in common to the last bit."""
+        """Render up to three region masks; without regions, render the background.
+
+        The background is bit-identical in all passes, so it can be subtracted.
+        """
         rasterizer = self._rasterizer
         colors = torch.zeros((len(self._labels), 3), dtype=rasterizer.dtype, device=rasterizer.device)
         for channel, place in enumerate(places):
@@ -155,13 +168,18 @@ class RegionMaps:
 
 
 def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
-    """Color changes [N, 3] for the Gaussians that nothing optimizes: those of neighbors in the same region.
+    """Return color changes for the Gaussians that are not optimized: those of their neighbors in the same region.
 
-    In a region of which nothing is optimized, they are those of any neighbors. Kept Gaussians have none.
+    In a region without optimized Gaussians, neighbors of any region count. Frozen Gaussians have no change.
 
     Args:
-        means, change: as for `neighbors_change`.
+        means: [N, 3], see `neighbors_change`.
+        change: [N, 3], see `neighbors_change`.
         weights: [N] float64, total blend weights of the optimized Gaussians; 0 for all others.
+        regions: Regions of the scene.
+
+    Returns:
+        [N, 3].
     """
     result = torch.zeros_like(change)
     kept = regions.frozen

@@ -1,4 +1,4 @@
-"""What is optimized when: the phases of a job."""
+"""Schedule of a job: its phases, and the order of views."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sgsst_core.settings import Settings
 
 @dataclass(frozen=True)
 class Phase:
-    """A part of the schedule.
+    """Part of the schedule.
 
     Attributes:
-        stage: its name: "coarse" (phase 1) and "sos" (phase 2) in every preset.
-        steps: how many.
-        scale: the one scale that is optimized, counted from the coarsest (0) of those that count; None for all of them,
-            the SOS loss.
+        stage: Name of the phase: "coarse" (phase 1) or "sos" (phase 2) in every preset.
+        steps: Number of steps.
+        scale: Single scale to optimize, counted from the coarsest (0) of those with a weight; None for the SOS loss on
+            all scales.
     """
 
     stage: str
@@ -27,17 +27,17 @@ class Phase:
     scale: int | None = None
 
     def scales(self, chosen: Sequence[int]) -> list[int]:
-        """Those of a view's chosen scales, the finest first, that are optimized."""
+        """Return the scales to optimize among a view's scales with a weight, which are sorted finest first."""
         return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
 
 
 def planned_phases(plan: Plan, settings: Settings) -> list[Phase]:
-    """The two phases of every preset."""
+    """Return the two phases of every preset."""
     return [Phase("coarse", plan.steps_coarse, 0), Phase("sos", settings.steps_sos)]
 
 
 def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
-    """The phase that the step after so many belongs to; the last one when all are done."""
+    """Return the phase of the step after `step` others; the last phase if all steps are done."""
     for phase in schedule:
         if step < phase.steps:
             return phase
@@ -46,12 +46,12 @@ def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
 
 
 def drawn_round(covered: Sequence[int], generator: torch.Generator) -> list[int]:
-    """Every view once in random order; the last one comes first."""
+    """Return every view once in random order; it is consumed from the end."""
     return [covered[i] for i in torch.randperm(len(covered), generator=generator).tolist()]
 
 
 def drawn_views(covered: Sequence[int], seed: int) -> Iterator[int]:
-    """The views of all steps of a job from its first one on, round after round."""
+    """Yield the views of all steps of a job from its start, round after round."""
     generator = torch.Generator().manual_seed(seed)
     while True:
         yield from reversed(drawn_round(covered, generator))

@@ -1,7 +1,8 @@
-"""How long a job will still take, from what its steps have taken and what the plan expects of the others.
+"""Estimate of the remaining time of a job, from the time of its steps and the plan's predictions for the others.
 
-A view's first visit in a phase is dearer than later ones: its lists, coverage and content features are made then. Steps
-are therefore counted apart by phase, and first visits apart from the rest. After a resume every view is visited anew.
+The first visit of a view in a phase takes longer than later ones, because its tile intersections, coverage and content
+features are computed then. Steps are therefore counted separately by phase, and first visits separately from others.
+After a resume, every view is visited anew.
 """
 
 from __future__ import annotations
@@ -11,19 +12,19 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-#: Of each kind of step in a phase, the latest so many count.
+#: Number of latest steps of each kind and phase that count.
 _LATEST = 101
 
 
 @dataclass(frozen=True)
 class ExpectedPhase:
-    """What the plan expects of a phase.
+    """Predicted values of a phase.
 
     Attributes:
-        stage: its name.
-        steps: how many.
-        seconds: of a step whose views have all been visited; 0 where nothing is known.
-        first_visit: seconds that each view's first visit takes beside them.
+        stage: Name of the phase.
+        steps: Number of steps.
+        seconds: Seconds of a step whose views have all been visited before; 0 if unknown.
+        first_visit: Additional seconds of each view's first visit.
     """
 
     stage: str
@@ -34,36 +35,36 @@ class ExpectedPhase:
 
 @dataclass(frozen=True)
 class _FirstVisits:
-    """A step with views that it visited for the first time."""
+    """Step that visited some of its views for the first time."""
 
     seconds: float
     views: int
-    prepared: float  # of the seconds, known to be theirs
+    prepared: float  # part of the seconds known to belong to first visits
 
 
 class _Stage:
-    """The latest steps of a phase."""
+    """Latest steps of a phase."""
 
     def __init__(self) -> None:
         self.known: deque[float] = deque(maxlen=_LATEST)
         self.first: deque[_FirstVisits] = deque(maxlen=_LATEST)
 
     def seconds(self) -> list[float]:
-        """Of all of them."""
+        """Return the seconds of all steps."""
         return [*self.known, *(step.seconds for step in self.first)]
 
     def extra(self, known: float) -> float:
-        """Seconds of a first visit, where a step without any takes `known`."""
+        """Return the additional seconds of a first visit, given the seconds of a step without any."""
         return max(median((step.seconds - known) / step.views for step in self.first), 0.0)
 
 
 class SecondsLeft:
-    """Keeps what steps have taken, and tells what the rest will take.
+    """Estimator of the remaining time.
 
     Args:
-        phases: of the schedule.
-        views: that are visited, each once before any comes again.
-        views_per_step: how many a step takes.
+        phases: Phases of the schedule.
+        views: Views in use, each of which is visited once per round.
+        views_per_step: Number of views per step.
     """
 
     def __init__(
@@ -77,11 +78,11 @@ class SecondsLeft:
         self._views_per_step = views_per_step
         self._steps = {phase.stage: _Stage() for phase in phases}
         self._visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
-        #: Seconds of all steps, and of checkpoints and the like, which come as often for as long as there are steps.
+        #: Total seconds of steps, and of checkpoints and the like, which recur in proportion to the steps.
         self._seconds = self._beside = 0.0
 
     def add_step(self, stage: str, views: Collection[int], seconds: float, prepared: float = 0.0) -> None:
-        """Count a step of some views; prepared: those of its seconds that are known to be first visits' alone."""
+        """Record a step. `prepared` is the part of its seconds known to belong to first visits."""
         fresh = len(set(views) - self._visited[stage])
         self._visited[stage].update(views)
         if fresh:
@@ -91,21 +92,25 @@ class SecondsLeft:
         self._seconds += seconds
 
     def resume(self) -> None:
-        """The steps so far were another session's: their prices hold, and every view is to be visited anew."""
+        """Mark all steps so far as another session's.
+
+        Their times remain valid, but every view must be visited again.
+        """
         self._visited = {phase.stage: set() for phase in self._phases}
         self._seconds = self._beside = 0.0
 
     def add_beside(self, seconds: float) -> None:
-        """Count what is neither a step nor a measurement: a checkpoint, a preview."""
+        """Record time that is neither a step nor a measurement: a checkpoint or a preview."""
         self._beside += seconds
 
     def left(self, step: int, queue: Sequence[int], *, measuring: float = 0.0, limit: float | None = None) -> float:
-        """Seconds that the job will still take after so many steps of all sessions.
+        """Return the remaining seconds of the job.
 
         Args:
-            queue: views left in this round, the next one first.
-            measuring: seconds of it.
-            limit: most seconds that the steps may take; None for any.
+            step: Number of steps completed in all sessions.
+            queue: Remaining views of this round, next one first.
+            measuring: Remaining seconds of measurements.
+            limit: Maximum remaining seconds of steps; None for no limit.
         """
         seconds, start = 0.0, 0
         for phase in self._phases:
@@ -121,7 +126,10 @@ class SecondsLeft:
         return seconds * (1 + beside) + measuring
 
     def _first_visits(self, stage: str, queue: Sequence[int], steps: int) -> float:
-        """How many views the next steps of a phase visit for the first time; a mean where only chance knows."""
+        """Return the number of first visits in the next steps of a phase.
+
+        It is an expected value where it depends on the random order.
+        """
         visits = steps * self._views_per_step
         unknown = self._views - self._visited[stage]
         soon = set(queue[:visits])
@@ -129,7 +137,7 @@ class SecondsLeft:
         return len(unknown & soon) + len(unknown - soon) * later
 
     def _prices(self, phase: ExpectedPhase) -> tuple[float, float]:
-        """Seconds of a step of a phase, and of each first visit beside it."""
+        """Return the seconds of a step of a phase, and the additional seconds of each first visit."""
         steps = self._steps[phase.stage]
         if not steps.seconds():
             ratio = self._ratio()
@@ -140,7 +148,7 @@ class SecondsLeft:
         return known, phase.first_visit * self._first_ratio(self._ratio())
 
     def _known(self, phase: ExpectedPhase) -> float:
-        """Seconds of a step of a phase, of which some have been made, whose views have all been visited."""
+        """Return the seconds of a step without first visits, for a phase that has already started."""
         steps = self._steps[phase.stage]
         if steps.known:
             return median(steps.known)
@@ -148,9 +156,9 @@ class SecondsLeft:
         return min(phase.seconds * self._ratio(), most) if phase.seconds else most
 
     def _ratio(self) -> float:
-        """Seconds of steps over what was expected, in the latest phase that has come to views visited before.
+        """Return the ratio of measured to predicted step times, in the latest phase that has revisited a view.
 
-        Until then the expectation stands: it was timed on this machine, while first visits are a guess.
+        Before that, the ratio is 1: predictions were timed on this machine, while the time of first visits is a guess.
         """
         for phase in reversed(self._phases):
             known = self._steps[phase.stage].known
@@ -159,7 +167,7 @@ class SecondsLeft:
         return 1.0
 
     def _first_ratio(self, otherwise: float) -> float:
-        """The same of first visits."""
+        """Return the ratio of measured to predicted first-visit times; `otherwise` if it is unknown."""
         for phase in reversed(self._phases):
             steps = self._steps[phase.stage]
             if steps.first and phase.first_visit:
@@ -167,6 +175,6 @@ class SecondsLeft:
         return otherwise
 
     def _any_step(self) -> float:
-        """Seconds of a step where nothing is expected: those of the phases so far."""
+        """Return the median seconds of all steps so far, for phases without predictions."""
         seconds = [seconds for steps in self._steps.values() for seconds in steps.seconds()]
         return median(seconds) if seconds else 0.0

@@ -1,4 +1,4 @@
-"""What a run leaves behind: a record of every step, and the state from which it can go on."""
+"""Records of steps, and the state from which a run can be resumed."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from torch import Tensor
 
 from sgsst_core.loss.terms import LossTerms
 
-#: Parts of a job's time before its first step, as `seconds_by_part` names them: inputs, the look at every view, what
-#: else the plan is made from, and what is built for the steps.
+#: Parts of a job's time before its first step, as named in `seconds_by_part`: inputs, refinement, survey, the rest of
+#: planning, and preparation of the steps.
 BEFORE_STEPS = ("reading", "refining", "survey", "planning", "preparing")
 
 
 @dataclass(frozen=True)
 class StepRecord:
-    """One iteration.
+    """Record of one iteration.
 
     Attributes:
-        step: counted from 1 over both phases.
-        stage: of the phase: "coarse", "sos".
-        view: index of the camera; the first one where a step has several.
-        seconds: wall-clock seconds of iterations so far, of all sessions of a resumed job.
-        loss: E of the step's views before the step, their mean.
-        terms: split loss by scale.
-        parts: seconds of this step by what they went into.
-        memory: bytes of physical memory that the process held after the step.
-        sent: bytes that this rank sent to others, by what for (`collectives.Traffic`); empty for one rank.
-        device_memory: most bytes of the GPU's memory that its tensors have held so far; None on a CPU.
+        step: Step number, counted from 1 over both phases.
+        stage: Name of the phase: "coarse" or "sos".
+        view: Index of the camera; of the first one if the step has several views.
+        seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
+        loss: E before the step, mean over its views.
+        terms: Loss by scale, split into terms.
+        parts: Seconds of this step by activity.
+        memory: Physical memory of the process after the step, in bytes.
+        sent: Bytes sent by this rank to others, by purpose (`collectives.Traffic`); empty for a single rank.
+        device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.
     """
 
     step: int
@@ -45,7 +45,7 @@ class StepRecord:
 
 @dataclass
 class StylizerState:
-    """Everything that a resumed run needs to go on bit for bit."""
+    """State from which a run resumes bit for bit."""
 
     sh_dc: Tensor  # [N, 3]
     first_moment: Tensor  # [N, 3]
@@ -56,5 +56,6 @@ class StylizerState:
     queue: list[int]  # views left in this round
     history: list[StepRecord] = field(default_factory=list)
     seconds_by_part: dict[str, float] = field(default_factory=dict)
-    memory: int | None = None  # bytes planned with: partition and kept weights follow from it, and so does rounding
+    # memory budget in bytes: it determines partition and cached weights, and thereby rounding
+    memory: int | None = None
     measured: list[dict[str, Any]] = field(default_factory=list)  # see `Stylizer.measured`

@@ -1,4 +1,4 @@
-"""The style's pictures as a job uses them: turned, and in the scene's colors, where that is asked."""
+"""Preparation of a job's style images: rotation, and matching to the scene's colors."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from sgsst_core.stylizing.warm_start import in_colors_of, in_luminance_of
 
 
 def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """A style, of pictures [H, W, 3] in 0..1, as the settings want it; itself where they want nothing.
+    """Prepare a style as the settings require. The style itself is returned if they require nothing.
 
     Args:
-        sh_dc: [N, 3], of the scene.
+        style: Images [H, W, 3] in 0..1.
+        settings: Settings of the job.
+        sh_dc: [N, 3], colors of the scene.
         weights: [N] float64, total blend weights, at least one positive.
     """
     if settings.style_rotation:
@@ -32,19 +34,20 @@ def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weigh
         # 2017, section 5.2.
         style = in_colors_of(style, sh_dc, weights)
     elif settings.preserve_colors == "luminance":
-        style = in_luminance_of(style, sh_dc, weights)  # section 5.1 there
+        style = in_luminance_of(style, sh_dc, weights)  # section 5.1 of the same paper
     return style
 
 
 def check_style_size(style: Tensor | StyleMixture, cameras: Sequence[Camera], scale: float) -> None:
-    """Prove that no view asks for a style picture [H, W, 3] of more than `MAX_RESOLUTION` pixels on its longer side.
+    """Check that no view requires a style image with a longer side of more than `MAX_RESOLUTION` pixels.
 
     Args:
-        cameras: at the sizes that they are stylized at.
-        scale: of its strokes.
+        style: Image [H, W, 3], or a mixture.
+        cameras: Cameras at the sizes used for stylization.
+        scale: Scale of the strokes.
 
     Raises:
-        SettingsError: otherwise.
+        SettingsError: If an image would be larger.
     """
     if scale <= 1:
         return
@@ -60,9 +63,9 @@ def check_style_size(style: Tensor | StyleMixture, cameras: Sequence[Camera], sc
 
 
 def turned(style: Tensor, degrees: float) -> Tensor:
-    """A picture [H, W, 3] turned against the clock, cut to the largest upright rectangle that lies inside.
+    """Rotate an image [H, W, 3] counterclockwise, and crop it to the largest upright rectangle inside.
 
-    By quarters of a turn exactly; otherwise interpolated (cubic splines) and clamped to 0..1.
+    Quarter turns are exact. Other angles are interpolated (cubic splines) and clamped to 0..1.
     """
     quarters, rest = divmod(degrees, 90)
     style = torch.rot90(style, int(quarters) % 4, (0, 1)).contiguous()
@@ -77,10 +80,10 @@ def turned(style: Tensor, degrees: float) -> Tensor:
 
 
 def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
-    """Sides of the largest upright rectangle inside one that is turned by an angle between 0 and pi/2; at least 1.
+    """Return the sides of the largest upright rectangle inside one that is rotated by 0 to pi/2; at least 1.
 
-    Either two of its corners lie on one long side of the turned one and it is as long as can be with half of the short
-    side above it, or each of its corners lies on another side.
+    Either two of its corners lie on one long side of the rotated rectangle, with half of the short side above it as the
+    limit, or each of its corners lies on a different side.
     """
     sine, cosine = math.sin(angle), math.cos(angle)
     shorter, longer = min(height, width), max(height, width)
@@ -90,5 +93,5 @@ def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
     else:
         spread = cosine * cosine - sine * sine
         across, down = (width * cosine - height * sine) / spread, (height * cosine - width * sine) / spread
-    # A pixel less on each side, where the interpolation reaches beyond the picture.
+    # One pixel less on each side, where the interpolation reads beyond the image.
     return max(int(down) - 2, 1), max(int(across) - 2, 1)

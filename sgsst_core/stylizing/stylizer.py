@@ -1,6 +1,6 @@
-"""The optimizer loop: Adam on the DC colors, coarse phase then SOS, one view a step.
+"""Stylizer: Adam on the DC colors, in a coarse phase followed by SOS.
 
-One step at a time; `loop.run` makes them all.
+It makes one step at a time; `loop.run` makes them all.
 """
 
 from __future__ import annotations
@@ -58,27 +58,29 @@ from sgsst_core.timing import Timer
 
 
 class Stylizer:
-    """One scene's stylization, step by step, as a plan says.
+    """Stylization of one scene according to a plan, step by step.
 
     Args:
-        plan: of this scene, these cameras and settings: from `make_plan`, or of an earlier run of the same job.
-        scene: what to stylize; as it was refined, where the plan says so.
-        cameras: the views; larger ones are brought down to `settings.max_resolution`.
-        style: a picture [H, W, 3] in 0..1, or several with their weights.
-        settings: see `Settings`.
-        weights: of the feature network.
-        photos: content image of a camera by its index, at its (brought down) size; None for unstylized renders.
-        collectives: of the ranks that stylize the scene together. Every rank has a stylizer with the same arguments and
-            calls the same methods in the same order; `state`, `stylized` and the like, which only read, need no other.
-        workshop: what was built to make the plan; None builds it anew.
-        regions: of the scene, each with its own style or kept; the plan was made for them. None for one style for all.
+        plan: Plan for this scene, these cameras and settings: from `make_plan`, or from an earlier run of the same job.
+        scene: Scene to stylize, refined if the plan says so.
+        cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
+        style: Image [H, W, 3] in 0..1, or several with weights.
+        settings: Settings of the job.
+        weights: Weights of the feature network.
+        photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
+            for unstylized renders.
+        collectives: Ranks that stylize the scene together. Every rank has a stylizer with the same arguments, and calls
+            the same methods in the same order. Methods that only read, such as `state` and `stylized`, may be called by
+            a single rank.
+        workshop: Planning context of the plan; None to create it anew.
+        regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
 
     Attributes:
-        collectives: of all ranks that take part.
-        group: of those that work on the same views as this one.
+        collectives: Ranks that take part.
+        group: Ranks that process the same views as this one.
 
     Raises:
-        RankLeftOut: the job goes on without this rank.
+        RankLeftOut: If the job continues without this rank.
     """
 
     def __init__(
@@ -102,9 +104,9 @@ class Stylizer:
         self.seconds_by_part: dict[str, float] = {}
         self.step = 0
         self.history: list[StepRecord] = []
-        #: What was measured between steps (`loop.Callbacks.measure`): values for JSON, kept through a resume.
+        #: Measurements between steps (`loop.Callbacks.measure`), JSON-serializable and preserved by a resume.
         self.measured: list[dict[str, Any]] = []
-        #: That the style's statistics have taken, in the steps that needed them first.
+        #: Seconds for the style's statistics, in the steps that first needed them.
         self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
@@ -123,25 +125,25 @@ class Stylizer:
         self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
-        #: The partition follows from it, and so does rounding: it is the same on all ranks.
+        #: It determines the partition, and thereby rounding, so it is identical on all ranks.
         self.memory_limit = settings.memory_limit or plan.memory_limit
         self.memory = self.memory_limit // sharing_memory(self.collectives, plan.device)
         self.loss = self._loss()
-        #: In place of `loss` in steps, where the plan says so.
+        #: Replacement for `loss` in steps, if the plan uses graphs.
         self.graphs = LossGraphs(self.loss) if plan.graphs and self.group.size == 1 else None
         self.sh_degree = scene.sh_degree
-        #: With its spherical harmonics faded as the settings say.
+        #: With the SH attenuation of the settings applied.
         self.scene = scene = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
         rasterizer, self._coarse = self._rasterizers(seen, planning_context)
         self.views = self._views(seen, fit_cameras(cameras, settings), rasterizer)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
-        # Made once: another processor may round it otherwise, and ranks begin with the same bits.
+        # Computed once, because another processor may round differently and ranks must start with the same bits.
         start = self.collectives.broadcast(self.transferred) if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
-        kept = regions.frozen[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
-        #: Of the Gaussians that are rendered, those that stay as they are; None where none do.
+        kept = regions.kept[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
+        #: Frozen Gaussians among the rendered ones; None if there are none.
         self._kept = kept.to(rasterizer.device)[:, None] if kept.any() else None
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
         self._optimizer = ColorOptimizer(
@@ -153,14 +155,14 @@ class Stylizer:
         )
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
-        #: Steps before a resume whose views' blend weights are still to be kept.
+        #: Number of steps before a resume whose views' blend weights have not been cached again yet.
         self._visited_before = 0
         self.schedule = planned_phases(plan, settings)
         self.total = sum(phase.steps for phase in self.schedule)
         self._process = psutil.Process()
         self._start: Evaluation | None = None
         self._stylized: Tensor | None = None
-        self._cost = 0  # pixels of this rank's share of the network in the present step
+        self._cost = 0  # pixels that this rank passes through the network in the present step
 
     @classmethod
     def planned(
@@ -176,9 +178,9 @@ class Stylizer:
         collectives: Collectives = ALONE,
         regions: Regions | None = None,
     ) -> Self:
-        """Plan a job and make its stylizer: see `make_plan` for `weights`, `rasterizer` and what is raised.
+        """Plan a job and create its stylizer; see `make_plan` for `weights`, `rasterizer` and exceptions.
 
-        Where the settings refine the scene, the stylizer's is the refined one.
+        If the settings refine the scene, the stylizer has the refined one.
         """
         weights = weights or load_network_weights("auto")
         mixture = StyleMixture.of(style)
@@ -218,36 +220,39 @@ class Stylizer:
         )
 
     def transferred(self, own: Tensor | None = None) -> Tensor:
-        """The Gaussians that are rendered in the style's colors, [n, 3] on the CPU: see `warm_start`.
+        """Return the colors [n, 3] of the rendered Gaussians after a transfer of the style's colors; see `warm_start`.
 
         Args:
-            own: [n, 3] on the CPU, what they have; None for the scene's, as before any step.
+            own: [n, 3] on the CPU, colors before the transfer; None for the scene's, as before the first step.
+
+        Returns:
+            [n, 3] on the CPU.
         """
         seen = self.plan.seen
         own = self.scene.sh_dc[seen] if own is None else own
         weights = self.plan.survey.total_blend_weights[seen]
         found = self.styles.transferred(own, weights, seen, keep_chroma=self._keeps_chroma)
-        # Of what no view decides, colors follow from what becomes of the others: see `stylized`.
+        # Colors that no view determines follow from the others: see `stylized`.
         return torch.where(self.plan.optimized[seen][:, None], found, own)
 
     @property
     def transfers_last(self) -> bool:
-        """Whether results have the style's colors once more: see `ends_with_transfer`."""
+        """Whether results get the style's colors once more: see `ends_with_transfer`."""
         return ends_with_transfer(self.settings, warm=self.plan.warm_start)
 
     def _transferred_last(self, optimized: Tensor) -> Tensor:
-        """What is written of optimized colors [n, 3]; before the first step they are the style's as they are."""
+        """Return the output for optimized colors [n, 3]; before the first step they already are the style's."""
         if not (self.transfers_last and self.step):
             return optimized
         found = self.transferred(optimized)
         if not self._keeps_chroma:
             return found
         bounded = constrained(found, self.scene.sh_dc[self.plan.seen], bounded=self.settings.bounded)
-        return torch.where(found != optimized, bounded, optimized)  # kept ones to the last bit
+        return torch.where(found != optimized, bounded, optimized)  # frozen colors remain bit-identical
 
     @property
     def _keeps_chroma(self) -> bool:
-        """Whether colors change in luminance alone."""
+        """Whether only luminance changes."""
         return self.settings.preserve_colors == "luminance"
 
     def _loss(self) -> SosLoss:
@@ -269,7 +274,7 @@ class Stylizer:
     def _rasterizers(
         self, seen: Scene, planning_context: PlanningContext | None
     ) -> tuple[Rasterizer, CoarseRasterizer | None]:
-        """The rasterizer that the plan names, and the one that keeps weights of the coarsest scale for phase 1."""
+        """Return the plan's rasterizer, and the one that caches weights of the coarsest scale for phase 1."""
         plan, settings = self.plan, self.settings
         name = plan.uncached if plan.rasterizer == "cached" else plan.rasterizer
         options = rasterizer_options(name, settings, self.memory)
@@ -278,7 +283,7 @@ class Stylizer:
             uncached = whole
         elif isinstance(whole, CpuRasterizer) and whole.name == name:
             uncached = whole.of_subset(seen, plan.seen, max_list_bytes=options["max_list_bytes"])
-        else:  # what a GPU's prepared for the whole scene names its Gaussians by their place in it
+        else:  # data that a GPU rasterizer prepared for the whole scene refer to Gaussians by index
             uncached = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
             return uncached, None
@@ -300,7 +305,7 @@ class Stylizer:
 
     @property
     def _least_list_bytes(self) -> int:
-        """For raster lists beside kept weights, of the memory for views."""
+        """Budget in bytes for tile intersections next to cached weights, taken from the memory for views."""
         on_cpu = self.plan.rasterizer == "cached" and self.plan.uncached == "cpu"
         return self.memory // LISTS_BESIDE_WEIGHTS if on_cpu else 0
 
@@ -326,45 +331,45 @@ class Stylizer:
 
     @property
     def style(self) -> StyleMixture:
-        """The style of what no region says otherwise."""
+        """Style of everything without a region of its own."""
         return self.styles.own
 
     @property
     def phase(self) -> Phase:
-        """The phase that the next step belongs to; the last one when all steps are done."""
+        """Phase of the next step; the last phase if all steps are done."""
         return phase_at(self.schedule, self.step)
 
     def share_done(self) -> float:
-        """How much of the schedule is done, 0 to 1: what the learning rate follows."""
+        """Return the completed fraction of the schedule, 0 to 1, which the learning rate follows."""
         return self.step / max(self.total - 1, 1)
 
     @property
     def stops_early(self) -> bool:
-        """Whether the run ends when its losses have stopped falling, which must be of the same surround for that."""
+        """Whether the run ends when its losses stop falling; this requires a constant background."""
         return self.settings.early_stop and self.plan.training_background == "background"
 
     @property
     def round_length(self) -> int:
-        """Steps in which every view comes once."""
+        """Number of steps in which every view comes once."""
         return math.ceil(len(self.views.covered) / self.settings.views_per_step)
 
     def scale_count(self, index: int) -> int:
-        """n_s of a view."""
+        """Return n_s of a view."""
         camera = self.views.cameras[index]
         return self.loss.scale_count(camera.height, camera.width)
 
     def scales(self, index: int) -> list[int]:
-        """The scales of a view that count, the finest first."""
+        """Return the scales of a view with a positive weight, finest first."""
         camera = self.views.cameras[index]
         return self.loss.scales(camera.height, camera.width)
 
     @property
     def evaluation_views(self) -> list[int]:
-        """Indices of the plan's `loss_views`, evenly spread over those that see anything."""
+        """Indices of the plan's `loss_views`, evenly spread over the views that see anything."""
         return evaluation_views(self.views.covered, self.plan.loss_views)
 
     def start(self) -> Evaluation:
-        """Loss of the unstylized scene on the evaluation views; taken once, whenever it is first asked for."""
+        """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
         if self._start is None:
             with self.measuring():
                 self._start = self.evaluate(self.evaluation_views, self.views.scene.sh_dc)
@@ -372,17 +377,17 @@ class Stylizer:
 
     @contextmanager
     def measuring(self) -> Iterator[None]:
-        """Count seconds as those of measuring, beside the steps."""
+        """Record the time of a `with` block as measuring, separately from the steps."""
         started, parts = time.perf_counter(), self.seconds_by_part
         yield
         parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
 
     def behind(self, index: int) -> Color | None:
-        """The color behind a view in the next step; None for the background of the settings."""
+        """Return the background color of a view in the next step; None for the background of the settings."""
         return drawn_color(self.plan.training_background, self.settings.seed, self.step, index, self.style)
 
     def style_targets(self, camera: Camera) -> StyleTargets:
-        """The style's statistics for views of the camera's size."""
+        """Return the style's targets for views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
             started = time.perf_counter()
@@ -391,10 +396,10 @@ class Stylizer:
         return self._style_targets[size]
 
     def run_step(self) -> StepRecord:
-        """One iteration.
+        """Run one iteration.
 
         Raises:
-            DivergedError: the gradient has left the range of float32; the colors are those before the step.
+            DivergedError: If the gradient has left the range of float32; the colors are those before the step.
         """
         started = time.perf_counter()
         self._stylized = None
@@ -434,7 +439,7 @@ class Stylizer:
         return record
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult]]:
-        """dE/dsh_dc [n, 3], mean over some views, and what was found of those that this group of ranks took."""
+        """Return dE/dsh_dc [n, 3], mean over some views, and the results of this group's views."""
         gradient: Tensor | None = None
         results = []
         self._cost = 0
@@ -459,18 +464,18 @@ class Stylizer:
                     gradient = self.collectives.all_reduce(gradient / self.group.size)
             gradient = gradient / len(views)
         if self._kept is not None:
-            gradient = gradient.masked_fill(self._kept, 0)  # Adam leaves colors of no gradient as they are
+            gradient = gradient.masked_fill(self._kept, 0)  # Adam does not change colors with zero gradient
         return gradient, results
 
     def _read(self, largest: Tensor, results: Sequence[SosResult]) -> Evaluation:
-        """Wait for the device, once in a step: loss of each scale, mean over all views of the step.
+        """Synchronize with the device, once per step, and return the loss of each scale, mean over the step's views.
 
         Args:
-            largest: magnitude in the gradient.
-            results: of this group's views.
+            largest: Largest magnitude in the gradient.
+            results: Results of this group's views.
 
         Raises:
-            DivergedError: that magnitude was too large for a step to be made.
+            DivergedError: If that magnitude was too large for a step.
         """
         # The rasterizer, and with it the colors, may be on the CPU while the network is on a GPU.
         first = largest.double()[None].to(self.network.device)
@@ -497,26 +502,26 @@ class Stylizer:
         )
 
     def _balance(self) -> None:
-        """Once in the phase on all scales, share the work out in proportion to the speeds that ranks have shown."""
+        """Divide the work once, in the phase on all scales, in proportion to the measured speeds of the ranks."""
         speeds = self._team.compare_speeds(self._cost, self.timer.seconds)
         if speeds:
             self.loss.speeds = speeds
             self.views.uncached_fraction()
 
     def _next_view(self) -> int:
-        """Random views without replacement: every view once before any comes again."""
+        """Return a random view without replacement: every view comes once before any comes again."""
         if not self._queue:
             self._queue = drawn_round(self.views.covered, self._generator)
         return self._queue.pop()
 
     def _look_ahead(self, left: Sequence[int], phase: Phase) -> None:
-        """Name the view that this group takes next, so that what it needs can be read while the device works.
+        """Announce the view that this group processes next, so that its data can be read while the device works.
 
-        The queue is looked at, not filled: the order of views is drawn when it is needed, as checkpoints expect.
+        The queue is only inspected, not refilled: the order of views is drawn when it is needed, as checkpoints expect.
 
         Args:
-            left: this group's views that are left in the present step.
-            phase: of the present step.
+            left: Remaining views of this group in the present step.
+            phase: Phase of the present step.
         """
         if left:
             index = left[0]
@@ -528,23 +533,24 @@ class Stylizer:
 
     @property
     def coming(self) -> list[int]:
-        """Views left in this round, the next one first."""
+        """Remaining views of this round, next one first."""
         return self._queue[::-1]
 
     def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
-        """Mean SOS loss over views, split by scale; changes nothing, its time does not count.
+        """Return the mean SOS loss over views, split by scale. Changes nothing, and its time does not count.
 
         Args:
-            sh_dc: [n, 3], colors to evaluate in place of the present ones of the n optimized Gaussians.
+            indices: Indices of the views.
+            sh_dc: [n, 3], colors of the rendered Gaussians to evaluate; None for the present ones.
         """
         self._keep_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
         return evaluate(self.views, self.style_targets, indices, values)
 
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
-        """dE/dsh_dc [n, 3] of the n optimized Gaussians on the CPU, as a step computes it, and its seconds.
+        """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its seconds.
 
-        Targets are prepared before the clock starts. Changes nothing.
+        Targets are prepared before timing starts. Changes nothing.
         """
         self._keep_visited()
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
@@ -561,7 +567,7 @@ class Stylizer:
         scales: Sequence[int],
         behind: Color | None = None,
     ) -> tuple[Tensor, SosResult]:
-        """dE/dsh_dc [n, 3] of one view with a color behind it (None: the settings' background), and the loss."""
+        """Return dE/dsh_dc [n, 3] of one view over a background color (None: that of the settings), and the loss."""
         rasterizer = self._rasterizer_for(scales)
         with self.timer("render"), torch.no_grad():
             colors = self.views.colors(index, self.sh_dc.detach())
@@ -576,14 +582,17 @@ class Stylizer:
             return self.views.gradient(index, result.image_gradient.to(colors.device), colors, rasterizer), result
 
     def keep_weights(self, index: int, scales: Sequence[int]) -> None:
-        """Keep a view's blend weights for some scales, as its first step does, where they fit.
+        """Cache a view's blend weights for some scales, if they fit, as its first step does.
 
-        Only steps do: what is rendered in between, which depends on the clock, changes none of their bits.
+        Only steps cache weights. Renderings in between, whose timing varies, therefore do not change any of their bits.
         """
         self.views.keep_weights(index, self._rasterizer_for(scales))
 
     def _keep_visited(self) -> None:
-        """Once after a resume: keep what the steps before it kept, in their order, so that the same views fit."""
+        """Cache, once after a resume, the blend weights that previous steps cached.
+
+        The order is the same, so that the same views fit.
+        """
         steps, self._visited_before = self._visited_before, 0
         if not steps:
             return
@@ -595,19 +604,20 @@ class Stylizer:
                 for index in views[self._team.own_group :: self._team.groups]:
                     scales = phase.scales(self.scales(index))
                     if self.phase.scale is not None or not self._rasterizer_for(scales).scale:
-                        self.keep_weights(index, scales)  # those of a phase that is over are not needed
+                        self.keep_weights(index, scales)  # weights of a finished phase are not needed
 
     def _rasterizer_for(self, scales: Sequence[int]) -> Rasterizer:
-        """What renders a view for some scales: at the one coarse scale alone, where its weights are kept."""
+        """Return the rasterizer of a view for some scales: the coarse one if it is cached for their only scale."""
         if self._coarse is not None and len(scales) == 1 and scales[0] > 0:
             return self._coarse.at(scales[0])
         return self.views.rasterizer
 
     def stylized(self) -> Tensor:
-        """sh_dc [N, 3] float32 of the whole scene, on the CPU: the optimized colors, and those of unseen Gaussians.
+        """Return sh_dc [N, 3] float32 of the whole scene on the CPU: optimized colors, and colors of unseen Gaussians.
 
-        They are what a job that ends now writes, so with the last transfer, where there is one. Kept until the colors
-        change, because the neighbors of millions of unseen Gaussians take seconds to find: it must not be written to.
+        This is the output of a job that ends now, including the final transfer if there is one. It is cached until the
+        colors change, because finding the neighbors of millions of unseen Gaussians takes seconds. It must not be
+        modified.
         """
         if self._stylized is None:
             result = self.scene.sh_dc.clone()
@@ -629,23 +639,23 @@ class Stylizer:
         return self._stylized
 
     def shown(self) -> Tensor:
-        """sh_dc [n, 3] of the Gaussians that are rendered, on the rasterizer's device, as a job that ends now has them.
+        """Return sh_dc [n, 3] of the rendered Gaussians, on the rasterizer's device, as output by a job that ends now.
 
-        Unlike `sh_dc`, which steps go on from, they have the last transfer, where there is one.
+        In contrast to `sh_dc`, from which steps continue, it includes the final transfer if there is one.
         """
         if not self.transfers_last:
             return self.sh_dc.detach()
         return self.stylized()[self.plan.seen].to(self.sh_dc.device)
 
     def set_colors(self, sh_dc: Tensor) -> None:
-        """Put the colors [N, 3] of the whole scene in place of the present ones, to evaluate them on these views."""
+        """Replace the present colors by sh_dc [N, 3] of the whole scene, to evaluate them on these views."""
         self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(sh_dc[self.plan.seen])
 
     @contextmanager
     def with_colors(self, sh_dc: Tensor) -> Iterator[None]:
-        """Have the colors [N, 3] of the whole scene for a while; the present ones come back, bit for bit."""
+        """Use sh_dc [N, 3] of the whole scene inside a `with` block, then restore the present colors bit for bit."""
         present, stylized = self.sh_dc.detach().clone(), self._stylized
         self.set_colors(sh_dc)
         try:
@@ -656,7 +666,7 @@ class Stylizer:
                 self.sh_dc.copy_(present)
 
     def state(self) -> StylizerState:
-        """A copy of all that a resumed run needs."""
+        """Return a copy of everything that a resumed run needs."""
         first_moment, second_moment = self._optimizer.moments()
         return StylizerState(
             sh_dc=self.sh_dc.detach().cpu().clone(),
@@ -673,7 +683,7 @@ class Stylizer:
         )
 
     def load_state(self, state: StylizerState) -> None:
-        """Go on from a state of a stylizer with the same arguments, and state.memory as its memory limit."""
+        """Resume from the state of a stylizer with the same arguments, and `state.memory` as its memory limit."""
         self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(state.sh_dc)

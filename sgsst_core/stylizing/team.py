@@ -1,4 +1,4 @@
-"""The ranks that stylize a scene together: who takes part, whether they agree, who does how much."""
+"""Ranks that stylize a scene together: their groups, a check for drift, and load balancing."""
 
 from __future__ import annotations
 
@@ -13,29 +13,32 @@ from sgsst_core.parallel.collectives import Collectives, RankLeftOut, same_on_al
 from sgsst_core.planning.plan import Plan
 from sgsst_core.settings import Settings
 
-#: Steps between two proofs that all ranks have the same colors.
+#: Steps between two checks that all ranks have the same colors.
 DRIFT_STEPS = 50
-#: Steps of a phase after which the ranks' speeds are compared; the first one, which prepares more, does not count.
+#: Steps of a phase after which speeds of ranks are compared. The first step is ignored, because it includes
+#: preparation.
 BALANCE_STEPS = 6
-#: Ranks are given other shares of the work only where the fastest is faster than the slowest by more than this.
+#: Minimum ratio of the fastest to the slowest rank at which the work is divided anew.
 LEAST_IMBALANCE = 1.15
 
 _NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching")
 
 
 class Team:
-    """This rank's place among those that the plan needs.
+    """Position of this rank among the ranks that the plan uses.
 
     Args:
-        collectives: of all ranks that there are.
+        plan: Plan of the job.
+        settings: Settings of the job.
+        collectives: All available ranks.
 
     Attributes:
-        everybody: the ranks that take part.
-        groups: how many groups they form, each of which takes views of its own.
-        group: the ranks that work on the same views as this one.
+        everybody: Ranks that take part.
+        groups: Number of groups they form; each group processes its own views.
+        group: Ranks that process the same views as this one.
 
     Raises:
-        RankLeftOut: the job goes on without this rank.
+        RankLeftOut: If the job continues without this rank.
     """
 
     def __init__(self, plan: Plan, settings: Settings, collectives: Collectives) -> None:
@@ -47,19 +50,19 @@ class Team:
         self.group = taking_part.split_group(self.groups)
         for ranks in (self.everybody, self.group):
             ranks.set_timeout_for(plan.prediction.seconds if plan.prediction else 0.0)
-        #: Pixels and seconds of this rank's share of the network in each step, until ranks have been compared.
+        #: Pixels and seconds of this rank's network passes in each step, until speeds have been compared.
         self._pace: list[tuple[int, float]] | None = [] if settings.rebalance and self.group.size > 1 else None
 
     @property
     def own_group(self) -> int:
-        """Number of this rank's group."""
+        """Index of this rank's group."""
         return self.everybody.rank // self.group.size
 
     def check_drift(self, step: int, colors: Tensor) -> None:
-        """Prove now and then that all ranks have the same colors [n, 3].
+        """Check every `DRIFT_STEPS` steps that all ranks have the same colors [n, 3].
 
         Raises:
-            RanksDriftedError: they have not.
+            RanksDriftedError: If they differ.
         """
         if self.everybody.size == 1 or step % DRIFT_STEPS:
             return
@@ -71,18 +74,18 @@ class Team:
             )
 
     def compare_speeds(self, cost: int, seconds: Mapping[str, float]) -> tuple[float, ...] | None:
-        """The speeds of the group's ranks, once, when they have been seen to differ; None otherwise.
+        """Return the speeds of the group's ranks, once, if they differ noticeably; otherwise None.
 
         Args:
-            cost: pixels of this rank's share of the network in the step that was made.
-            seconds: of that step, by part.
+            cost: Pixels that this rank passed through the network in the last step.
+            seconds: Seconds of that step by activity.
         """
         if self._pace is None:
             return None
         self._pace.append((cost, sum(seconds.get(part, 0.0) for part in _NETWORK_PARTS)))
         if len(self._pace) < BALANCE_STEPS:
             return None
-        # Medians: one step in which the machine did something else says nothing.
+        # Medians, so that a single disturbed step has no effect.
         rates = sorted(pixels / duration for pixels, duration in self._pace[1:] if pixels)
         self._pace = None
         speeds = self.group.all_gather(rates[len(rates) // 2] if rates else 0.0)

@@ -1,10 +1,10 @@
-"""What lies behind an object scan in a step: a color drawn anew for every view, which nothing can be fitted to.
+"""Training background: a color behind an object scan that is redrawn for every view, so nothing can be fitted to it.
 
-A scan without background covers a part of each picture, and features near its silhouette see what is behind it too. A
-color that never changes is part of what the loss judges, and the object's colors come to make up for it.
+A scan without background covers only part of each image, and features near its silhouette also see what is behind it. A
+constant color would become part of what the loss compares, and the object's colors would compensate for it.
 
-A color follows from the job's seed, the step and the view alone: there is no state, a run repeats and resumes bit for
-bit, and all ranks agree.
+A color depends only on the job's seed, the step and the view. There is no state: runs repeat and resume bit for bit,
+and all ranks agree.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from torch import Tensor
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.settings import PlannedBackground
 
-#: Red, green, blue in 0..1.
+#: Red, green and blue in 0..1.
 Color = tuple[float, float, float]
 
-_BITS = 53  # of a float64's fraction
+_BITS = 53  # bits of a float64's fraction
 
 
 def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Tensor | StyleMixture) -> Color | None:
-    """What is behind a view in the step after `step` others; None for the background of the settings.
+    """Return the background color of a view in the step after `step` others; None for the background of the settings.
 
     Args:
-        kind: "random" for a uniform color, "palette" for that of a random pixel of the style.
-        seed: of the job, not negative.
-        view: index of its camera.
-        style: pictures [H, W, 3] in 0..1, on the CPU; of several, one is drawn by its weight.
+        kind: "random" for a uniform color, "palette" for the color of a random style pixel.
+        seed: Seed of the job, non-negative.
+        step: Number of previous steps.
+        view: Index of the view's camera.
+        style: Image [H, W, 3] in 0..1 on the CPU, or a mixture, of which one image is drawn by weight.
     """
     if kind == "background":
         return None
@@ -43,32 +44,34 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
 
 
 def _drawn_picture(style: StyleMixture, number: float) -> Tensor:
-    """One of the pictures, by their weights and a number in [0, 1)."""
+    """Draw an image by weight, given a number in [0, 1)."""
     for picture, weight in zip(style.pictures, style.weights, strict=True):
         number -= weight
         if number < 0:
             return picture
-    return style.pictures[-1]  # the weights' sum may be rounded down
+    return style.pictures[-1]  # the sum of the weights may be rounded down
 
 
 def _uniform(*numbers: int) -> Color:
-    """Three numbers in [0, 1) that look random; the same for the same numbers on every machine."""
+    """Return three pseudorandom numbers in [0, 1), identical for the same arguments on every machine."""
     digest = hashlib.blake2b(",".join(map(str, numbers)).encode(), digest_size=24).digest()
     first, second, third = (int.from_bytes(digest[place : place + 8], "big") >> 64 - _BITS for place in (0, 8, 16))
     return first / 2**_BITS, second / 2**_BITS, third / 2**_BITS
 
 
 def put_behind(image: Tensor, coverage: Tensor, color: Sequence[float], present: Sequence[float]) -> Tensor:
-    """Image [h, w, 3] of Gaussians with another color behind them: image + (1 - coverage) (color - present).
+    """Replace the background color of an image [h, w, 3]: image + (1 - coverage) (color - present).
 
-    Rendering is linear in what lies behind, and so is the box average: an image at a scale takes the coverage at it.
+    Rendering is linear in the background, and so is the box average: for an image at a scale, use the coverage at that
+    scale.
 
     Args:
+        image: [h, w, 3], rendered over the color `present`.
         coverage: [h, w] in 0..1.
-        color: [3], that is wanted.
-        present: [3], that the image has behind.
+        color: [3], new background color.
+        present: [3], present background color.
     """
     uncovered = (1 - coverage).to(image.dtype)
-    # Numbers travel with the kernels that they belong to: a device has neither a copy to make nor to be waited for.
+    # Scalars are passed as kernel arguments: no copy to the device, and no synchronization.
     channels = zip(image.unbind(-1), color, present, strict=True)
     return torch.stack([channel.add(uncovered, alpha=wanted - old) for channel, wanted, old in channels], dim=-1)

@@ -1,4 +1,4 @@
-"""Colors for Gaussians that no view sees: the color change of their nearest seen neighbors."""
+"""Colors of Gaussians that no view sees: they take the color change of their nearest seen neighbors."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-#: Seen neighbors that vote on an unseen Gaussian's color change.
+#: Number of seen neighbors that determine the color change of an unseen Gaussian.
 NEIGHBORS = 8
-#: Unseen Gaussians at a time: their neighbors' changes and weights take some tens of megabytes.
+#: Number of unseen Gaussians processed at a time; their neighbors' changes and weights take some tens of megabytes.
 _CHUNK = 1 << 16
-#: Cells along each axis of the grid by which searches are ordered.
+#: Cells along each axis of the grid that orders the searches.
 _CELLS = 128
 
 
 def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """Color changes for the Gaussians that no view sees.
+    """Return color changes for the Gaussians that no view sees.
 
-    Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: what hardly any
-    pixel showed has a change that hardly any pixel asked for.
+    Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: the change of a
+    hardly visible Gaussian was determined by hardly any pixel.
 
     Args:
         means: [N, 3].
-        change: [N, 3], what optimization changed; rows of unseen Gaussians are not read.
-        weights: [N] float64, total blend weights; 0 for the U unseen ones, at least one positive.
+        change: [N, 3], change by the optimization; rows of unseen Gaussians are ignored.
+        weights: [N] float64, total blend weights: 0 for the U unseen Gaussians, positive for at least one other.
 
     Returns:
         [U, 3] float32.
@@ -42,7 +42,10 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
 
 
 def _near_each_other(places: Tensor) -> Tensor:
-    """Order [U] of points [U, 3] by the cells of a coarse grid: searches of neighbors read the same part of a tree."""
+    """Return an order [U] of points [U, 3] by the cells of a coarse grid.
+
+    Consecutive neighbor searches then read the same part of a tree.
+    """
     places = places.double()
     lowest = places.amin(dim=0)
     size = (places.amax(dim=0) - lowest).clamp_min(1e-300)
@@ -51,7 +54,10 @@ def _near_each_other(places: Tensor) -> Tensor:
 
 
 def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean changes [U, 3] float64 of seen Gaussians `nearest` [U, K]; `change` [S, 3], `weights` [S]."""
+    """Return weighted mean changes [U, 3] float64 of seen Gaussians.
+
+    `nearest` [U, K] are their indices into `change` [S, 3] and `weights` [S].
+    """
     own = weights[nearest]
     # Relative to the largest of the eight, so that eight tiny weights still have a mean.
     share = own / own.amax(dim=1, keepdim=True)

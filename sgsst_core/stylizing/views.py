@@ -1,4 +1,4 @@
-"""The views of a job: what each is compared with, and what of it is kept in memory."""
+"""Views of a job: rendering, targets, and caches."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ from sgsst_core.stylizing.training_background import Color, put_behind
 
 
 class Views:
-    """Renders views, and prepares their targets at first use.
+    """Renderer of views that prepares their targets at first use.
 
-    Of several ranks, each renders a band of rows. What is kept is decided by sizes that are the same on every rank, so
-    that all of them find a view's targets, or none: preparing them takes all ranks.
+    With several ranks, each renders a band of rows. What is cached depends only on sizes that are identical on all
+    ranks, so they all have a view's targets cached or none has: preparing targets involves all ranks.
 
     Args:
-        scene: supplies the colors' frozen part and the content (the unstylized render).
-        cameras: one for each view.
-        rasterizer: renders them.
-        loss: prepares the targets.
-        photos: content image [H, W, 3] of a view by its index; None for the unstylized render. On a GPU they are read
-            in a thread too, see `look_ahead`.
-        covered: indices of the views that see anything.
-        weighted: weigh statistics by rendered coverage.
-        memory: bytes that content features, coverage and colors of views may take.
-        clamp_aware_gradient: let colors that the clamp holds at 0 come back (`view_colors_gradient`).
-        keep_content: keep content features that fit; False computes them at each visit, for comparison.
-        regions: for each view, the rectangle that holds every covered pixel; None where that is not known.
-        background: what the rasterizer has behind the Gaussians.
-        drawn: steps have other colors behind the Gaussians: images of the content are kept for them, not features.
-        maps: renders the share of each of the scene's regions; None where it has none.
-        collectives: of the ranks that render each view together; `loss` has the same.
+        scene: Scene that provides the frozen part of the colors and the content (the unstylized render).
+        cameras: One camera per view.
+        rasterizer: Rasterizer of the views.
+        loss: Loss that prepares the targets.
+        covered: Indices of the views that see anything.
+        weighted: Whether statistics are weighted by rendered coverage.
+        photos: Function that loads the content image [H, W, 3] of a view by its index; None for unstylized renders.
+            With a GPU it is also called in a thread, see `look_ahead`.
+        memory: Memory budget in bytes for content features, coverage and colors of views.
+        keep_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
+        clamp_aware_gradient: Whether to use the clamp-aware gradient (`view_colors_gradient`).
+        regions: Rectangle of each view that contains all covered pixels; None if unknown.
+        background: Background color of the rasterizer.
+        drawn: Whether steps use other background colors; content images are then cached instead of features.
+        maps: Renderer of region maps; None if the scene has no regions.
+        collectives: Ranks that render each view together, the same as in `loss`.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Views:
         self.scene = scene
         self.cameras = list(cameras)
         self.rasterizer = rasterizer
-        #: For what is kept through many steps: whenever it is made, it has the same bits.
+        #: For values that are cached over many steps: they are bit-identical whenever they are computed.
         self._repeatable = repeatable(rasterizer)
         self.loss = loss
         self.collectives = collectives
@@ -95,7 +95,7 @@ class Views:
         self._shown: Shelf[_ShownKey, ShownGaussians] = Shelf(shown)
         self._rest: Shelf[int, Tensor] = Shelf(memory // 4 - shown, _tensor_bytes)
         self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
-        #: Room for content, of which maps of regions take one half.
+        #: Budget for content, half of which goes to region maps if there are any.
         content = memory // 2 if maps is None else memory // 4
         self._region_weights: Shelf[int, list[list[Tensor]]] = Shelf(
             0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
@@ -116,18 +116,20 @@ class Views:
         return len(self.cameras)
 
     def colors(self, index: int, sh_dc: Tensor) -> Tensor:
-        """Colors [N, 3] of a view."""
+        """Return the colors [N, 3] of a view."""
         if self.scene.sh_degree == 0:
             return view_colors(sh_dc, torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device))
         rest = self._rest.get(index, lambda: rest_colors(self._sh_rest, self._means, self.cameras[index]))
         return view_colors(sh_dc, rest)
 
     def render(self, index: int, colors: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
-        """Image [h, w, 3] of a view with its colors [N, 3].
+        """Return the image [h, w, 3] of a view.
 
         Args:
-            rasterizer: takes the place of the views' own; h and w are those of its scale. Images of a coarse scale
-                are so small that every rank renders them whole.
+            index: Index of the view.
+            colors: [N, 3], colors of the view.
+            rasterizer: Replacement for the views' own rasterizer; h and w are those of its scale. Images at a coarse
+                scale are so small that every rank renders them completely.
         """
         rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
         if rasterizer.scale:
@@ -141,10 +143,13 @@ class Views:
     def gradient(
         self, index: int, image_gradient: Tensor, colors: Tensor, rasterizer: Rasterizer | None = None
     ) -> Tensor:
-        """dL/dsh_dc [N, 3] from this rank's part of dL/dimage [h, w, 3] and the colors that were rendered.
+        """Return dL/dsh_dc [N, 3].
 
         Args:
-            rasterizer: as for `render`.
+            index: Index of the view.
+            image_gradient: [h, w, 3], this rank's summand of dL/dimage.
+            colors: [N, 3], colors that were rendered.
+            rasterizer: Replacement for the views' own rasterizer, as in `render`.
         """
         rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
         if rasterizer.scale:
@@ -156,14 +161,15 @@ class Views:
         some = len(rows) > 0
         gradient = rasterizer.color_gradient(rows, camera, band) if some else self._nothing(len(colors), 3)
         gradient = self._sum(gradient, self._shown_by(index, rasterizer, rows, band))
-        # After the sum: which colors are let through depends on the sign of their whole gradient.
+        # After the sum, because which colors pass the clamp depends on the sign of their total gradient.
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
     def keep_weights(self, index: int, rasterizer: Rasterizer | None = None) -> None:
-        """Keep the blend weights of this rank's part of a view, where its rasterizer keeps any and they fit.
+        """Cache the blend weights of this rank's band of a view, if the rasterizer can cache them and they fit.
 
         Args:
-            rasterizer: as for `render`.
+            index: Index of the view.
+            rasterizer: Replacement for the views' own rasterizer, as in `render`.
         """
         rasterizer, camera, band = rasterizer or self.rasterizer, self.cameras[index], self._own_band(index)
         if isinstance(rasterizer, CoarseRasterizer):
@@ -172,9 +178,9 @@ class Views:
             rasterizer.keep(camera, band)
 
     def lending_weights(self, index: int, rasterizer: Rasterizer) -> AbstractContextManager[None]:
-        """A block in which a view's weights are those that `keep_weights` keeps, though they may not be kept by then.
+        """Use in a `with` block the blend weights that `keep_weights` would cache, even if they are not cached.
 
-        Coarse ones are no approximation, and not lent.
+        Coarse weights are exact, so they are not lent.
         """
         band = self._own_band(index)
         if isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
@@ -182,7 +188,7 @@ class Views:
         return nullcontext()
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
-        """The sum [N, 3] of every rank's gradient [N, 3], which is 0 but for the Gaussians that the view shows."""
+        """Return the sum [N, 3] of all ranks' gradients, which are 0 except for the Gaussians that the view shows."""
         with self.loss.timer("communication"):
             if shown is None or not shown.sparse:
                 return self.collectives.all_reduce(gradient)
@@ -190,14 +196,19 @@ class Views:
             return gradient.index_copy_(0, indices, self.collectives.all_reduce(gradient.index_select(0, indices)))
 
     def _shown_by(self, index: int, rasterizer: Rasterizer, rows: Tensor, band: Rows | None) -> ShownGaussians | None:
-        """The Gaussians that any rank's part of a view shows; None where there is nobody to tell, or no room.
+        """Return the Gaussians that any rank's band of a view shows.
 
-        Agreed upon at the first visit, from the blend weights of the gradients themselves: those of another
-        rasterizer, or of the whole view in place of its bands, may differ by rounding at the least opacity.
+        They are agreed on at the first visit, using the blend weights of the gradients themselves: those of another
+        rasterizer, or of the whole view instead of its bands, may differ by rounding at the smallest opacity.
 
         Args:
-            rows: [h, w, 3], this rank's part of the image gradient, for its shape.
-            band: the rows that it belongs to.
+            index: Index of the view.
+            rasterizer: Rasterizer of the gradients.
+            rows: [h, w, 3], image gradient of this rank's band, used for its shape.
+            band: Rows of the band.
+
+        Returns:
+            The Gaussians; None with a single rank, or without memory for them.
         """
         key, size = (index, rasterizer.scale), ShownGaussians.nbytes(len(self.scene))
         if self.collectives.size == 1 or not self._shown.holds(key, size):
@@ -206,7 +217,7 @@ class Views:
         def look() -> ShownGaussians:
             mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
             with self.loss.timer("prepare"):
-                if len(rows):  # weights are never negative: their sum is 0 where all of them are
+                if len(rows):  # weights are never negative, so their sum is 0 only if all are
                     mask = rasterizer.color_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
             with self.loss.timer("communication"):
                 return ShownGaussians(self.collectives.union(mask))
@@ -214,14 +225,17 @@ class Views:
         return self._shown.get(key, look, size)
 
     def _nothing(self, *shape: int) -> Tensor:
-        """What a rank without rows has to add."""
+        """Return the contribution of a rank without rows."""
         return torch.zeros(shape, dtype=self.rasterizer.dtype, device=self.rasterizer.device)
 
     def _own_band(self, index: int) -> Rows:
         return self._bands[index][self.collectives.rank]
 
     def content(self, index: int) -> Tensor:
-        """Content image [H, W, 3]: the photo, on the GPU where there is one; or the render of the unstylized scene."""
+        """Return the content image [H, W, 3]: the photo, or the render of the unstylized scene.
+
+        Photos are on the GPU if there is one.
+        """
         if self._ahead is not None:
             return self._ahead(index)
         if self._photos is not None:
@@ -229,44 +243,52 @@ class Views:
         return self.render(index, self.colors(index, self._sh_dc), self._repeatable)
 
     def look_ahead(self, index: int, scales: Sequence[int]) -> None:
-        """On a GPU, begin to read the photo of the view whose target is asked for next, if that will need it."""
+        """Start reading, on a GPU, the photo of the view whose target is requested next, if it will be needed."""
         if self._ahead is not None and self._needs_content(index, scales):
             self._ahead.begin(index)
 
     def end_look_ahead(self) -> None:
-        """Read nothing in advance any more, until `look_ahead`."""
+        """Stop prefetching until the next call of `look_ahead`."""
         if self._ahead is not None:
             self._ahead.end()
 
     def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
-        """Whether the content of a view at some scales is not kept: its features, or the images that they are of."""
+        """Return whether content features of a view at some scales, or the images behind them, are not cached."""
         if self._drawn:
             return bool(self.loss.content_weight) and any((index, scale) not in self._images for scale in scales)
-        share = self._shares.get((index, tuple(scales)))  # what is kept was shared out before
+        share = self._shares.get((index, tuple(scales)))  # features are cached only after their share is known
         kept = share is not None and all((index, scale, share.pieces[scale]) in self._content for scale in scales)
         return bool(self.loss.content_weight) and not kept
 
     def coverage(self, index: int) -> list[Tensor]:
-        """Coverage [H >> k, W >> k] of a view at powers of two, on the network's device; kept where memory allows."""
+        """Return the coverage [H >> k, W >> k] of a view at powers of two, on the network's device.
+
+        It is cached if it fits.
+        """
         return self._coverage.get(index, lambda: self._position_weights(index))
 
     def region_weights(self, index: int) -> list[list[Tensor]] | None:
-        """The share of each region in a view, as `coverage`; None where the scene has none."""
+        """Return the map of each region in a view, in the format of `coverage`; None if the scene has no regions."""
         maps = self._maps
         return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
 
     def put_behind(self, index: int, image: Tensor, color: Color, scale: int = 0) -> Tensor:
-        """Image [h, w, 3] of a view, at a scale, with another color behind the Gaussians, on the network's device."""
+        """Replace the background color of a view's image [h, w, 3] at a scale.
+
+        The result is on the network's device.
+        """
         return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background)
 
     def target(self, index: int, scales: Sequence[int], behind: Color | None = None) -> ViewTarget:
-        """What the view is compared with at some scales; kept where memory allows.
+        """Return the target of a view at some scales; cached if it fits.
 
-        Features are computed only of scales that are asked for: phase 1 needs those of one.
+        Features are computed only for requested scales: phase 1 needs those of one.
 
         Args:
-            behind: the color behind the Gaussians, which their content has too; None for the rasterizer's own. Its
-                features are nobody else's: only the images that they are computed from are kept.
+            index: Index of the view.
+            scales: Requested scales.
+            behind: Background color, which the content gets too; None for the rasterizer's own. Features with a
+                background color are used only once, so only the images they are computed from are cached.
         """
         coverage = self.coverage(index) if self.weighted else None
         share = self._share(index, scales, coverage)
@@ -285,7 +307,7 @@ class Views:
         return target
 
     def _content_images(self, index: int, scales: Sequence[int]) -> dict[int, Tensor]:
-        """The content of a view at some scales, [H >> s, W >> s, 3] on the network's device."""
+        """Return the content of a view at some scales, [H >> s, W >> s, 3] on the network's device."""
         whole = functools.cache(lambda: self.content(index).to(self.loss.network.device))
 
         def scaled(scale: int) -> Tensor:
@@ -294,9 +316,9 @@ class Views:
         return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
 
     def _content_behind(self, index: int, image: Tensor, behind: Color, scale: int) -> Tensor:
-        """The content of a view at a scale with another color behind the Gaussians.
+        """Return the content of a view at a scale with another background color.
 
-        What a photo has where no Gaussian is gives way to the color.
+        In a photo, the color replaces everything that no Gaussian covers.
         """
         if self._photos is None:
             return self.put_behind(index, image, behind, scale)
@@ -304,12 +326,15 @@ class Views:
         return put_behind(image * coverage[..., None].to(image.dtype), coverage, behind, (0.0, 0.0, 0.0))
 
     def uncached_fraction(self) -> None:
-        """Forget what belongs to the present division of the work, because another follows."""
+        """Clear the caches that depend on the division of work, before it changes."""
         self._content.clear()
         self._shares.clear()
 
     def _share(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Share:
-        """How the work on some scales of a view is shared out: found once, because it takes looks at the coverage."""
+        """Return the division of work on some scales of a view.
+
+        It is computed once, because it requires reading the coverage.
+        """
         key = (index, tuple(scales))
         if key not in self._shares:
             camera = self.cameras[index]
@@ -335,11 +360,11 @@ class Views:
         return self.loss.content_features(image(), scale, tiles)
 
 
-#: View, and scale of the rasterizer.
+#: Index of the view, and scale of the rasterizer.
 _ShownKey = tuple[int, int]
-#: View and scale.
+#: Index of the view, and scale.
 _ImageKey = tuple[int, int]
-#: View, scale, and every rank's pieces of it.
+#: Index of the view, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
 
 

@@ -1,13 +1,13 @@
-"""Warm start: colors that are the style's before any step, with each Gaussian's weight in the views.
+"""Warm start: give the scene the style's colors before the first step, weighted by visibility in the views.
 
-`warm_start` gives them the distribution of the style's colors (see `color_transport`); `with_moments` only its mean
+`warm_start` matches the distribution of the style's colors (see `color_transport`). `with_moments` matches only mean
 and covariance, by the linear map that moves colors least (optimal transport between Gaussian distributions; Pitié and
 Kokaram, "The Linear Monge-Kantorovitch Linear Color Mapping for Example-Based Color Transfer", 2007):
 
     A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2,   c -> A (c - m) + m_style
 
-with S, m the scene's covariance and mean and T the style's. What it moves out of 0..1 is cut off: of a dark object and
-a bright style of two colors, a pale gray was left.
+where S and m are the scene's covariance and mean, and T the style's covariance. Colors that it moves out of 0..1 are
+clipped; for a dark object and a bright style of two colors, only a pale gray would be left.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
 from sgsst_core.stylizing.color_transport import transported
 
-#: A direction in which the scene's colors vary by less than this share of their largest variance has no spread that
-#: could be stretched to the style's: it is left flat instead of blowing rounding up.
+#: A direction in which the scene's colors vary by less than this fraction of their largest variance has no spread to be
+#: stretched to the style's. It stays flat, because stretching would amplify rounding errors.
 _FLAT = 1e-9
-#: Pixels of a style that stand for all of them, at most.
+#: Maximum number of pixels that represent a style.
 _PIXELS = 1 << 16
 
 
 def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
-    """DC coefficients with the distribution of the style's colors, all of which a picture can show (0..1).
+    """Return DC coefficients with the distribution of the style's colors, all of them displayable (0..1).
 
     Args:
         sh_dc: [N, 3] float32.
         weights: [N] float64, total blend weights, at least one positive.
-        style: pictures [H, W, 3] in 0..1; of several, colors are as frequent as in the mixture.
+        style: Image [H, W, 3] in 0..1, or a mixture, in whose proportions colors then occur.
 
     Returns:
         [N, 3] float32.
@@ -47,19 +47,19 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> 
 
 
 def _some_pixels(style: StyleMixture) -> Tensor:
-    """Pixels [n, 3] of a style, evenly spread, as many of each picture as it weighs."""
+    """Return evenly spread pixels [n, 3] of a style, in proportion to the weights of its images."""
     parts = []
     for picture, weight in zip(style.pictures, style.weights, strict=True):
         pixels, count = picture.reshape(-1, 3), max(1, round(_PIXELS * weight))
         places = chosen_places(len(pixels), count)
-        if len(style.pictures) > 1 and len(places) < count:  # of a small picture, each comes several times
+        if len(style.pictures) > 1 and len(places) < count:  # repeat the pixels of a small image
             places = torch.arange(count) * len(pixels) // count
         parts.append(pixels[places])
     return torch.cat(parts)
 
 
 def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
-    """DC coefficients with the style's mean and covariance, cut off at 0..1; arguments as of `warm_start`."""
+    """Return DC coefficients with the style's mean and covariance, clipped to 0..1; arguments as in `warm_start`."""
     colors = 0.5 + SH_C0 * sh_dc.double()
     mean, covariance = _moments(colors, weights.double() / weights.double().amax())
     wanted_mean, wanted = _style_moments(StyleMixture.of(style))
@@ -68,12 +68,14 @@ def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -
 
 
 def in_colors_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """A style, of pictures [H, W, 3] in 0..1, with mean and covariance of a scene's colors: the inverse map.
+    """Match the mean and covariance of a style's colors to those of a scene, the inverse of `with_moments`.
 
-    Of several pictures, those are the mixture's: all take the same map.
+    Several images are mapped together, by the moments of their mixture.
 
     Args:
-        sh_dc, weights: as in `warm_start`.
+        style: Images [H, W, 3] in 0..1.
+        sh_dc: [N, 3], see `warm_start`.
+        weights: [N] float64, see `warm_start`.
     """
     colors = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
     wanted_mean, wanted = _moments(colors, weights.double() / weights.double().amax())
@@ -88,7 +90,7 @@ def in_colors_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMi
 
 
 def _style_moments(style: StyleMixture) -> tuple[Tensor, Tensor]:
-    """Mean [3] and covariance [3, 3] of a style's pixels, float64."""
+    """Return mean [3] and covariance [3, 3] of a style's pixels, float64."""
     found = []
     for picture in style.pictures:
         pixels = picture.reshape(-1, 3).double()
@@ -97,7 +99,9 @@ def _style_moments(style: StyleMixture) -> tuple[Tensor, Tensor]:
 
 
 def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
-    """As `warm_start`, in luminance alone: mean and spread of the style's, clamped to 0..1, with the colors' chroma.
+    """Return DC coefficients with the style's mean and spread of luminance, clamped to 0..1, and their own chroma.
+
+    Arguments are as in `warm_start`.
 
     Returns:
         [N, 3] float32.
@@ -108,12 +112,14 @@ def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture
 
 
 def in_luminance_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """A style, of pictures [H, W, 3] in 0..1, without color, its luminance with mean and deviation of a scene's.
+    """Convert a style to gray, and match the mean and deviation of its luminance to those of a scene.
 
-    Of several pictures, those are the mixture's: all take the same map.
+    Several images are mapped together, by the moments of their mixture.
 
     Args:
-        sh_dc, weights: as in `warm_start`.
+        style: Images [H, W, 3] in 0..1.
+        sh_dc: [N, 3], see `warm_start`.
+        weights: [N] float64, see `warm_start`.
     """
     wanted = _luminance_moments(luminance((COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
     own = _style_luminance(style)
@@ -126,7 +132,7 @@ def in_luminance_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> Styl
 
 
 def _style_luminance(style: StyleMixture) -> tuple[Tensor, Tensor]:
-    """Mean and deviation of the luminance of a style's pixels."""
+    """Return mean and deviation of the luminance of a style's pixels."""
     found = [luminance(picture.reshape(-1, 3).double()) for picture in style.pictures]
     parts = [_luminance_moments(values, torch.ones_like(values)) for values in found]
     if len(parts) == 1:
@@ -137,7 +143,7 @@ def _style_luminance(style: StyleMixture) -> tuple[Tensor, Tensor]:
 
 
 def _luminance_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean and deviation of values [n]."""
+    """Return weighted mean and deviation of values [n]."""
     share = weights / weights.amax()
     share = share / share.sum()
     mean = (share * values).sum()
@@ -145,7 +151,7 @@ def _luminance_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, Tensor]) -> Tensor:
-    """Values moved and stretched from a mean and a deviation to others, clamped to 0..1; flat ones are moved alone."""
+    """Map values linearly to another mean and deviation, clamped to 0..1; flat values are only shifted."""
     (mean, deviation), (wanted_mean, wanted_deviation) = own, (part.to(values) for part in wanted)
     flat = deviation <= _FLAT**0.5 * mean.abs().clamp_min(torch.finfo(values.dtype).tiny)
     factor = torch.where(flat, 0.0, wanted_deviation / torch.where(flat, 1.0, deviation))
@@ -153,7 +159,7 @@ def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, T
 
 
 def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean [3] and covariance [3, 3] of colors [n, 3]."""
+    """Return weighted mean [3] and covariance [3, 3] of colors [n, 3]."""
     total = weights.sum()
     mean = (weights[:, None] * colors).sum(dim=0) / total
     centered = colors - mean
@@ -161,7 +167,7 @@ def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _monge_map(source: Tensor, target: Tensor) -> Tensor:
-    """The symmetric A [3, 3] with A source A = target, on the directions in which the source varies."""
+    """Return the symmetric A [3, 3] with A source A = target, in the directions in which the source varies."""
     values, vectors = torch.linalg.eigh(source)
     varies = values > _FLAT * values[-1].clamp_min(torch.finfo(values.dtype).tiny)
     roots = torch.where(varies, values, 0.0).sqrt()
@@ -173,7 +179,7 @@ def _monge_map(source: Tensor, target: Tensor) -> Tensor:
 
 
 def _square_root(matrix: Tensor) -> Tensor:
-    """Square root of a symmetric matrix that is positive semidefinite up to rounding."""
+    """Return the square root of a symmetric matrix that is positive semidefinite up to rounding."""
     values, vectors = torch.linalg.eigh(matrix)
     root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
     return root
