@@ -26,7 +26,7 @@ LISTS_BESIDE_WEIGHTS = 16
 
 
 def measuring_memory(memory: int) -> int:
-    """Return the bytes of a rank's memory that novel views may use as cache.
+    """Return the size in bytes of a rank's memory that novel views may use as cache.
 
     The views of the reference may use as much again.
     """
@@ -59,7 +59,11 @@ def device_peak(device: torch.device | str) -> int | None:
 class Shelf(Generic[K, V]):
     """Cache of values by key within a number of bytes; what does not fit is recomputed at each use.
 
-    Nothing is ever evicted: views come round in turn, so evicting one would only trade it for another.
+    Nothing is ever evicted: views are visited in rounds, so evicting one would only trade it for another.
+
+    Args:
+        capacity: Memory budget in bytes.
+        size: Function that returns the size of a value in bytes; None if every call of `get` passes the size.
     """
 
     def __init__(self, capacity: int, size: Callable[[V], int] | None = None) -> None:

@@ -64,7 +64,9 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
 
 
 def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
-    """Return the network for a job: at the feature scale of its settings, and on luminance alone if colors are kept."""
+    """Return the network for a job: at the feature scale of its settings, and on luminance alone if chroma is
+    preserved.
+    """
     scaled = at_scale(weights, settings.feature_scale)
     return replace(scaled, gray=True) if settings.preserve_colors == "luminance" else scaled
 

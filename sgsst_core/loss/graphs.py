@@ -33,7 +33,7 @@ def has_graphs(device: torch.device | str) -> bool:
 def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
     """Return whether the loss of a view can be captured as a graph.
 
-    A graph reserves memory for its activations, so the same work without a graph must still fit beside it.
+    A graph reserves memory for its activations, so the same work without a graph must still fit in addition.
 
     Args:
         tiling: Partitioning rules of the loss.

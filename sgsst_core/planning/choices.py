@@ -94,7 +94,7 @@ def precision_of(asked: Precision, ratio: float | None) -> Precision:
 
     Args:
         asked: Requested precision.
-        ratio: Seconds of a convolution in float32 divided by those in the requested precision; None if float32 was
+        ratio: Time in seconds of a convolution in float32 divided by those in the requested precision; None if float32 was
             requested, or the requested one is unavailable.
     """
     return asked if ratio is not None and ratio > 1 else "float32"

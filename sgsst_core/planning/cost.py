@@ -24,7 +24,7 @@ STEP_BYTES = 4 * 3 * 4
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Return the bytes of a float32 Gaussian: position, rotation, scale, opacity and coefficients of three channels."""
+    """Return the size in bytes of a float32 Gaussian: position, rotation, scale, opacity and coefficients of three channels."""
     return 4 * (3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2)
 
 
@@ -48,14 +48,14 @@ class RasterCost:
     """Cost of the views' blend weights.
 
     Attributes:
-        seconds: Seconds of a render and its gradient with recomputed weights, mean over some views.
-        kept_seconds: Seconds of the same with cached weights; None if those of even one view do not fit in memory.
+        seconds: Time in seconds of a render and its gradient with recomputed weights, mean over some views.
+        kept_seconds: Time in seconds of the same with cached weights; None if those of even one view do not fit in memory.
         bytes: Size of the cached weights of all views, float32; None if the rasterizer cannot cache them.
         half_bytes: Size of the same in half precision.
         keeping_seconds: Seconds to compute a view's cached weights; None if not measured, on the CPU.
-        first_seconds: Additional seconds of a view's first render, which computes its tile intersections.
+        first_seconds: Additional time in seconds of a view's first render, which computes its tile intersections.
         lists_bytes: Mean size of a view's tile intersections; 0 if unknown.
-        colors_seconds: Seconds for the contribution of spherical harmonics to the colors of a view.
+        colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
     """
 
     seconds: float
@@ -193,11 +193,11 @@ class Work:
         return Work(pixels / views, again / views, without / views, tiles, peak, pairs / views)
 
     def seconds(self, rate: Rate) -> float:
-        """Return the seconds of feature network and statistics in one iteration."""
+        """Return the time in seconds of feature network and statistics in one iteration."""
         return self.pixels * rate.both + self.again * rate.forward + self.pairs * rate.search
 
     def evaluation(self, rate: Rate) -> float:
-        """Return the seconds of the loss without its gradient."""
+        """Return the time in seconds of the loss without its gradient."""
         return self.pixels * rate.forward + self.pairs * rate.search
 
 
@@ -213,7 +213,7 @@ def _vectors(size: Size) -> int:
 
 
 def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: int, device: str) -> int:
-    """Return the bytes for matching: style vectors of all view sizes at all scales, matches, and search buffers.
+    """Return the memory in bytes for matching: style vectors of all view sizes at all scales, matches, and search buffers.
 
     Args:
         sizes: (height, width) of each view.
@@ -233,7 +233,7 @@ def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: i
 
 
 def content_bytes(sizes: Sequence[Size], tiling: Tiling, cell: int) -> int:
-    """Return the bytes of the content features of views at all scales, given the bytes per cell."""
+    """Return the size in bytes of the content features of views at all scales, given the bytes per cell."""
     cells = sum(
         (height >> scale + 3) * (width >> scale + 3)
         for height, width in sizes
@@ -243,5 +243,5 @@ def content_bytes(sizes: Sequence[Size], tiling: Tiling, cell: int) -> int:
 
 
 def image_bytes(sizes: Sequence[Size]) -> int:
-    """Return the bytes of the images of one iteration: render, gradient, and their temporary float32 copies."""
+    """Return the size in bytes of the images of one iteration: render, gradient, and their temporary float32 copies."""
     return max(height * width for height, width in sizes) * 3 * 4 * 6

@@ -79,7 +79,7 @@ def whole_job(
 
 
 def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> float:
-    """Return the seconds of all steps, including first visits and style."""
+    """Return the time in seconds of all steps, including first visits and style."""
     phases = (
         (plan.steps_coarse, expected.seconds_coarse, expected.first_visit_coarse),
         (settings.steps_sos, expected.seconds, expected.first_visit),

@@ -61,7 +61,7 @@ NOTHING = len(LEVELS) - 1
 
 @dataclass(frozen=True)
 class Prices:
-    """Seconds of measurements.
+    """Time in seconds of measurements.
 
     Attributes:
         setup: Seconds once per view of `Level.views`, for neighboring poses, depth and warps.
@@ -74,21 +74,21 @@ class Prices:
     moment: float = 0.0
 
     def again(self, level: Level) -> float:
-        """Return the seconds of a moment after the first."""
+        """Return the time in seconds of a moment after the first."""
         return level.views * self.view + self.moment
 
     def of(self, level: Level, moments: int) -> float:
-        """Return the seconds of this many moments, including the evaluation of the last one."""
+        """Return the time in seconds of this many moments, including the evaluation of the last one."""
         return level.views * (self.setup + self.view) + moments * self.again(level)
 
 
 def allowed_seconds(share: float, steps: float) -> float:
-    """Return the seconds that all measurements may take, given the seconds of the steps."""
+    """Return the time in seconds that all measurements may take, given the seconds of the steps."""
     return max(LEAST_ALLOWED, share * steps)
 
 
 def novel_view_seconds(share: float, expected: Prediction) -> float:
-    """Return the seconds that novel views may take: what the loss before and after leaves; 0 if `share` is 0."""
+    """Return the time in seconds that novel views may take: what the loss before and after leaves; 0 if `share` is 0."""
     if not share:
         return 0.0
     return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)
@@ -99,8 +99,8 @@ def choose_loss_views(share: float, steps: float, price: float, views: int) -> i
 
     Args:
         share: Fraction of the steps' time allowed for measurements.
-        steps: Seconds of all steps.
-        price: Seconds of both losses of one view.
+        steps: Time in seconds of all steps.
+        price: Time in seconds of both losses of one view.
         views: Number of views of the job.
     """
     half = _PLANNED * allowed_seconds(share, steps) / 2
@@ -111,7 +111,7 @@ def choose_level(prices: Prices, allowed: float, total: int, first: int = 0) -> 
     """Return the index in `LEVELS` of the first level, from `first` on, that takes at most `allowed` seconds.
 
     Args:
-        prices: Seconds of measurements.
+        prices: Time in seconds of measurements.
         allowed: Seconds allowed.
         total: Number of steps of the run.
         first: Index of the first level to consider.

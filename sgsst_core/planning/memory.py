@@ -57,7 +57,7 @@ class PeakMemory:
         """
         probe, gaussians = self.probe, int(self.plan.seen.sum())
         measuring = 0 if self.level is None else MEASURING_BYTES
-        # The memory of a graph is exclusive: the same work without the graph must fit beside it.
+        # The memory of a graph is exclusive: the same work without the graph must fit in addition to it.
         passing = image_bytes(probe.sizes) + self.activations * (2 if self.plan.graphs else 1) + self.matching
         if probe.machine.device != "cpu":
             computing = passing + self._content() + self._weights()
@@ -85,7 +85,7 @@ class PeakMemory:
         return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
 
     def _content(self) -> int:
-        """Return the bytes of content features: the coarsest scale's from phase 1 on, all of them from phase 2 on.
+        """Return the size in bytes of content features: the coarsest scale's from phase 1 on, all of them from phase 2 on.
 
         Content images, if they are cached instead, and maps of regions are included.
         """
@@ -106,7 +106,7 @@ class PeakMemory:
         return int(min(self._all_visited * colors.bytes, colors.room))
 
     def _lists_and_weights(self) -> int:
-        """Return the bytes of weights and tile intersections beyond those cached by the survey; both share a budget."""
+        """Return the size in bytes of weights and tile intersections beyond those cached by the survey; both share a budget."""
         memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
         room = int(memory * MEMORY_SHARES["rasterizer"]) - weights
         lists = visits.lists.bytes + self._other_lists()
@@ -116,14 +116,14 @@ class PeakMemory:
         return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
 
     def _other_lists(self) -> int:
-        """Return the bytes of tile intersections of novel views, and of the reference if it has its own scene."""
+        """Return the size in bytes of tile intersections of novel views, and of the reference if it has its own scene."""
         views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
         if self.level is not None and self._pruned():
             views += self.loss_views
         return views * self.probe.raster.lists_bytes
 
     def _scene(self) -> int:
-        """Return the bytes of partial copies of the scene, and of the shapes needed to compute tile intersections."""
+        """Return the size in bytes of partial copies of the scene, and of the shapes needed to compute tile intersections."""
         probe, gaussians, everything = self.probe, int(self.plan.seen.sum()), self.probe.scene.gaussians
         each = gaussian_bytes(probe.scene.held_degree)
         copies = 0

@@ -47,13 +47,13 @@ class Prediction:
         communication: Seconds per SOS iteration that a rank spends waiting for data from others.
         seconds_one_rank: Seconds per SOS iteration on a single rank; None if there is only one.
         device_bytes: Peak GPU memory; None on a CPU.
-        first_visit: Additional seconds of a view's first visit in phase 2.
-        first_visit_coarse: Additional seconds of a view's first visit in phase 1.
-        style: Seconds for the style's statistics in the first step, assuming a style as large as a view.
-        evaluation: Seconds for the loss on the evaluation views once they have been visited.
-        losses: Seconds for the loss before and after, including first visits of views that no step has visited.
-        measuring: Seconds for all measurements outside the steps.
-        job: Seconds for all steps, with first visits, style and measurements.
+        first_visit: Additional time in seconds of a view's first visit in phase 2.
+        first_visit_coarse: Additional time in seconds of a view's first visit in phase 1.
+        style: Time in seconds for the style's statistics in the first step, assuming a style as large as a view.
+        evaluation: Time in seconds for the loss on the evaluation views once they have been visited.
+        losses: Time in seconds for the loss before and after, including first visits of views that no step has visited.
+        measuring: Time in seconds for all measurements outside the steps.
+        job: Time in seconds for all steps, with first visits, style and measurements.
         ending: Seconds from the last step to the last file, except for measurements.
     """
 

@@ -44,12 +44,12 @@ def precision_ratio(asked: Precision, device: Device, collectives: Collectives) 
 
 
 def convolution_ratio(precision: Precision, device: Device) -> float:
-    """Return the seconds of a convolution in float32 divided by those in another precision."""
+    """Return the time in seconds of a convolution in float32 divided by those in another precision."""
     return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
 
 
 def _convolution_seconds(precision: Precision, device: Device) -> float:
-    """Return the seconds of a 3x3 convolution."""
+    """Return the time in seconds of a 3x3 convolution."""
     channels, side, dtype = _CHANNELS[device], _SIDE[device], DTYPES[precision]
     image = torch.ones((1, channels, side, side), dtype=dtype, device=device)
     kernel = torch.ones((channels, channels, 3, 3), dtype=dtype, device=device)
@@ -67,7 +67,7 @@ def _convolution_seconds(precision: Precision, device: Device) -> float:
 
 
 def seconds_of(run: Callable[[int], float], least: float) -> float:
-    """Return the seconds of one repetition, from enough repetitions to take `least` seconds after a warm-up.
+    """Return the time in seconds of one repetition, from enough repetitions to take `least` seconds after a warm-up.
 
     Args:
         run: Function that repeats something a number of times and returns the total seconds.

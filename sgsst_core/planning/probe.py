@@ -102,8 +102,8 @@ class NetworkFacts:
         working_bytes: Additional bytes per pixel needed by a pass.
         content_bytes: Bytes per cell of the content layer.
         rate: Seconds per pixel.
-        fixed: Seconds of a partition tile with almost no pixels.
-        precision_ratio: Seconds of a convolution in float32 divided by those in the requested precision; None if
+        fixed: Time in seconds of a partition tile with almost no pixels.
+        precision_ratio: Time in seconds of a convolution in float32 divided by those in the requested precision; None if
             float32 was requested, or the requested one is unavailable.
         gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
         vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
@@ -513,7 +513,7 @@ def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[f
 
 
 def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
-    """Return the seconds of a view's SH colors on the second run; the first one compiles."""
+    """Return the time in seconds of a view's SH colors on the second run; the first one compiles."""
     seconds = 0.0
     if scene.sh_degree:
         sh_rest, means = scene.sh_rest.to(device), scene.means.to(device)
@@ -537,7 +537,7 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
 
 
 def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
-    """Return the seconds of each of several renders with gradient; the first one prepares the view if necessary."""
+    """Return the time in seconds of each of several renders with gradient; the first one prepares the view if necessary."""
     colors = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
     seconds = []
     for _ in range(visits):

@@ -37,18 +37,18 @@ class Link:
 
     Attributes:
         bandwidth: Bytes per second that a rank sends while receiving as many.
-        latency: Seconds of the shortest message from one rank to the next.
+        latency: Time in seconds of the shortest message from one rank to the next.
     """
 
     bandwidth: float
     latency: float
 
     def all_gather(self, size: int, ranks: int) -> float:
-        """Return the seconds of an all-gather of `size` bytes in total; a reduce-scatter takes as long."""
+        """Return the time in seconds of an all-gather of `size` bytes in total; a reduce-scatter takes as long."""
         return (ranks - 1) * (self.latency + size / ranks / self.bandwidth)
 
     def all_reduce(self, size: int, ranks: int) -> float:
-        """Return the seconds of an all-reduce of `size` bytes per rank."""
+        """Return the time in seconds of an all-reduce of `size` bytes per rank."""
         return 2 * self.all_gather(size, ranks)
 
 
@@ -60,7 +60,7 @@ class IterationWork:
         pieces: One piece for each computed scale.
         halo: Pixels around a partition tile.
         pixel: Seconds per pixel through the network: both passes and statistics.
-        raster: Seconds of render and gradient on one rank.
+        raster: Time in seconds of render and gradient on one rank.
         fixed: Seconds that every rank needs regardless of their number: comparing statistics, and the optimizer.
         gaussians: Number of optimized Gaussians.
         whole_image: Whether the full-size image and its gradient are exchanged (phase 1 with cached weights needs
@@ -70,7 +70,7 @@ class IterationWork:
         working: Memory of a pass in addition to the activations, as a fraction of them.
         sharing: Number of ranks that divide this memory.
         shown: Number of Gaussians that the view shows, whose gradients are sent; None for all.
-        matching: Seconds of the nearest-neighbor search on one rank.
+        matching: Time in seconds of the nearest-neighbor search on one rank.
     """
 
     pieces: tuple[Piece, ...]
@@ -88,7 +88,7 @@ class IterationWork:
     matching: float = 0.0
 
     def computing(self, ranks: int, groups: int = 1) -> float:
-        """Return the seconds of the rank with most work, if this many groups of ranks take a view each."""
+        """Return the time in seconds of the rank with most work, if this many groups of ranks take a view each."""
         shares = divide(self.pieces, self.halo, (1.0,) * ranks)
         held = self.held / min(ranks * groups, self.sharing)
         return (
@@ -98,7 +98,7 @@ class IterationWork:
         )
 
     def _network(self, share: Sequence[Piece], ranks: int, held: float) -> float:
-        """Return the seconds of a rank's pieces, split into partition tiles as its memory requires."""
+        """Return the time in seconds of a rank's pieces, split into partition tiles as its memory requires."""
         areas = {piece.scale: self._areas(piece, held) for piece in share if piece.region.pixels}
         seconds = 0.0
         for scales in rounds(list(areas), ranks):
@@ -112,7 +112,7 @@ class IterationWork:
         return [tile.outer.pixels for tile in partition(*piece.size, size, self.halo, piece.region)]
 
     def communication(self, ranks: int, link: Link) -> float:
-        """Return the seconds that ranks wait for data.
+        """Return the time in seconds that ranks wait for data.
 
         Only the statistics of the last scale count; the others overlap.
         """
@@ -143,7 +143,7 @@ class IterationWork:
         return int(12 * (self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)))
 
     def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
-        """Return the seconds of an iteration of one view, on each of this many groups of ranks."""
+        """Return the time in seconds of an iteration of one view, on each of this many groups of ranks."""
         return self.computing(ranks, groups) + self.communication(ranks, link)
 
 
@@ -162,7 +162,7 @@ def probe_link(collectives: Collectives, device: torch.device) -> Link:
 
 
 def _slowest_sum(collectives: Collectives, device: torch.device, size: int) -> float:
-    """Return the seconds of an all-reduce of this many bytes on the slowest rank, from the last of three runs."""
+    """Return the time in seconds of an all-reduce of this many bytes on the slowest rank, from the last of three runs."""
     tensor = torch.zeros(size // 4, device=device)
     seconds = 0.0
     for _ in range(3):  # the first run opens the connections
@@ -181,7 +181,7 @@ class RanksChoice:
 
     Attributes:
         ranks: Number of ranks that take part.
-        seconds: Seconds of the whole schedule for each number of ranks considered.
+        seconds: Time in seconds of the whole schedule for each number of ranks considered.
     """
 
     ranks: int

@@ -55,12 +55,12 @@ class Made:
 
     @property
     def once(self) -> float:
-        """Additional seconds of a view's first visit, mean over views."""
+        """Additional time in seconds of a view's first visit, mean over views."""
         return self.kept * self.seconds
 
     @property
     def always(self) -> float:
-        """Seconds of every visit of a view, mean over views."""
+        """Time in seconds of every visit of a view, mean over views."""
         return (1 - self.kept) * self.seconds
 
     @property
@@ -90,8 +90,8 @@ class Visits:
         content_coarse: Content features of the coarsest scale alone.
         images: Content images, from which features are computed with another background color.
         maps: Maps of the regions.
-        raster: Seconds of a render and its gradient with recomputed weights.
-        raster_kept: Seconds of a render and its gradient with cached weights.
+        raster: Time in seconds of a render and its gradient with recomputed weights.
+        raster_kept: Time in seconds of a render and its gradient with cached weights.
         in_coarse: Whether phase 1 already computes tile intersections, colors and weights for phase 2.
         coarse_weights: Whether phase 1 computes weights of its own.
     """
@@ -162,14 +162,14 @@ class Visits:
         )
 
     def rasterized(self) -> float:
-        """Return the seconds of a render and its gradient at a later visit, mean over views."""
+        """Return the time in seconds of a render and its gradient at a later visit, mean over views."""
         uncached = self.raster + self.lists.always
         if self.weights is not None:
             uncached = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * uncached
         return uncached + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
-        """Return the seconds of every visit apart from rendering and network, for content that is not cached."""
+        """Return the time in seconds of every visit apart from rendering and network, for content that is not cached."""
         return (self.content_coarse if coarse else self.content).always + self.images.always + self.maps.always
 
     def first(self, *, coarse: bool) -> float:

@@ -26,8 +26,8 @@ L = TypeVar("L", bound=Sized)
 class KeptLists(Generic[L]):
     """Cache of per-view data. Beyond the budget, only the data of the latest view are held.
 
-    Nothing is evicted: views come round in turn, so evicting the least recently used one would evict each just before
-    it is needed.
+    Nothing is evicted: views are visited in rounds, so evicting the least recently used one would evict each just
+    before it is needed.
 
     Args:
         build: Function that computes the data of a view.

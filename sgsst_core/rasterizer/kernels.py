@@ -58,10 +58,11 @@ _BLOCK_TILES, _STRIDE = 8, 1_000_003
 def _blend(block, alive, value, x, y, low, high, alpha_max):
     """Blend one Gaussian into rows low..high of the tile at pixel (x, y).
 
-    Return the rows (first, stop) that it reached.
-
-    block[1, first:stop] then holds its weights. alive[row] tells whether the row has unfinished pixels; alive[16] is
+    block[1, first:stop] then holds its weights. alive[row] is non-zero if the row has unfinished pixels; alive[16] is
     the number of such rows.
+
+    Returns:
+        Rows (first, stop) that the Gaussian reached.
     """
     dx = x + 0.5 - value[0]
     top = y + 0.5 - value[1]
@@ -144,9 +145,9 @@ def _blocks(tiles):
 
 @compiled()
 def _scattered(step, tiles):
-    """Return the tile at a step of a parallel loop over `_blocks(tiles) * _BLOCK_TILES`.
+    """Return the tile at a step of a parallel loop over `_blocks(tiles) * _BLOCK_TILES` steps.
 
-    It may be beyond `tiles`: skip it.
+    Steps whose result is not below `tiles` have no tile and must be skipped.
 
     Each thread gets a range of steps. Consecutive blocks are scattered over the image, so that no thread gets only sky
     and another only dense areas. Tiles within a block are neighbors, which share Gaussians.

@@ -28,7 +28,7 @@ def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class CountedStrips:
-    """Sizes of a band's weights, counted before they are stored; takes about as long as one render.
+    """Sizes of a band's weights, counted before the weights are stored. Counting takes about as long as one render.
 
     Attributes:
         items: [strips], items per strip.

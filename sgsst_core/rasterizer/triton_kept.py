@@ -19,7 +19,9 @@ _DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "half": torch
 
 
 class CountedPieces:
-    """Sizes of a band's weights, counted before they are stored: one pass over the view and one synchronization.
+    """Sizes of a band's weights, counted before the weights are stored.
+
+    Counting takes one pass over the view and one synchronization with the device.
 
     Attributes:
         pieces: P, number of pieces.

@@ -37,7 +37,7 @@ class Progress:
         step: Number of completed steps.
         total: Total number of steps.
         loss: Loss of the step.
-        seconds: Seconds of all steps so far.
+        seconds: Time in seconds of all steps so far.
         seconds_left: Remaining seconds of the job, including measurements and output.
         scales: Loss of the step by scale, full size first; None for skipped scales.
     """

@@ -2,7 +2,7 @@
 
 The first visit of a view in a phase takes longer than later ones, because its tile intersections, coverage and content
 features are computed then. Steps are therefore counted separately by phase, and first visits separately from others.
-After a resume, every view is visited anew.
+After a resume, every view has to be visited for the first time again.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class ExpectedPhase:
     Attributes:
         stage: Name of the phase.
         steps: Number of steps.
-        seconds: Seconds of a step whose views have all been visited before; 0 if unknown.
-        first_visit: Additional seconds of each view's first visit.
+        seconds: Time in seconds of a step whose views have all been visited before; 0 if unknown.
+        first_visit: Additional time in seconds of each view's first visit.
     """
 
     stage: str
@@ -50,7 +50,7 @@ class _Stage:
         self.first: deque[_FirstVisits] = deque(maxlen=_LATEST)
 
     def seconds(self) -> list[float]:
-        """Return the seconds of all steps."""
+        """Return the time in seconds of all steps."""
         return [*self.known, *(step.seconds for step in self.first)]
 
     def extra(self, known: float) -> float:
@@ -137,7 +137,7 @@ class SecondsLeft:
         return len(unknown & soon) + len(unknown - soon) * later
 
     def _prices(self, phase: ExpectedPhase) -> tuple[float, float]:
-        """Return the seconds of a step of a phase, and the additional seconds of each first visit."""
+        """Return the time in seconds of a step of a phase, and the additional seconds of each first visit."""
         steps = self._steps[phase.stage]
         if not steps.seconds():
             ratio = self._ratio()
@@ -148,7 +148,7 @@ class SecondsLeft:
         return known, phase.first_visit * self._first_ratio(self._ratio())
 
     def _known(self, phase: ExpectedPhase) -> float:
-        """Return the seconds of a step without first visits, for a phase that has already started."""
+        """Return the time in seconds of a step without first visits, for a phase that has already started."""
         steps = self._steps[phase.stage]
         if steps.known:
             return median(steps.known)

@@ -25,7 +25,7 @@ class StepRecord:
         seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
         loss: E before the step, mean over its views.
         terms: Loss by scale, split into terms.
-        parts: Seconds of this step by activity.
+        parts: Time in seconds of this step by activity.
         memory: Physical memory of the process after the step, in bytes.
         sent: Bytes sent by this rank to others, by purpose (`collectives.Traffic`); empty for a single rank.
         device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.

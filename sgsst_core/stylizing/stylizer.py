@@ -106,7 +106,7 @@ class Stylizer:
         self.history: list[StepRecord] = []
         #: Measurements between steps (`loop.Callbacks.measure`), JSON-serializable and preserved by a resume.
         self.measured: list[dict[str, Any]] = []
-        #: Seconds for the style's statistics, in the steps that first needed them.
+        #: Time in seconds for the style's statistics, in the steps that first needed them.
         self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []

@@ -18,7 +18,7 @@ DRIFT_STEPS = 50
 #: Steps of a phase after which speeds of ranks are compared. The first step is ignored, because it includes
 #: preparation.
 BALANCE_STEPS = 6
-#: Minimum ratio of the fastest to the slowest rank at which the work is divided anew.
+#: Minimum ratio of the fastest to the slowest rank at which the work is redivided.
 LEAST_IMBALANCE = 1.15
 
 _NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching")
@@ -78,7 +78,7 @@ class Team:
 
         Args:
             cost: Pixels that this rank passed through the network in the last step.
-            seconds: Seconds of that step by activity.
+            seconds: Time in seconds of that step by activity.
         """
         if self._pace is None:
             return None
