@@ -26,7 +26,7 @@ LISTS_BESIDE_WEIGHTS = 16
 
 
 def measuring_memory(memory: int) -> int:
-    """Return the size in bytes of a rank's memory that novel views may use as cache.
+    """Return the size in bytes of the cache for novel views, as part of a rank's memory.
 
     The views of the reference may use as much again.
     """
@@ -34,7 +34,7 @@ def measuring_memory(memory: int) -> int:
 
 
 def default_memory_limit(device: torch.device | None = None) -> int:
-    """Return the bytes that a job may plan with on this machine at present.
+    """Return how many bytes a job may plan with on this machine at present.
 
     They are those of the GPU if `device` is one, else those of the CPU.
     """
@@ -96,7 +96,7 @@ class Shelf(Generic[K, V]):
         return key in self._kept
 
     def holds(self, key: K, size: int) -> bool:
-        """Return whether the value of a key is cached, or would be because this many bytes are free."""
+        """Return whether the value of a key is cached, or would be because it has at most as many bytes as are free."""
         return key in self._kept or self.used + size <= self._capacity
 
     def clear(self) -> None:

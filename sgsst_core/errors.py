@@ -69,25 +69,25 @@ class CheckpointError(InvalidInputError):
 
 
 class TooManyIntersectionsError(SgsstError):
-    """View with more pairs of Gaussian and raster tile than the rasterizer can address."""
+    """Too many pairs of Gaussian and raster tile in a view for the rasterizer to address."""
 
     code = "too-many-intersections"
 
 
 class RanksFailedError(SgsstError):
-    """Workers of a job that were lost too often, or failed for a reason of their own."""
+    """Workers of a job that were lost too often, or that failed for a reason of their own."""
 
     code = "workers-failed"
 
 
 class RanksDriftedError(SgsstError):
-    """Ranks whose colors differ although they must be identical: a machine computes wrongly, or unlike the others."""
+    """Different colors on ranks that must agree: a machine computes wrongly, or not like the others."""
 
     code = "ranks-drifted"
 
 
 class DivergedError(SgsstError):
-    """Colors or gradients outside the range in which the optimizer works."""
+    """Divergence of colors or gradients beyond the range in which the optimizer works."""
 
     code = "diverged"
 
@@ -99,6 +99,6 @@ class InfrastructureError(SgsstError):
 
 
 class ClusterAwayError(RanksFailedError, InfrastructureError):
-    """No cluster to run workers on, or none with capacity for even a single worker."""
+    """Missing cluster, or a cluster without capacity for even a single worker."""
 
     code = "workers-failed"

@@ -1,4 +1,4 @@
-"""Profiling by name: exclusive time, from the clock on a CPU, and from stream events on a GPU."""
+"""Profiler: exclusive time by name, from the clock on a CPU and from stream events on a GPU."""
 
 from __future__ import annotations
 

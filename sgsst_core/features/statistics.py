@@ -128,9 +128,9 @@ def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 
 def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
-    """Return the mean [c] of some positions, of those with weight if any has, as float32 or float64.
+    """Return a shift [c] near the mean: the mean of some positions, in float32 or float64.
 
-    For a constant channel it is exactly that constant.
+    Only positions with weight are used, if there are any. For a constant channel the shift is exactly that constant.
     """
     height, width = features.shape[:2]
     positions = height * width
@@ -147,7 +147,7 @@ def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
 
 
 def _is_far(shift: Tensor, found: LayerStatistics) -> bool:
-    """Return whether removing the shift from the sums canceled digits. Synchronizes with the device."""
+    """Return whether the shift is so far from the mean that digits canceled. Synchronizes with the device."""
     offset = (found.mean - shift).abs()
     rounding = torch.finfo(shift.dtype).eps * shift.abs()
     return bool(((offset > _FAR * found.std()) & (offset > _FAR * rounding)).any())

@@ -49,7 +49,7 @@ _TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
 
 
 def layer_stride(layer: str) -> int:
-    """Return the pixels from one cell of a layer to the next: 1 for `PIXELS` and relu1_*, up to 16 for relu5_*."""
+    """Return the distance in pixels between neighboring cells: 1 for `PIXELS` and relu1_*, up to 16 for relu5_*."""
     return 1 if layer == PIXELS else 1 << (int(layer[4]) - 1)
 
 

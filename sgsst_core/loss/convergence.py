@@ -16,7 +16,7 @@ LEAST_FALL = 0.005
 
 
 def window_length(round_length: int) -> int:
-    """Return the steps in a window: as many whole rounds as reach at least `SHORTEST_WINDOW`."""
+    """Return the length of a window: the smallest number of whole rounds with at least `SHORTEST_WINDOW` steps."""
     return round_length * math.ceil(SHORTEST_WINDOW / round_length)
 
 

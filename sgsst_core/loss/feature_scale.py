@@ -64,9 +64,7 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
 
 
 def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
-    """Return the network for a job: at the feature scale of its settings, and on luminance alone if chroma is
-    preserved.
-    """
+    """Return the network as a job uses it: at its feature scale, and for luminance alone if chroma is preserved."""
     scaled = at_scale(weights, settings.feature_scale)
     return replace(scaled, gray=True) if settings.preserve_colors == "luminance" else scaled
 
@@ -78,9 +76,7 @@ def even_scales(weights: BackboneWeights) -> dict[str, float]:
 
 
 def is_original(weights: BackboneWeights) -> bool:
-    """Return whether the weights are those of the original network, which takes input of 0 to 255 without
-    normalization.
-    """
+    """Return whether the weights are those of the original network, whose input is 0 to 255 without normalization."""
     return bool((weights.input_scale == 255).all())
 
 

@@ -62,12 +62,11 @@ class StyleVectors:
 
 
 def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
-    """Return at most `most` of `count` indices, evenly spread, int64 in ascending order; all of them if there are no
-    more.
+    """Return at most `most` of `count` indices, evenly spread, int64 in ascending order.
 
-    The range is divided into `most` equal parts, and one index is taken from each, at an offset that varies. Otherwise
-    a style with a regular pattern, such as stripes, would be sampled at the same phase throughout. An index may appear
-    twice.
+    All are returned if there are no more. Otherwise the range is divided into `most` equal parts, and one index is
+    taken from each, at an offset that varies. With a constant offset, a style with a regular pattern, such as stripes,
+    would be sampled at the same phase throughout. An index may appear twice.
     """
     if count <= most:
         return torch.arange(count)
@@ -203,8 +202,9 @@ def working_bytes(channels: int, value: int, device: str) -> int:
 
 
 def nearest_reference(features: Sequence[Tensor], style: Sequence[Tensor], weights: Tensor | None = None) -> Tensor:
-    """Compute the mean distance to the nearest style vector from its definition, in float64, unblocked and
-    differentiable.
+    """Compute the mean distance to the nearest style vector from its definition.
+
+    Float64, unblocked and differentiable.
 
     Args:
         features: Features of each layer, [h, w, c_l].

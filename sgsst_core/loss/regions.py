@@ -21,7 +21,7 @@ from sgsst_core.scene.split import Refinement, parents_of
 
 @dataclass(frozen=True)
 class Region:
-    """Single region as requested by the user.
+    """Region as requested by the user.
 
     Attributes:
         name: Display name.

@@ -248,7 +248,7 @@ class SosLoss:
         return self.tiling.scales((height, width))
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
-        """Return the partition of a scaled view. Pixels of coverage [h, w] 0 may belong to no tile."""
+        """Return the partition of a scaled view. Pixels without coverage [h, w] may belong to no tile."""
         return self._partition(self._piece(0, (height, width), coverage), coverage)
 
     def share(
@@ -332,7 +332,7 @@ class SosLoss:
     def _mixed_layers(
         self, pyramids: Sequence[Mapping[int, Tensor]], weights: Sequence[float]
     ) -> dict[int, dict[str, LayerTarget]]:
-        """Compute the layer targets of a mixture at each scale."""
+        """Compute the layer targets of a mixture at each scale, from the pyramids and weights of its images."""
         every = [self._style_statistics(pyramid) for pyramid in pyramids]
         mixed: dict[int, dict[str, LayerTarget]] = {}
         for scale in pyramids[0]:

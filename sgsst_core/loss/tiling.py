@@ -1,4 +1,4 @@
-"""Partitioning of scaled views into tiles under a memory budget, as used by the loss and predicted by the planner."""
+"""Partitioning of scaled views into tiles under a memory budget, for the loss and for the planner's predictions."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Piece:
     region: Rectangle
 
     def cost(self, halo: int) -> int:
-        """Return the pixels through the network if the piece is processed as one tile."""
+        """Return the number of pixels through the network if the piece is processed as one tile."""
         return self.tile(halo).outer.pixels if self.region.pixels else 0
 
     def cells(self, layer: str) -> int:
@@ -111,9 +111,9 @@ def _cuts(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
 
 
 def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Rows]:
-    """Divide the rows of an image into one band per rank, in order; bands may be empty.
+    """Divide the rows of an image into one band per rank, in order. Bands may be empty.
 
-    Bands start at raster tile boundaries, since Gaussians of a divided raster tile would be processed twice. The
+    Bands start at raster tile boundaries, because the Gaussians of a divided raster tile would be processed twice. The
     covered rows are divided equally; empty rows above and below cost nothing and go to the first and last band.
     """
     top, bottom = covered or (0, height)

@@ -1,1 +1,1 @@
-"""Planning: measure a job before its first step, and decide what its scene allows to leave out."""
+"""Planning: measure a job before its first step, and decide what can be left out for its scene."""

@@ -70,7 +70,7 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
 
 
 def training_background_of(settings: Settings, *, scan: bool) -> PlannedBackground:
-    """Return the background of the Gaussians in a step."""
+    """Return the training background, which is behind the Gaussians in a step."""
     if settings.training_background == "auto":
         return SCAN_BACKGROUND if scan else "background"
     return settings.training_background
@@ -94,7 +94,7 @@ def precision_of(asked: Precision, ratio: float | None) -> Precision:
 
     Args:
         asked: Requested precision.
-        ratio: Time in seconds of a convolution in float32 divided by those in the requested precision; None if float32 was
+        ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32 was
             requested, or the requested one is unavailable.
     """
     return asked if ratio is not None and ratio > 1 else "float32"

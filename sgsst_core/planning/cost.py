@@ -24,7 +24,10 @@ STEP_BYTES = 4 * 3 * 4
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Return the size in bytes of a float32 Gaussian: position, rotation, scale, opacity and coefficients of three channels."""
+    """Return the size in bytes of a float32 Gaussian.
+
+    It has position, rotation, scale, opacity, and coefficients of three color channels.
+    """
     return 4 * (3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2)
 
 
@@ -49,12 +52,13 @@ class RasterCost:
 
     Attributes:
         seconds: Time in seconds of a render and its gradient with recomputed weights, mean over some views.
-        kept_seconds: Time in seconds of the same with cached weights; None if those of even one view do not fit in memory.
-        bytes: Size of the cached weights of all views, float32; None if the rasterizer cannot cache them.
-        half_bytes: Size of the same in half precision.
-        keeping_seconds: Seconds to compute a view's cached weights; None if not measured, on the CPU.
+        kept_seconds: Time in seconds of the same with cached weights; None if those of even one view do not fit in
+            memory.
+        bytes: Size in bytes of the cached weights of all views, float32; None if the rasterizer cannot cache them.
+        half_bytes: Size in bytes of the same in half precision.
+        keeping_seconds: Time in seconds to compute a view's cached weights; None if not measured, on the CPU.
         first_seconds: Additional time in seconds of a view's first render, which computes its tile intersections.
-        lists_bytes: Mean size of a view's tile intersections; 0 if unknown.
+        lists_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
         colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
     """
 
@@ -213,7 +217,9 @@ def _vectors(size: Size) -> int:
 
 
 def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: int, device: str) -> int:
-    """Return the memory in bytes for matching: style vectors of all view sizes at all scales, matches, and search buffers.
+    """Return the memory in bytes for matching features.
+
+    It holds style vectors of all view sizes at all scales, matches, and search buffers.
 
     Args:
         sizes: (height, width) of each view.

@@ -140,7 +140,7 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
 
 
 def of_training_background(plan: Plan, settings: Settings, visits: Visits) -> list[Decision]:
-    """Return the lines about the training background and the initial colors, unless they are the plain ones."""
+    """Return the lines about the training background and the initial colors, unless they are the default ones."""
     share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
     decisions = []
     if plan.training_background != "background":

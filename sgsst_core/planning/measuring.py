@@ -27,7 +27,7 @@ RENDERED = 4
 
 @dataclass(frozen=True)
 class Level:
-    """Amount of measurements.
+    """Set of measurements, one step on the scale from everything to nothing.
 
     Attributes:
         views: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
@@ -61,7 +61,7 @@ NOTHING = len(LEVELS) - 1
 
 @dataclass(frozen=True)
 class Prices:
-    """Time in seconds of measurements.
+    """Time that measurements take.
 
     Attributes:
         setup: Seconds once per view of `Level.views`, for neighboring poses, depth and warps.
@@ -83,12 +83,15 @@ class Prices:
 
 
 def allowed_seconds(share: float, steps: float) -> float:
-    """Return the time in seconds that all measurements may take, given the seconds of the steps."""
+    """Return the time in seconds that all measurements may take, given that of the steps."""
     return max(LEAST_ALLOWED, share * steps)
 
 
 def novel_view_seconds(share: float, expected: Prediction) -> float:
-    """Return the time in seconds that novel views may take: what the loss before and after leaves; 0 if `share` is 0."""
+    """Return the time in seconds that novel views may take.
+
+    It is what the loss before and after leaves, or 0 if `share` is 0.
+    """
     if not share:
         return 0.0
     return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)

@@ -50,10 +50,10 @@ class PeakMemory:
     matching: int
 
     def bytes(self) -> tuple[int, int | None]:
-        """Return the peak memory of a rank's process and of its GPU, which holds the operands; None on a CPU.
+        """Return the peak memory in bytes of a rank's process, and of its GPU (None on a CPU).
 
-        Data that grow with the number of Gaussians are counted on a CPU; on a GPU they are small compared to its
-        tensors.
+        With a GPU, the data of the computation are in GPU memory. Data that grow with the number of Gaussians are
+        counted only on a CPU; on a GPU they are small compared to its tensors.
         """
         probe, gaussians = self.probe, int(self.plan.seen.sum())
         measuring = 0 if self.level is None else MEASURING_BYTES
@@ -85,7 +85,7 @@ class PeakMemory:
         return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
 
     def _content(self) -> int:
-        """Return the size in bytes of content features: the coarsest scale's from phase 1 on, all of them from phase 2 on.
+        """Return the size in bytes of content features: those of the coarsest scale in phase 1, all of them in phase 2.
 
         Content images, if they are cached instead, and maps of regions are included.
         """
@@ -106,7 +106,10 @@ class PeakMemory:
         return int(min(self._all_visited * colors.bytes, colors.room))
 
     def _lists_and_weights(self) -> int:
-        """Return the size in bytes of weights and tile intersections beyond those cached by the survey; both share a budget."""
+        """Return the size in bytes of weights and tile intersections, which share a budget.
+
+        What the survey has already cached is not included.
+        """
         memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
         room = int(memory * MEMORY_SHARES["rasterizer"]) - weights
         lists = visits.lists.bytes + self._other_lists()
@@ -116,14 +119,14 @@ class PeakMemory:
         return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
 
     def _other_lists(self) -> int:
-        """Return the size in bytes of tile intersections of novel views, and of the reference if it has its own scene."""
+        """Return the size in bytes of tile intersections for novel views, and for a reference with its own scene."""
         views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
         if self.level is not None and self._pruned():
             views += self.loss_views
         return views * self.probe.raster.lists_bytes
 
     def _scene(self) -> int:
-        """Return the size in bytes of partial copies of the scene, and of the shapes needed to compute tile intersections."""
+        """Return the size in bytes of partial copies of the scene, and of shapes for computing tile intersections."""
         probe, gaussians, everything = self.probe, int(self.plan.seen.sum()), self.probe.scene.gaussians
         each = gaussian_bytes(probe.scene.held_degree)
         copies = 0
@@ -136,7 +139,7 @@ class PeakMemory:
         return copies
 
     def _novel_views(self) -> int:
-        """Return the bytes cached for novel views and for the reference's views, without tile intersections."""
+        """Return the size in bytes of the caches for novel views and for the reference, except tile intersections."""
         if self.level is None:
             return 0
         memory, kept = measuring_memory(self.probe.machine.memory), 0
@@ -154,7 +157,7 @@ class PeakMemory:
         return kept
 
     def _exact_activations(self) -> int:
-        """Return the bytes that the reference's activations take beyond the job's."""
+        """Return by how many bytes the reference's activations exceed the job's."""
         if self.level is None or not self._approximated():
             return 0
         budget = int(self.probe.machine.memory * MEMORY_SHARES["activations"])

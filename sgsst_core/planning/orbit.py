@@ -1,4 +1,4 @@
-"""Choice of an orbit around a scene: the up direction, and rings of cameras as far as they show more of its surface."""
+"""Choice of an orbit around a scene: the up direction, and as many rings of cameras as show more of its surface."""
 
 from __future__ import annotations
 

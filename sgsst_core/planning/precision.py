@@ -44,7 +44,7 @@ def precision_ratio(asked: Precision, device: Device, collectives: Collectives) 
 
 
 def convolution_ratio(precision: Precision, device: Device) -> float:
-    """Return the time in seconds of a convolution in float32 divided by those in another precision."""
+    """Return the ratio of a convolution's time in float32 to its time in another precision."""
     return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
 
 

@@ -101,10 +101,10 @@ class NetworkFacts:
         held_bytes: Bytes per pixel stored by a forward pass for the backward pass.
         working_bytes: Additional bytes per pixel needed by a pass.
         content_bytes: Bytes per cell of the content layer.
-        rate: Seconds per pixel.
+        rate: Time per pixel.
         fixed: Time in seconds of a partition tile with almost no pixels.
-        precision_ratio: Time in seconds of a convolution in float32 divided by those in the requested precision; None if
-            float32 was requested, or the requested one is unavailable.
+        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32
+            was requested, or the requested one is unavailable.
         gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
         vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
         deepest: Deepest reported layer.
@@ -288,7 +288,9 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
 
 
 def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps: int = 0) -> Probe:
-    """Time and count. One rank does this for all, because timings differ between ranks.
+    """Measure everything that decisions depend on.
+
+    One rank does this for all, because timings differ between ranks.
 
     Args:
         workshop: Planning context.
@@ -503,7 +505,7 @@ def _comes_too_seldom(settings: Settings, views: int) -> bool:
 
 
 def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
-    """Return seconds and bytes of a view's tile intersections, recomputed; mean over some views."""
+    """Return the time in seconds and the size in bytes of recomputed tile intersections, mean over some views."""
     seconds, size, shapes = 0.0, 0, Shapes.of(scene)
     for camera in cameras:
         started = time.perf_counter()
@@ -526,7 +528,7 @@ def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float
 
 
 def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPrecision) -> float:
-    """Return the seconds to compute a view's cached weights on the second run; the first one compiles."""
+    """Return the time in seconds to compute a view's cached weights on the second run; the first one compiles."""
     seconds = 0.0
     for _ in range(2):
         started = time.perf_counter()
@@ -537,7 +539,10 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
 
 
 def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
-    """Return the time in seconds of each of several renders with gradient; the first one prepares the view if necessary."""
+    """Return the time in seconds of each of several renders with gradient.
+
+    The first one prepares the view if necessary.
+    """
     colors = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
     seconds = []
     for _ in range(visits):

@@ -88,7 +88,12 @@ class IterationWork:
     matching: float = 0.0
 
     def computing(self, ranks: int, groups: int = 1) -> float:
-        """Return the time in seconds of the rank with most work, if this many groups of ranks take a view each."""
+        """Return the computing time in seconds of the rank with most work.
+
+        Args:
+            ranks: Number of ranks per group.
+            groups: Number of groups, each of which takes a view.
+        """
         shares = divide(self.pieces, self.halo, (1.0,) * ranks)
         held = self.held / min(ranks * groups, self.sharing)
         return (
@@ -143,7 +148,13 @@ class IterationWork:
         return int(12 * (self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)))
 
     def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
-        """Return the time in seconds of an iteration of one view, on each of this many groups of ranks."""
+        """Return the time in seconds of an iteration of one view, including communication.
+
+        Args:
+            ranks: Number of ranks per group.
+            link: Connection between the ranks.
+            groups: Number of groups, each of which takes a view.
+        """
         return self.computing(ranks, groups) + self.communication(ranks, link)
 
 
@@ -162,7 +173,10 @@ def probe_link(collectives: Collectives, device: torch.device) -> Link:
 
 
 def _slowest_sum(collectives: Collectives, device: torch.device, size: int) -> float:
-    """Return the time in seconds of an all-reduce of this many bytes on the slowest rank, from the last of three runs."""
+    """Return the time in seconds of an all-reduce of this many bytes on the slowest rank.
+
+    The last of three runs counts.
+    """
     tensor = torch.zeros(size // 4, device=device)
     seconds = 0.0
     for _ in range(3):  # the first run opens the connections

@@ -119,7 +119,7 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, ther
 
 
 def most_children(weights: Tensor) -> Tensor:
-    """Return the maximum number of Gaussians [N] that each may become; children that cover few pixels carry no stroke.
+    """Return the maximum number of Gaussians that each one may become, [N]; children of too few pixels carry no stroke.
 
     Args:
         weights: [N], blend weights over all pixels of all views.

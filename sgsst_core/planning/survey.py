@@ -31,7 +31,7 @@ def sees_something(coverage: Tensor) -> bool:
 
 
 def nothing_seen(cameras: int) -> CameraError:
-    """Return the error for cameras none of which sees a Gaussian."""
+    """Return the error for cameras that see no Gaussian."""
     return CameraError(
         f"None of the {cameras} cameras sees a Gaussian. Check that cameras and scene belong together (same training "
         "run, same world), or let an orbit make the cameras."

@@ -169,11 +169,11 @@ class Visits:
         return uncached + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
-        """Return the time in seconds of every visit apart from rendering and network, for content that is not cached."""
+        """Return the time in seconds of every visit for content that is not cached, without rendering and network."""
         return (self.content_coarse if coarse else self.content).always + self.images.always + self.maps.always
 
     def first(self, *, coarse: bool) -> float:
-        """Return the additional seconds of a view's first visit in a phase."""
+        """Return the additional time in seconds of a view's first visit in a phase."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
         lists = (1 - self.handed) * self.lists.once + self.colors.once + self.maps.once
         keeping = self.weights.once if self.weights else 0.0

@@ -196,9 +196,10 @@ def _factor_row(row, rotation, deviation):
 
 @compiled()
 def _surely_outside(center, size, row, deviation, support):
-    """Return whether a Gaussian lies outside the image in any orientation, by bounding the row of M by that of a ball.
+    """Return whether a Gaussian is certain to lie outside the image, whatever its orientation.
 
-    The distance must exceed any rounding error of the extents used for the exact test; otherwise return False.
+    The bound on its extent is that of a ball with the largest deviation, for which a row of M is longest. The distance
+    must exceed any rounding error of the exact test that follows; otherwise return False.
     """
     beside = max(0.5 - center, center - (size - 0.5)) - _ROUNDING
     if not beside > 0:

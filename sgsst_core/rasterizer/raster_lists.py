@@ -138,7 +138,7 @@ def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterList
 
 
 def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the start offsets of consecutive arrays with these lengths, and the end of the last one."""
+    """Return the start offsets of consecutive runs with these lengths, and the end of the last one."""
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
 
 
@@ -200,7 +200,7 @@ def _tile_span(value, first, last, width):
 
 @compiled()
 def _own_part(step, threads):
-    """Return the part for a step, such that every thread gets parts from front to back: nearer ones are more work."""
+    """Return the part for a step. Every thread gets parts from front to back, because nearer ones are more work."""
     return step % _PARTS * threads + step // _PARTS
 
 

@@ -252,7 +252,7 @@ class ReferenceRasterizer:
 
 
 def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return the ranks of the splats that intersect each raster tile, and their number per tile [tiles].
+    """Return the ranks of the splats in each raster tile, and their number per tile [tiles].
 
     Extents are enlarged by one pixel.
     """

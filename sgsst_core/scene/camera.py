@@ -47,7 +47,7 @@ class Camera:
 
     @property
     def center(self) -> Tensor:
-        """[3] float64, position in the world."""
+        """Camera position in the world, [3] float64."""
         rotation = self.world_to_camera[:3, :3]
         return -rotation.T @ self.world_to_camera[:3, 3]
 
@@ -84,7 +84,7 @@ def resized(camera: Camera, side: int) -> Camera:
 
 
 def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
-    """Return the cameras, with those whose longer side exceeds `settings.max_resolution` reduced to it."""
+    """Return the cameras, downscaled to `settings.max_resolution` if their longer side exceeds it."""
     limit = settings.max_resolution
     return [resized(camera, limit) if limit and camera.side > limit else camera for camera in cameras]
 

@@ -84,7 +84,7 @@ class Scene:
 
 
 def attenuation_factor(attenuation: float) -> float:
-    """Return the factor of SH coefficients for an SH attenuation, rounded to float32."""
+    """Return the factor that an SH attenuation applies to SH coefficients, rounded to float32."""
     return float(torch.tensor(1.0 - attenuation, dtype=torch.float32))
 
 
@@ -103,7 +103,7 @@ def sampled(scene: Scene, count: int) -> Scene:
 
 
 def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:
-    """Return how many leading coefficients are needed to include all non-zero ones of some Gaussians ([N] bool).
+    """Return how many leading coefficients cover all non-zero ones, for all Gaussians or those of a mask [N].
 
     Processes the Gaussians in chunks, without a copy.
     """

@@ -1,4 +1,4 @@
-"""Projection of colors to the range of screens: 0 to 1 in every channel.
+"""Projection of colors to the range that screens can display: 0 to 1 in every channel.
 
 A loss on images pushes colors beyond what a screen can show, where viewers clip them and the change is lost. Restoring
 each color after every step is projected gradient descent on a box. Adam's metric is diagonal, so clamping each channel

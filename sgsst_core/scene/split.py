@@ -95,12 +95,12 @@ class Refinement:
 
 
 def piece_counts(pieces: Tensor) -> Tensor:
-    """Return the number of Gaussians that each becomes, [N] int64."""
+    """Return the number of Gaussians that each one becomes, [N] int64."""
     return pieces.long().prod(dim=1)
 
 
 def parents_of(pieces: Tensor) -> Tensor:
-    """Return the index of the parent of each Gaussian in a split scene, [M] int64, ascending."""
+    """Return the parent's index for each Gaussian of a split scene, [M] int64, ascending."""
     return torch.repeat_interleave(piece_counts(pieces))
 
 

@@ -202,7 +202,7 @@ class StoredHarmonics:
         return found
 
     def used_coefficients(self) -> int:
-        """Return how many leading coefficients are needed to include all non-zero ones.
+        """Return how many leading coefficients cover all non-zero ones.
 
         Reads no further than necessary.
         """

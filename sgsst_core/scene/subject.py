@@ -112,7 +112,10 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def _sample(total: int, count: int) -> Tensor:
-    """Return random rows, one from each run of equal length, with a fixed seed; a file may be ordered with a period."""
+    """Return a random row from each run of equal length, with a fixed seed.
+
+    Regular sampling could coincide with a period in the order of the file.
+    """
     step = -(-total // count)
     first = torch.arange(0, total, step)
     chance = torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))

@@ -327,9 +327,9 @@ def _plan_values(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _completed(values: dict[str, Any], memory: int) -> dict[str, Any]:
-    """Add to a plan of version 3 what it left to the stylizer, for a CPU, where all measurements of that version ran.
+    """Complete a plan of version 3 with what it left to the stylizer, as on a CPU.
 
-    On a GPU gsplat may have run instead; there, a new plan decides.
+    All measurements of that version were made on CPUs. On a GPU gsplat may have run instead; there, a new plan decides.
     """
     precision = "features in bfloat16" in [line["decision"] for line in values["decisions"]]
     return {

@@ -162,7 +162,7 @@ class _Refining:
     def _as_far_as_the_picture_stays(
         self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]
     ) -> tuple[Tensor, _Change | None]:
-        """Reduce the pieces until the image of some views is preserved, and return them with the remaining change.
+        """Reduce the pieces until the image of some views is preserved. Return them with the remaining change.
 
         Colors of split Gaussians are first fitted to other views. The change is None if nothing is split or remains
         split.
@@ -273,11 +273,11 @@ class _Refining:
         return fewer
 
     def _own(self, views: Sequence[int]) -> Sequence[int]:
-        """Return the views of this rank."""
+        """Return the views that this rank processes."""
         return views[self._collectives.rank :: self._collectives.size]
 
     def _shown(self, views: Sequence[int]) -> Iterator[int]:
-        """Yield the views of this rank one by one, and report progress."""
+        """Yield the views that this rank processes, one by one, and report progress."""
         started = time.perf_counter()
         for done, index in enumerate(self._own(views)):
             if self._show:

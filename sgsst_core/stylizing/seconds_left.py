@@ -50,11 +50,11 @@ class _Stage:
         self.first: deque[_FirstVisits] = deque(maxlen=_LATEST)
 
     def seconds(self) -> list[float]:
-        """Return the time in seconds of all steps."""
+        """Return the time in seconds of each step."""
         return [*self.known, *(step.seconds for step in self.first)]
 
     def extra(self, known: float) -> float:
-        """Return the additional seconds of a first visit, given the seconds of a step without any."""
+        """Return the additional time in seconds of a first visit, given the time of a step without any."""
         return max(median((step.seconds - known) / step.views for step in self.first), 0.0)
 
 
@@ -104,7 +104,7 @@ class SecondsLeft:
         self._beside += seconds
 
     def left(self, step: int, queue: Sequence[int], *, measuring: float = 0.0, limit: float | None = None) -> float:
-        """Return the remaining seconds of the job.
+        """Return the remaining time of the job in seconds.
 
         Args:
             step: Number of steps completed in all sessions.
@@ -137,7 +137,7 @@ class SecondsLeft:
         return len(unknown & soon) + len(unknown - soon) * later
 
     def _prices(self, phase: ExpectedPhase) -> tuple[float, float]:
-        """Return the time in seconds of a step of a phase, and the additional seconds of each first visit."""
+        """Return the time in seconds of a step of a phase, and the additional time of each first visit."""
         steps = self._steps[phase.stage]
         if not steps.seconds():
             ratio = self._ratio()

@@ -1,4 +1,4 @@
-"""Stylizer: Adam on the DC colors, in a coarse phase followed by SOS.
+"""Stylizer: Adam on the DC colors, in a coarse phase followed by one on all scales.
 
 It makes one step at a time; `loop.run` makes them all.
 """
@@ -548,7 +548,7 @@ class Stylizer:
         return evaluate(self.views, self.style_targets, indices, values)
 
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
-        """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its seconds.
+        """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.
 
         Targets are prepared before timing starts. Changes nothing.
         """
@@ -648,7 +648,7 @@ class Stylizer:
         return self.stylized()[self.plan.seen].to(self.sh_dc.device)
 
     def set_colors(self, sh_dc: Tensor) -> None:
-        """Replace the present colors by sh_dc [N, 3] of the whole scene, to evaluate them on these views."""
+        """Replace the present colors with sh_dc [N, 3] of the whole scene, to evaluate them on these views."""
         self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(sh_dc[self.plan.seen])

@@ -253,7 +253,7 @@ class Views:
             self._ahead.end()
 
     def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
-        """Return whether content features of a view at some scales, or the images behind them, are not cached."""
+        """Return whether the content features of a view at some scales, or their images, are not cached."""
         if self._drawn:
             return bool(self.loss.content_weight) and any((index, scale) not in self._images for scale in scales)
         share = self._shares.get((index, tuple(scales)))  # features are cached only after their share is known
@@ -326,7 +326,7 @@ class Views:
         return put_behind(image * coverage[..., None].to(image.dtype), coverage, behind, (0.0, 0.0, 0.0))
 
     def uncached_fraction(self) -> None:
-        """Clear the caches that depend on the division of work, before it changes."""
+        """Clear the caches that depend on the division of work, because it is about to change."""
         self._content.clear()
         self._shares.clear()
 
