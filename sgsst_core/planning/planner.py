@@ -52,7 +52,7 @@ def make_plan(
         cameras: Cameras; larger ones are reduced to `settings.max_resolution`.
         settings: Settings of the job.
         weights: Weights of the feature network; None for VGG19, or VGG16 if only that is installed.
-        rasterizer: Rasterizer that computes blend weights: "cpu", "cuda" or "reference". None to choose one.
+        rasterizer: Rasterizer that computes blend weights: "cpu", "triton", "cuda" or "reference". None to choose one.
         collectives: Ranks of the job.
         looked: Survey from an earlier plan of the same job; None to survey the views.
         measured: Whether the job will be measured between its steps; see `decide`.

@@ -29,7 +29,7 @@ def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -
     try:
         with one_at_a_time(build_folder()):
             drawn = _draws(name, device)
-    except Exception as error:  # any exception means that it cannot be used
+    except Exception as error:  # whatever the exception, it cannot be used
         return (str(error).strip().splitlines() or [type(error).__name__])[0]
     return None if drawn else "it draws nothing"
 

@@ -43,7 +43,7 @@ _FUSED = ("contract",)
 #: Half precision stores weight * 2^HALF_EXPONENT. The smallest weight, ALPHA_MIN * TRANSMITTANCE_MIN, and the largest,
 #: ALPHA_MAX, are then both normal numbers in float16 (relative error 2^-11), so no conversion meets a denormal.
 HALF_EXPONENT = 14
-#: float16 has 13 bits of mantissa less than float32, and an exponent bias that is 112 smaller.
+#: float16 has 13 fewer bits of mantissa than float32, and an exponent bias that is 112 smaller.
 HALF_SHIFT, HALF_BIAS = 13, 112
 
 

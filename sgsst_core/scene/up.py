@@ -24,7 +24,7 @@ _LAYER, _END, _END_OF_HEIGHT = 0.01, 0.12, 0.25
 _GROUND, _OTHER_END = 0.7, 0.6
 #: Cells along the longer side of a grid over a layer.
 _CELLS = 24
-#: A scene with a larger fraction of background or strays is no object that could stand.
+#: A scene with a larger fraction of background or strays is not an object that could stand.
 _WHOLE = 0.03
 #: A subject counts as standing if its length is at least this multiple of its width (by standard deviation).
 _STANDS = 1.6

@@ -72,7 +72,7 @@ class Stylizer:
         collectives: Ranks that stylize the scene together. Every rank has a stylizer with the same arguments, and calls
             the same methods in the same order. Methods that only read, such as `state` and `stylized`, may be called by
             a single rank.
-        workshop: Planning context of the plan; None to create it anew.
+        workshop: Planning context of the plan; None to create one.
         regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
 
     Attributes:
