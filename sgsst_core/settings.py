@@ -252,9 +252,9 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps. These push many
-#: colors below 0 along the way, which is why they need `clamp_aware_gradient` (docs/performance.md). They start from the style's
-#: colors, which steps alone reach only slowly (docs/quality.md). Phase 1 pays off for large views, and has no further
-#: effect after some 80 steps (docs/performance.md).
+#: colors below 0 along the way, which is why they need `clamp_aware_gradient` (docs/performance.md). They start from
+#: the style's colors, which steps alone reach only slowly (docs/quality.md). Phase 1 pays off for large views, and has
+#: no further effect after some 80 steps (docs/performance.md).
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,

@@ -28,7 +28,7 @@ class Region:
         select: Selection as text; empty for the rest.
         style: Style of the region; None for the style of the job.
         weight: Weight of its style in the loss, above 0.
-        keep: Whether its Gaussians are frozen.
+        freeze: Whether its Gaussians keep their colors.
         selected: Number of Gaussians in its own selection, some of which later regions may have taken.
     """
 
@@ -48,7 +48,7 @@ class Regions:
         every: The rest, followed by the other regions in the order given.
         labels: [N] uint8, index in `every` of each Gaussian's region.
         active: Indices of regions with a loss of their own; set by `resolved`.
-        kept_in_view: Whether some view sees frozen Gaussians; set by `resolved`.
+        frozen_in_view: Whether some view sees frozen Gaussians; set by `resolved`.
     """
 
     every: tuple[Region, ...]
@@ -57,10 +57,10 @@ class Regions:
     frozen_in_view: bool = False
 
     @property
-    def kept(self) -> Tensor:
+    def frozen(self) -> Tensor:
         """Mask [N] bool of frozen Gaussians."""
-        keeps = torch.tensor([region.keep for region in self.every])
-        return keeps[self.labels.long()]
+        by_region = torch.tensor([region.freeze for region in self.every])
+        return by_region[self.labels.long()]
 
     @property
     def mapped(self) -> bool:
@@ -68,7 +68,7 @@ class Regions:
 
         A single region that covers everything is an ordinary job.
         """
-        return len(self.active) > 1 or self.kept_in_view or self.every[self.active[0]].weight != 1
+        return len(self.active) > 1 or self.frozen_in_view or self.every[self.active[0]].weight != 1
 
     def members(self, place: int) -> Tensor:
         """Return the mask [N] bool of the Gaussians in the region at an index."""

@@ -211,7 +211,7 @@ def view_colors_gradient(
 ) -> Tensor:
     """Return dL/dsh_dc [N, 3]: `SH_C0 * dL/dcolors` where the color is above the clamp, else 0.
 
-    With `clamp_aware_gradient`, colors clamped at 0 also get gradients that would raise them (clamp-aware gradient). This is not the
+    With `clamp_aware_gradient`, colors clamped at 0 also get gradients that would raise them. This is not the
     derivative: it recovers colors that a large step has thrown below 0, which otherwise never move again.
     """
     passes = (colors > 0) | (color_gradient < 0) if clamp_aware_gradient else colors > 0

@@ -142,7 +142,7 @@ class Stylizer:
         # Computed once, because another processor may round differently and ranks must start with the same bits.
         start = self.collectives.broadcast(self.transferred) if plan.warm_start else seen.sh_dc
         self.sh_dc = start.clone().to(rasterizer.device)
-        kept = regions.kept[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
+        kept = regions.frozen[plan.seen] if regions else torch.zeros(0, dtype=torch.bool)
         #: Frozen Gaussians among the rendered ones; None if there are none.
         self._kept = kept.to(rasterizer.device)[:, None] if kept.any() else None
         chroma_of = seen.sh_dc.to(rasterizer.device) if self._keeps_chroma else None
