@@ -14,9 +14,9 @@ density, whose peak is r times as high if the deviation is r times as small. As 
 fully, this adds up to the parent's alpha to first order in the opacity. Opacities stay proportional to the weights, so
 the opacity-weighted mixture keeps its moments at any opacity.
 
-Two alternatives are no better (benchmarks/results/README.md). Children that add up in optical depth, with opacity 1 - (1 - a)^(w
-r), cover more than the parent in its tails. Children whose lattice has the parent's optical depth are no closer to the
-parent than these.
+Two alternatives are no better (benchmarks/results/README.md). Children that add up in optical depth, with opacity
+1 - (1 - a)^(w r), cover more than the parent in its tails. Children whose lattice has the parent's optical depth are
+no closer to the parent than these.
 """
 
 from __future__ import annotations
