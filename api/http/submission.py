@@ -142,7 +142,12 @@ REFUSALS: tuple[ServiceError, ...] = (
         input="scene",
     ),
     RefusedInputError("Webhooks are switched off on this service.", "webhooks-off", input="webhook"),
-    RefusedInputError("'ftp://example.com' is no http or https URL.", "invalid-webhook", input="webhook"),
+    RefusedInputError(
+        "'ftp://example.com' cannot be called: its scheme is neither http nor https. Give a URL such as "
+        "'https://example.com/hook'.",
+        "invalid-webhook",
+        input="webhook",
+    ),
     IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key."),
     QueueFullError("There are 100 unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=100),
     QuotaError(

@@ -1,127 +1,248 @@
-"""Tells other servers that jobs have ended: Standard Webhooks (https://www.standardwebhooks.com), off by default."""
+"""Webhooks: messages to other servers about finished jobs, signed by Standard Webhooks (https://www.standardwebhooks.com).
+
+Receivers are not trusted. Each message is sent on its own, from the lookup of the name to the head of the answer within
+one deadline, to an address that was checked; of the answer only the status is read.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import hmac
 import ipaddress
 import json
 import logging
+import re
 import socket
+import ssl
 import threading
 import time
-from urllib.parse import urlsplit
+from concurrent.futures import Future
+from functools import cached_property
 
 import httpx
 
 from service.errors import RefusedInputError
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.tables import DeliveryRow
+from service.store.operations import Delivery
 
-#: Waits before further tries, seconds: the schedule that the convention suggests, up to a day.
+#: Waits before further attempts, seconds: the schedule that the convention suggests, up to a day.
 _WAITS = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0)
-_TIMEOUT = 15.0
+#: Seconds for one attempt: lookup, connection, TLS, request and the head of the answer together.
+_DEADLINE = 15.0
+#: Seconds for which no other dispatcher takes a message that is being sent: several deadlines.
+_HOLD_SECONDS = 4 * _DEADLINE
+#: Messages that are sent at the same time: in total, to the owner of one key's jobs, and to one URL.
+_MAX_TOTAL, _MAX_PER_OWNER, _MAX_PER_URL = 32, 8, 2
 _ROUND_SECONDS = 2.0
+_MAX_URL = 2000
+#: Characters of a reason in the log: it may hold what a receiver sent.
+_MAX_REASON = 300
+#: A host name as DNS has it; `_` is no part of host names but in use.
+_NAME = re.compile(r"(?=.{1,253}$)[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*\.?", re.ASCII)
+#: The only part of IPv6 that is assigned for global unicast.
+_GLOBAL_UNICAST = ipaddress.IPv6Network("2000::/3")
+#: Prefix under which NAT64 translates to IPv4 (RFC 6052).
+_NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 
 _log = logging.getLogger(__name__)
 
 
 def signature(secret: str, message_id: str, timestamp: int, body: bytes) -> str:
-    """`v1,` and the base64 of HMAC-SHA256 over id, timestamp and body, joined by dots."""
+    """Return `v1,` and the base64 of HMAC-SHA256 over id, timestamp and body, joined by dots."""
     key = base64.b64decode(secret.removeprefix("whsec_"))
     signed = b".".join((message_id.encode(), str(timestamp).encode(), body))
     return "v1," + base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
 
 
-def check_url(url: str, settings: ServiceSettings) -> str:
-    """The URL of a webhook, if it may be called.
+def check_url(url: str, settings: ServiceSettings) -> None:
+    """Check that a job may name a URL as its webhook. Addresses are checked at each delivery.
 
     Raises:
-        RefusedInputError: webhooks are off, or it is not an http(s) URL.
+        RefusedInputError: Webhooks are off, or the URL cannot be called.
     """
     if not settings.webhooks:
         raise RefusedInputError("Webhooks are switched off on this service.", "webhooks-off", input="webhook")
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.hostname or parts.username or len(url) > 2000:
-        raise RefusedInputError(f"{url!r} is no http or https URL.", "invalid-webhook", input="webhook")
-    return url
+    try:
+        parse_url(url)
+    except ValueError as error:
+        raise RefusedInputError(
+            f"{url[:100]!r} cannot be called: {error}. Give a URL such as 'https://example.com/hook'.",
+            "invalid-webhook",
+            input="webhook",
+        ) from error
 
 
-def public_address(host: str, port: int, *, private_allowed: bool) -> str:
-    """An address of a host that may be called; it is looked up once, so that it cannot change after the check.
+def parse_url(url: str) -> httpx.URL:
+    """Parse the URL of a webhook as the client that sends the message does.
 
     Raises:
-        PermissionError: every one of its addresses is private, or one is: a name that leads to both is a trick.
+        ValueError: The URL cannot be called; the message is the reason.
     """
-    found = {entry[4][0] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
-    addresses = [ipaddress.ip_address(str(address).partition("%")[0]) for address in found]
+    if len(url) > _MAX_URL:
+        raise ValueError(f"it has {len(url):,} characters, at most {_MAX_URL:,} are allowed")
+    try:
+        parsed = httpx.URL(url)
+        host, port = parsed.raw_host.decode(), parsed.port
+        _ = parsed.host  # decodes IDNA
+    except (httpx.InvalidURL, UnicodeError) as error:
+        raise ValueError(f"it is not a valid URL ({error})") from error
+    if parsed.scheme not in ("http", "https"):
+        raise ValueError("its scheme is neither http nor https")
+    if parsed.userinfo:
+        raise ValueError("it holds a user name or password")
+    if port is not None and not 0 < port < 65536:
+        raise ValueError("its port must be between 1 and 65535")
+    if "%" in host or not (_NAME.fullmatch(host) or ":" in host):  # httpx has checked what is in brackets
+        raise ValueError("it has no valid host name")
+    return parsed
+
+
+def is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
+    """Return whether an address is reachable on the public internet; an IPv4 address inside an IPv6 one decides."""
+    if isinstance(address, ipaddress.IPv6Address):
+        embedded = address.ipv4_mapped or address.sixtofour
+        if address in _NAT64:
+            embedded = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+        if embedded is not None:
+            return is_public(embedded)
+        if address not in _GLOBAL_UNICAST or address.teredo is not None:
+            return False
+    return address.is_global and not address.is_multicast
+
+
+def _look_up(host: str, port: int) -> Future[list[str]]:
+    """Look up the addresses of a host on a daemon thread: the resolver cannot be interrupted, and an executor's thread
+    would hold up the end of the process.
+    """
+    future: Future[list[str]] = Future()
+    future.set_running_or_notify_cancel()
+
+    def run() -> None:
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError) as error:
+            future.set_exception(OSError(f"{host} is not known ({error})"))
+        else:
+            future.set_result([str(entry[4][0]) for entry in found])
+
+    threading.Thread(target=run, name="webhook-lookup", daemon=True).start()
+    return future
+
+
+async def checked_address(host: str, port: int, *, private_allowed: bool) -> str:
+    """Return an address of a host that may be called. The caller connects to this address, not to the name.
+
+    Raises:
+        PermissionError: An address of the host is private; names that lead to both kinds are refused too.
+        OSError: The name is not known.
+    """
+    found = [address.partition("%")[0] for address in await asyncio.wrap_future(_look_up(host, port))]
     if not private_allowed:
-        for address in addresses:
-            mapped = getattr(address, "ipv4_mapped", None) or address
-            if not mapped.is_global or mapped.is_multicast:
+        for address in found:
+            if not is_public(ipaddress.ip_address(address)):
                 raise PermissionError(f"{host} leads to {address}, which is not public")
-    return str(addresses[0])
+    return found[0]
 
 
 class Deliverer:
-    """Sends what is due, in a thread of its own."""
+    """Sends due messages from its own thread.
 
-    def __init__(self, settings: ServiceSettings, store: Store) -> None:
+    Args:
+        tls: Certificates that receivers are verified with; None for the public ones.
+    """
+
+    def __init__(self, settings: ServiceSettings, store: Store, tls: ssl.SSLContext | None = None) -> None:
         self._settings, self._store = settings, store
+        self._tls = tls or httpx.create_ssl_context(trust_env=False)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
 
     def start(self) -> None:
-        """Begin, where webhooks are switched on."""
+        """Start the thread if webhooks are switched on."""
         if self._settings.webhooks:
             self._thread.start()
 
     def stop(self) -> None:
-        """End after the message in hand."""
+        """Stop soon; messages that are not delivered by then stay due."""
         self._stop.set()
 
     def _run(self) -> None:
         while not self._stop.wait(_ROUND_SECONDS):
             try:
                 self.deliver_due()
-            except Exception:  # the thread must go on
+            except Exception:  # the database may be away; the thread must continue
                 _log.exception("webhooks could not be delivered")
 
     def deliver_due(self) -> None:
-        """Send all messages that are due."""
-        for delivery in self._store.operations.due_deliveries(hold_seconds=4 * _TIMEOUT):
-            error = self._send(delivery)
-            wait = None if error is None or delivery.tries > len(_WAITS) else _WAITS[delivery.tries - 1]
-            self._store.operations.settle_delivery(delivery.id, None if wait is None else time.time() + wait)
-            if error is not None:
-                _log.warning(
-                    "webhook to %s: %s", urlsplit(delivery.url).hostname, error, extra={"job": delivery.job_id}
-                )
+        """Send due messages until none is due and none is being sent."""
+        asyncio.run(self._deliver_due())
 
-    def _send(self, delivery: DeliveryRow) -> str | None:
-        """Send one message; returns what went wrong."""
-        parts = urlsplit(delivery.url)
-        host, port = parts.hostname or "", parts.port or (443 if parts.scheme == "https" else 80)
+    async def _deliver_due(self) -> None:
+        sending: dict[asyncio.Task[None], Delivery] = {}
+        while not self._stop.is_set():
+            for delivery in await asyncio.to_thread(self._take, list(sending.values())):
+                sending[asyncio.create_task(self._deliver(delivery))] = delivery
+            if not sending:
+                return
+            done, _ = await asyncio.wait(sending, timeout=_ROUND_SECONDS, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                del sending[task]
+
+    def _take(self, sending: list[Delivery]) -> list[Delivery]:
+        return self._store.operations.due_deliveries(
+            _HOLD_SECONDS, sending, total=_MAX_TOTAL, per_owner=_MAX_PER_OWNER, per_url=_MAX_PER_URL
+        )
+
+    async def _deliver(self, delivery: Delivery) -> None:
+        """Send one message and record the outcome; whatever goes wrong stays with this message."""
         try:
-            address = public_address(host, port, private_allowed=self._settings.webhook_private_addresses)
-        except (OSError, ValueError) as error:
-            return str(error)
+            async with asyncio.timeout(_DEADLINE):
+                error = await self._send(delivery)
+        except TimeoutError:
+            error = f"no answer within {_DEADLINE:g} s"
+        except Exception as broken:
+            error = f"{type(broken).__name__}: {broken}"[:_MAX_REASON]
+        wait = None if error is None or delivery.tries > len(_WAITS) else _WAITS[delivery.tries - 1]
+        if error is not None:
+            outcome = "given up" if wait is None else f"next attempt in {wait:g} s"
+            _log.warning(
+                "webhook failed (attempt %d, %s): %s", delivery.tries, outcome, error, extra={"job": delivery.job_id}
+            )
+        try:
+            await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
+        except Exception:  # it is due again once its hold is over
+            _log.exception("the outcome of a webhook could not be stored", extra={"job": delivery.job_id})
+
+    async def _send(self, delivery: Delivery) -> str | None:
+        """Send one message; return what went wrong."""
+        url = parse_url(delivery.url)
+        host, port = url.raw_host.decode(), url.port or (443 if url.scheme == "https" else 80)
+        address = await checked_address(host, port, private_allowed=self._settings.webhook_private_addresses)
         body = json.dumps(delivery.body, separators=(",", ":")).encode()
         timestamp = int(time.time())
         headers = {
             "content-type": "application/json",
-            "host": parts.netloc,
+            "host": url.netloc.decode(),
             "webhook-id": delivery.id,
             "webhook-timestamp": str(timestamp),
-            "webhook-signature": signature(self._store.operations.webhook_secret(), delivery.id, timestamp, body),
+            "webhook-signature": signature(await asyncio.to_thread(lambda: self._secret), delivery.id, timestamp, body),
         }
-        literal = f"[{address}]" if ":" in address else address
-        target = parts._replace(netloc=f"{literal}:{port}").geturl()
-        try:
-            with httpx.Client(timeout=_TIMEOUT, follow_redirects=False, trust_env=False) as client:
-                answer = client.post(target, content=body, headers=headers, extensions={"sni_hostname": host})
-        except httpx.HTTPError as error:
-            return f"{type(error).__name__}: {error}"
-        return None if answer.is_success else f"answered {answer.status_code}"
+        async with (
+            # one client for each message: a kept connection to an address would be used for other names as well
+            httpx.AsyncClient(verify=self._tls, timeout=None, follow_redirects=False, trust_env=False) as client,
+            client.stream(
+                "POST",
+                url.copy_with(host=address, port=port),
+                content=body,
+                headers=headers,
+                extensions={"sni_hostname": host},
+            ) as answer,
+        ):
+            return None if answer.is_success else f"answered {answer.status_code}"
+
+    @cached_property
+    def _secret(self) -> str:
+        return self._store.operations.webhook_secret()

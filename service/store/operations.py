@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import base64
 import secrets
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import bindparam, delete, func, select
+from sqlalchemy import ColumnElement, bindparam, case, delete, func, literal, select
 
 from service.store.database import Database, upsert
 from service.store.states import JobStatus
@@ -14,6 +18,31 @@ from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow,
 #: A dispatcher that was not heard of for so long is not coming back.
 _FORGET_SECONDS = 86_400.0
 _ALIVE = select(func.count()).select_from(DispatcherRow).where(DispatcherRow.seen_at >= bindparam("since"))
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Message that a dispatcher has taken to send.
+
+    Attributes:
+        id, job_id: Of the message, and of the job that it is about.
+        owner: Owner of the job; empty if the job is deleted.
+        url: Receiver.
+        body: JSON to send.
+        tries: Attempts, this one included.
+    """
+
+    id: str
+    job_id: str
+    owner: str
+    url: str
+    body: dict[str, Any]
+    tries: int
+
+
+def _counted(counts: Mapping[str, int], column: ColumnElement[str]) -> ColumnElement[int]:
+    """Return the count of a column's value."""
+    return case(dict(counts), value=column, else_=0) if counts else literal(0)
 
 
 class Operations:
@@ -82,24 +111,60 @@ class Operations:
             session.execute(insert.on_conflict_do_nothing())
             return session.get_one(SecretRow, "webhooks").value
 
-    def due_deliveries(self, hold_seconds: float) -> list[DeliveryRow]:
-        """Messages to be sent now; nobody else gets them for so many seconds."""
+    def due_deliveries(
+        self, hold_seconds: float, sending: Collection[Delivery], *, total: int, per_owner: int, per_url: int
+    ) -> list[Delivery]:
+        """Take messages that are due; no other dispatcher gets them for `hold_seconds`.
+
+        Args:
+            sending: Messages that this dispatcher is sending already; they count toward the limits.
+            total, per_owner, per_url: Most messages that are sent at the same time. Thanks to the latter two, neither a
+                receiver that does not answer nor an owner with many of them delays the messages of others.
+        """
         now = self._database.clock()
+        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs share one turn
+        per_url_rank = func.row_number().over(partition_by=DeliveryRow.url, order_by=DeliveryRow.next_at)
+        due = (
+            select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
+            .add_columns(
+                (per_url_rank + _counted(Counter(each.url for each in sending), DeliveryRow.url)).label("rank")
+            )
+            .outerjoin(JobRow, JobRow.id == DeliveryRow.job_id)
+            .where(DeliveryRow.next_at <= now)
+            .subquery()
+        )
+        per_owner_rank = func.row_number().over(partition_by=due.c.owner, order_by=due.c.next_at)
+        turns = (
+            select(due.c.id, due.c.owner)
+            .add_columns(
+                (per_owner_rank + _counted(Counter(each.owner for each in sending), due.c.owner)).label("rank")
+            )
+            .where(due.c.rank <= per_url)
+            .subquery()
+        )
+        query = (
+            select(DeliveryRow, turns.c.owner)
+            .join(turns, turns.c.id == DeliveryRow.id)
+            .where(turns.c.rank <= per_owner, DeliveryRow.next_at <= now)  # checked again once the row is locked
+            .order_by(DeliveryRow.next_at)
+            .limit(max(0, total - len(sending)))
+            .with_for_update(of=DeliveryRow, skip_locked=True)
+        )
         with self._database.writing() as session:
-            query = select(DeliveryRow).where(DeliveryRow.next_at <= now).order_by(DeliveryRow.next_at).limit(20)
-            rows = session.scalars(query.with_for_update(skip_locked=True)).all()
-            for row in rows:
+            taken = []
+            for row, holder in session.execute(query).all():
                 row.tries += 1
                 row.next_at = now + hold_seconds
-            return list(rows)
+                taken.append(Delivery(row.id, row.job_id, holder, row.url, row.body, row.tries))
+            return taken
 
-    def settle_delivery(self, delivery_id: str, next_at: float | None) -> None:
-        """A message was delivered or given up (None), or is to be tried again later."""
+    def settle_delivery(self, delivery_id: str, wait_seconds: float | None) -> None:
+        """Delete a message that was delivered or given up (None), or make it due again after `wait_seconds`."""
         with self._database.writing() as session:
             row = session.get(DeliveryRow, delivery_id, with_for_update=True)
             if row is None:
                 return
-            if next_at is None:
+            if wait_seconds is None:
                 session.delete(row)
             else:
-                row.next_at = next_at
+                row.next_at = self._database.clock() + wait_seconds

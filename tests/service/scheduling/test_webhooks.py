@@ -1,123 +1,501 @@
-"""Webhooks: signed, tried again, and never to private addresses unless allowed."""
+"""Webhooks: signed, tried again, sent to checked addresses only, and no receiver can hold the messages of others."""
 
 from __future__ import annotations
 
 import base64
+import datetime
 import hashlib
 import hmac
+import ipaddress
 import json
+import logging
+import socket
+import ssl
 import threading
-from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from sqlalchemy import select
 
 from service.errors import RefusedInputError
-from service.scheduling.webhooks import Deliverer, check_url, public_address
+from service.scheduling import webhooks
+from service.scheduling.webhooks import Deliverer, check_url, is_public
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
+from service.store.tables import DeliveryRow
+from tests.postgres import fresh_database, is_installed, server
+from tests.service.store.helpers import Clock
+
+#: Seconds for which a test waits for an event before it fails.
+PATIENCE = 60.0
+#: Bytes of a body that no receiver of a status needs; more than the buffers of a connection.
+LARGE = 64 << 20
 
 
-class Listener:
-    """A server that remembers what it was told, and answers with `status`."""
+class Receiver:
+    """An HTTP server on loopback that records the messages it receives.
 
-    def __init__(self) -> None:
+    Args:
+        behave: What it does with a connection after it has read the message; by default it answers `status`.
+        certificate: Certificate and key for TLS.
+    """
+
+    def __init__(self, behave: Callable[[Any], None] | None = None, certificate: Path | None = None) -> None:
         self.status = 200
         self.heard: list[tuple[dict[str, str], bytes]] = []
-        listener = self
+        self.names: list[str | None] = []
+        receiver = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["content-length"]))
-                listener.heard.append(({name.lower(): value for name, value in self.headers.items()}, body))
-                self.send_response(listener.status)
-                self.send_header("Location", listener.url)
+                receiver.heard.append(({name.lower(): value for name, value in self.headers.items()}, body))
+                if behave is not None:
+                    behave(self)
+                    return
+                self.send_response(receiver.status)
+                self.send_header("Location", receiver.url)
                 self.end_headers()
 
             def log_message(self, *ignored: object) -> None:
                 return
 
-        self.server = HTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/hook"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        class Server(ThreadingHTTPServer):
+            daemon_threads = True
+            block_on_close = False
+            request_queue_size = 100
+
+            def handle_error(self, *ignored: object) -> None:  # clients that do not complete TLS
+                return
+
+        self._server = Server(("127.0.0.1", 0), Handler)
+        if certificate is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(certificate)
+            context.sni_callback = lambda connection, name, context: self.names.append(name)
+            self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
+        self.port = self._server.server_port
+        self.url = f"{'https' if certificate else 'http'}://127.0.0.1:{self.port}/hook"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+Start = Callable[..., Receiver]
 
 
 @pytest.fixture
-def listener() -> Iterator[Listener]:
-    made = Listener()
+def start() -> Iterator[Start]:
+    """Starts receivers that end with the test."""
+    started: list[Receiver] = []
+
+    def start(*arguments: Any, **named: Any) -> Receiver:
+        started.append(Receiver(*arguments, **named))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.close()
+
+
+@pytest.fixture
+def receiver(start: Start) -> Receiver:
+    return start()
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock) -> Iterator[Store]:
+    made = open_store(_settings(tmp_path), clock)
     yield made
-    made.server.shutdown()
+    made.close()
 
 
-def _store(folder: Path, **values: object) -> tuple[ServiceSettings, Store]:
-    settings = ServiceSettings(data=folder, webhooks=True, **values)  # type: ignore[arg-type]
-    return settings, open_store(settings)
+def _settings(folder: Path, **values: Any) -> ServiceSettings:
+    return ServiceSettings(data=folder, webhooks=True, **{"webhook_private_addresses": True, **values})
 
 
-def _ended_job(store: Store, url: str) -> str:
+def _deliver(store: Store, folder: Path, **values: Any) -> None:
+    Deliverer(_settings(folder, **values), store).deliver_due()
+
+
+def _end_job(store: Store, url: str, owner: str = "local") -> str:
+    """End a job whose webhook is `url`, without the check at submission."""
     store.inputs.add_blob("a" * 64, "aa/b", 1)
     inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
-    job, _ = store.jobs.create(NewJob("local", "wall", 0, {}, inputs, url), limit=9)
-    store.jobs.cancel(job.id, "local")
+    job, _ = store.jobs.create(NewJob(owner, "wall", 0, {}, inputs, url), limit=1000)
+    store.jobs.cancel(job.id, owner)
     return job.id
 
 
-def test_a_message_is_signed_by_the_convention(tmp_path: Path, listener: Listener) -> None:
-    settings, store = _store(tmp_path, webhook_private_addresses=True)
-    job_id = _ended_job(store, listener.url)
-    Deliverer(settings, store).deliver_due()
-    ((headers, body),) = listener.heard
+def _tries(store: Store) -> list[int]:
+    """Attempts of each message that is neither delivered nor given up."""
+    with store.database.reading() as session:
+        return list(session.scalars(select(DeliveryRow.tries)))
+
+
+# --- what is sent --------------------------------------------------------------------------------------------------
+
+
+def test_a_message_is_signed_by_the_convention(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+    job_id = _end_job(store, receiver.url)
+    _deliver(store, tmp_path)
+    ((headers, body),) = receiver.heard
     assert json.loads(body)["type"] == "job.canceled"
     assert json.loads(body)["data"]["id"] == job_id
+    assert headers["host"] == f"127.0.0.1:{receiver.port}"
     key = base64.b64decode(store.operations.webhook_secret().removeprefix("whsec_"))
     signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
     expected = base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
     assert headers["webhook-signature"] == f"v1,{expected}"
-    Deliverer(settings, store).deliver_due()
-    assert len(listener.heard) == 1
+    _deliver(store, tmp_path)
+    assert len(receiver.heard) == 1
 
 
-def test_a_message_that_is_refused_is_kept(tmp_path: Path, listener: Listener) -> None:
-    settings, store = _store(tmp_path, webhook_private_addresses=True)
-    _ended_job(store, listener.url)
-    listener.status = 500
-    Deliverer(settings, store).deliver_due()
-    assert store.operations.due_deliveries(1.0) == []  # later
-    with store.database.reading() as session:
-        left = session.connection().exec_driver_sql("SELECT tries FROM deliveries").scalars().all()
-    assert left == [1]
+def test_a_message_that_is_refused_is_kept(tmp_path: Path, store: Store, receiver: Receiver, clock: Clock) -> None:
+    _end_job(store, receiver.url)
+    receiver.status = 500
+    _deliver(store, tmp_path)
+    assert _tries(store) == [1]
+    _deliver(store, tmp_path)
+    assert len(receiver.heard) == 1  # not due yet
+    receiver.status = 204
+    clock.now += 5
+    _deliver(store, tmp_path)
+    assert len(receiver.heard) == 2
+    assert _tries(store) == []
 
 
-def test_redirects_are_not_followed(tmp_path: Path, listener: Listener) -> None:
-    settings, store = _store(tmp_path, webhook_private_addresses=True)
-    _ended_job(store, listener.url)
-    listener.status = 307
-    Deliverer(settings, store).deliver_due()
-    assert len(listener.heard) == 1
+def test_redirects_are_not_followed(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+    _end_job(store, receiver.url)
+    receiver.status = 307
+    _deliver(store, tmp_path)
+    assert len(receiver.heard) == 1
+    assert _tries(store) == [1]
 
 
-def test_private_addresses_are_not_called(tmp_path: Path, listener: Listener) -> None:
-    settings, store = _store(tmp_path)
-    _ended_job(store, listener.url)
-    Deliverer(settings, store).deliver_due()
-    assert listener.heard == []
+# --- receivers and rows that do harm -------------------------------------------------------------------------------
+
+UNUSABLE = ["http://127.0.0.1:99999/", "http://[::1", "http://℀.com/", "http://[v1.x]/", "\ud800", ""]
+
+
+def test_bad_rows_stop_no_other_message(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+    """As a version that did not check them may have stored them; the last message is the youngest."""
+    for url in UNUSABLE[:4]:
+        _end_job(store, url)
+    _end_job(store, receiver.url)
+    _deliver(store, tmp_path)
+    assert len(receiver.heard) == 1
+    assert _tries(store) == [1] * 4
+
+
+def test_a_message_that_always_fails_is_given_up(
+    tmp_path: Path, store: Store, clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    job_id = _end_job(store, "http://127.0.0.1:99999/")
+    with caplog.at_level(logging.WARNING):
+        for attempt in range(1, 8):
+            assert _tries(store) == [attempt - 1]
+            _deliver(store, tmp_path)
+            clock.now += 86_400
+    assert _tries(store) == []
+    last = caplog.records[-1]
+    assert last.__dict__["job"] == job_id
+    assert "given up" in last.getMessage()
+    assert "port" in last.getMessage()
+
+
+def test_only_the_head_of_an_answer_is_read(tmp_path: Path, store: Store, start: Start) -> None:
+    sent, cut_off = [0], threading.Event()
+
+    def endless(handler: Any) -> None:
+        handler.wfile.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/plain\r\n\r\n")
+        try:
+            while sent[0] < LARGE:
+                sent[0] += handler.wfile.write(b"x" * (1 << 16))
+        except OSError:
+            cut_off.set()
+
+    receiver = start(endless)
+    _end_job(store, receiver.url)
+    _deliver(store, tmp_path)
+    assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
+    assert _tries(store) == []
+
+
+def test_a_head_without_end_is_not_kept(tmp_path: Path, store: Store, start: Start) -> None:
+    sent, cut_off = [0], threading.Event()
+
+    def endless(handler: Any) -> None:
+        handler.wfile.write(b"HTTP/1.1 200 OK\r\nX: ")
+        try:
+            while sent[0] < LARGE:
+                sent[0] += handler.wfile.write(b"x" * (1 << 16))
+        except OSError:
+            cut_off.set()
+
+    _end_job(store, start(endless).url)
+    _deliver(store, tmp_path)
+    assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
+    assert _tries(store) == [1]
+
+
+@pytest.mark.parametrize("head", [b"", b"HTTP/1.1 200 OK\r\nX: "], ids=["100-continue", "head"])
+def test_a_receiver_that_drips_is_cut_off(
+    head: bytes, tmp_path: Path, store: Store, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No single read takes long; the deadline is that of the whole delivery."""
+    cut_off = threading.Event()
+
+    def drip(handler: Any) -> None:
+        handler.wfile.write(head)
+        try:
+            while not cut_off.wait(0.02):
+                handler.wfile.write(b"x" if head else b"HTTP/1.1 100 Continue\r\n\r\n")
+        except OSError:
+            cut_off.set()
+
+    monkeypatch.setattr(webhooks, "_DEADLINE", 0.5)
+    receiver = start(drip)
+    _end_job(store, receiver.url)
+    _deliver(store, tmp_path)
+    assert cut_off.wait(PATIENCE)
+    assert len(receiver.heard) == 1
+    assert _tries(store) == [1]
+
+
+def test_the_deadline_includes_lookup_and_tls(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A name that is never found, and a server that accepts connections and is silent."""
+    release, found = threading.Event(), socket.getaddrinfo
+
+    def slow(host: Any, *arguments: Any, **named: Any) -> Any:
+        if host == "receiver.example":
+            release.wait(PATIENCE)
+            host = "127.0.0.1"
+        return found(host, *arguments, **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    monkeypatch.setattr(webhooks, "_DEADLINE", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent, caplog.at_level(logging.WARNING):
+        _end_job(store, f"http://receiver.example:{silent.getsockname()[1]}/")
+        _end_job(store, f"https://127.0.0.1:{silent.getsockname()[1]}/")
+        _deliver(store, tmp_path)
+        release.set()
+    assert _tries(store) == [1, 1]
+    assert [record.getMessage().count("no answer within") for record in caplog.records] == [1, 1]
+
+
+def test_slow_receivers_hold_no_other_message(tmp_path: Path, store: Store, start: Start) -> None:
+    """One owner has many messages to one receiver that does not answer, another one to many such receivers."""
+    release = threading.Event()
+    slow = start(lambda handler: release.wait(PATIENCE))
+    heard = threading.Semaphore(0)
+
+    def answer(handler: Any) -> None:
+        handler.send_response(200)
+        handler.end_headers()
+        heard.release()
+
+    quick = start(answer)
+    for index in range(20):
+        _end_job(store, slow.url, owner="patient")
+        _end_job(store, f"{slow.url}/{index}", owner="greedy")
+    _end_job(store, f"{quick.url}/own", owner="patient")
+    _end_job(store, quick.url, owner="other")
+    deliverer = Deliverer(_settings(tmp_path), store)
+    thread = threading.Thread(target=deliverer.deliver_due, daemon=True)
+    thread.start()
+    try:
+        assert heard.acquire(timeout=PATIENCE)
+        assert heard.acquire(timeout=PATIENCE)
+        assert len(slow.heard) <= webhooks._MAX_PER_URL + webhooks._MAX_PER_OWNER
+    finally:
+        deliverer.stop()
+        release.set()
+        thread.join(PATIENCE)
+
+
+@pytest.mark.parametrize("backend", ["sqlite", "postgresql"])
+def test_messages_are_taken_in_turns_and_once(backend: str, tmp_path: Path, clock: Clock) -> None:
+    if backend == "postgresql" and not is_installed():
+        pytest.skip("PostgreSQL's server is not installed")
+    if backend == "sqlite":
+        _check_turns(open_store(_settings(tmp_path), clock))
+        return
+    with server() as url:
+        _check_turns(open_store(_settings(tmp_path, database=fresh_database(url)), clock))
+
+
+def _check_turns(store: Store) -> None:
+    limits = {"total": 6, "per_owner": 4, "per_url": 2}
+    for index in range(10):
+        _end_job(store, f"http://a/{index // 5}", owner="a")
+    _end_job(store, "http://a/3", owner="a")
+    for _ in range(3):
+        _end_job(store, "http://b/", owner="b")
+    first = store.operations.due_deliveries(60, [], **limits)
+    assert sorted(each.url for each in first if each.owner == "a") == ["http://a/0"] * 2 + ["http://a/1"] * 2
+    assert [each.url for each in first if each.owner == "b"] == ["http://b/"] * 2
+    assert store.operations.due_deliveries(60, first, **limits) == []
+    going = [each for each in first if each.url == "http://a/0"]
+    second = store.operations.due_deliveries(60, going, **limits)
+    assert sorted(each.url for each in second) == ["http://a/1"] * 2 + ["http://b/"]
+    taken = [each.id for each in [*first, *second]]
+    assert len(set(taken)) == len(taken)
+    store.close()
+
+
+# --- addresses -----------------------------------------------------------------------------------------------------
+
+
+def test_private_addresses_are_not_called(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+    _end_job(store, receiver.url)
+    _end_job(store, f"http://localhost:{receiver.port}/")
+    _end_job(store, f"http://2130706433:{receiver.port}/")  # 127.0.0.1 to the system's resolver
+    _deliver(store, tmp_path, webhook_private_addresses=False)
+    assert receiver.heard == []
+    assert _tries(store) == [1] * 3
 
 
 @pytest.mark.parametrize(
-    "host", ["127.0.0.1", "localhost", "10.1.2.3", "169.254.169.254", "::1", "::ffff:127.0.0.1", "0.0.0.0", "224.0.0.1"]
+    "address",
+    [
+        *("127.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1", "100.64.0.1", "255.255.255.255"),
+        *("::1", "::", "fe80::1", "fc00::1", "ff02::1", "2001:db8::1", "4000::1"),
+        *("::ffff:127.0.0.1", "::ffff:0:127.0.0.1", "::127.0.0.1", "::169.254.169.254"),
+        *("64:ff9b::127.0.0.1", "64:ff9b::169.254.169.254", "64:ff9b:1::7f00:1", "64:ff9b:1::8.8.8.8"),
+        *("2002:7f00:1::", "2002:a9fe:a9fe::1", "2002:a01:203::1"),
+        *("2001:0:7f00:1::", "2001:0:4136:e378:8000:63bf:80ff:fffe"),
+    ],
 )
-def test_what_counts_as_private(host: str) -> None:
-    with pytest.raises(PermissionError):
-        public_address(host, 80, private_allowed=False)
+def test_what_counts_as_private(address: str) -> None:
+    assert not is_public(ipaddress.ip_address(address))
 
 
-def test_urls_that_are_refused(tmp_path: Path) -> None:
-    on = ServiceSettings(data=tmp_path, webhooks=True)
-    for url in ("ftp://example.com", "file:///etc/passwd", "http://", "http://user:pw@example.com", "x" * 3000):
-        with pytest.raises(RefusedInputError):
-            check_url(url, on)
-    assert check_url("https://example.com/hook", on)
+@pytest.mark.parametrize("address", ["8.8.8.8", "2606:4700::1111", "64:ff9b::808:808", "::ffff:8.8.8.8"])
+def test_what_counts_as_public(address: str) -> None:
+    assert is_public(ipaddress.ip_address(address))
+
+
+def test_the_checked_address_is_the_one_that_is_called(
+    tmp_path: Path, store: Store, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name leads elsewhere from the second lookup on; there is none."""
+    looked_up, found = [], socket.getaddrinfo
+
+    def resolve(host: Any, *arguments: Any, **named: Any) -> Any:
+        if host != "receiver.example":
+            return found(host, *arguments, **named)
+        looked_up.append(host)
+        return found("127.0.0.1" if len(looked_up) == 1 else "127.0.0.2", *arguments, **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolve)
+    _end_job(store, f"http://receiver.example:{receiver.port}/hook")
+    _deliver(store, tmp_path)
+    ((headers, _),) = receiver.heard
+    assert headers["host"] == f"receiver.example:{receiver.port}"
+    assert len(looked_up) == 1
+
+
+@pytest.mark.parametrize(("name", "delivered"), [("localhost", True), ("other.example", False)])
+def test_certificates_are_verified_for_the_name(
+    name: str, delivered: bool, tmp_path: Path, store: Store, start: Start
+) -> None:
+    """The connection goes to an address; SNI, certificate and `Host` are those of the name."""
+    receiver = start(certificate=_certificate(tmp_path, name))
+    tls = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
+    _end_job(store, f"https://localhost:{receiver.port}/hook")
+    Deliverer(_settings(tmp_path), store, tls).deliver_due()
+    assert receiver.names == ["localhost"]
+    assert [headers["host"] for headers, _ in receiver.heard] == [f"localhost:{receiver.port}"] * delivered
+    assert _tries(store) == [1] * (not delivered)
+
+
+def _certificate(folder: Path, name: str) -> Path:
+    """Certificate and key of a name, signed by itself."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+    now = datetime.datetime.now(datetime.UTC)
+    certificate = (
+        x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    plain = serialization.NoEncryption()
+    path = folder / "certificate.pem"
+    path.write_bytes(
+        certificate.public_bytes(serialization.Encoding.PEM)
+        + key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain)
+    )
+    return path
+
+
+# --- submission ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *UNUSABLE,
+        *("ftp://example.com", "file:///etc/passwd", "http://", "http:example.com", "//example.com", "x" * 3000),
+        *("http://user:pw@example.com", "http://user@example.com", "http://:pw@example.com"),
+        *("http://example.com:0/", "http://example.com:-1/", "http://example.com:65536/", "http://example.com:x/"),
+        *(
+            "http://exa mple.com/",
+            "http://exa%6dple.com/",
+            "http://a\\b/",
+            "http://a..b/",
+            "http://" + "a" * 64 + ".com",
+        ),
+        *("http://exam\nple.com/", "http://example.com/\0", "http://xn--zz--/", "http://[fe80::1%25eth0]/"),
+        "http://" + "a." * 130 + "com",
+        "https://example.com/" + "a" * 2000,
+    ],
+)
+def test_urls_that_are_refused(url: str, tmp_path: Path) -> None:
+    with pytest.raises(RefusedInputError) as caught:
+        check_url(url, _settings(tmp_path))
+    assert caught.value.code == "invalid-webhook"
+    assert len(str(caught.value)) < 800
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *("https://example.com/hook", "http://example.com:65535/?a=b", "HTTPS://EXAMPLE.com", "http://bücher.example/"),
+        *("http://localhost:8080/", "http://my_host/", "http://[2606:4700::1111]:8080/hook", "http://example.com./"),
+    ],
+)
+def test_urls_that_are_accepted(url: str, tmp_path: Path) -> None:
+    check_url(url, _settings(tmp_path))
     with pytest.raises(RefusedInputError, match="switched off"):
-        check_url("https://example.com/hook", ServiceSettings(data=tmp_path))
+        check_url(url, ServiceSettings(data=tmp_path))
+
+
+def test_the_thread_delivers_until_it_is_stopped(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+    deliverer = Deliverer(_settings(tmp_path), store)
+    deliverer.start()
+    _end_job(store, receiver.url)
+    deadline = time.monotonic() + PATIENCE
+    while _tries(store) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    deliverer.stop()
+    assert len(receiver.heard) == 1
