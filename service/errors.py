@@ -91,6 +91,19 @@ class StoreError(ServiceError, InfrastructureError):
     code, status = "store-unavailable", 503
 
 
+class DamagedWeightsError(ServiceError, InfrastructureError):
+    """Weights of a feature network on this machine are damaged: no job is accepted until they are installed again."""
+
+    code, status = "weights-damaged", 503
+
+    def __init__(self) -> None:
+        super().__init__(
+            "The service's feature networks are damaged. Try again when its operator has installed them again: the "
+            "log and `sgsst weights list` say which.",
+            retry_after=60,
+        )
+
+
 class LeaseLostError(ServiceError):
     """Another dispatcher has taken the job over: whatever this one still has to say about it is void."""
 

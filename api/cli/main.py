@@ -487,12 +487,22 @@ def bench_stability(
 
 @weights_app.command("list")
 def list_() -> None:
-    """Show which weights are installed, and where the others come from."""
+    """Show which weights are installed and sound, and where the others come from; exits with 1 if some are damaged."""
     from sgsst_core.features.network_weights import list_network_weights
+    from sgsst_core.features.weight_files import damage_of
 
+    damaged = []
     for entry in list_network_weights():
-        state = f"installed   {entry.path}" if entry.path else f"to download from {entry.source}"
+        if entry.path is not None and (damage := damage_of(entry.path, entry.name)):
+            damaged.append(damage)
+            state = f"DAMAGED     {entry.path}"
+        else:
+            state = f"installed   {entry.path}" if entry.path else f"to download from {entry.source}"
         out_console.print(f"{entry.name:<12}{entry.size / 1e6:>6.0f} MB  {state}")
+    for damage in damaged:
+        error_console.print(f"error: {damage}")
+    if damaged:
+        raise typer.Exit(FAILURE)
 
 
 @weights_app.command()

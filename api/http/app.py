@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -24,12 +25,14 @@ from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
 from api.http.static import add_static
 from api.http.submission import JobFromUploads
+from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.inspection.inspector import Inspector
 from service.inspection.packer import Packer
 from service.settings import ServiceSettings
 from service.store import open_store
+from service.weights import check_weights
 
 #: Requests that read the store or the disk side by side.
 _THREADS = 40
@@ -65,6 +68,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
         context.hub.start()
+        with suppress(DamagedWeightsError):  # it is logged, and /readyz reports it
+            await asyncio.to_thread(check_weights)
         yield
         await context.hub.close()
         await context.inspector.close()

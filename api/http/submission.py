@@ -10,6 +10,7 @@ from api.http.documentation import invalid
 from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError
 from service.errors import (
     BusyError,
+    DamagedWeightsError,
     IdempotencyError,
     NoSpaceError,
     NotFoundError,
@@ -159,4 +160,5 @@ REFUSALS: tuple[ServiceError, ...] = (
     BusyError("Too many files are being checked. Try again later.", retry_after=10),
     NoSpaceError("The service's disk is too full to take this in. Try again later."),
     StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
+    DamagedWeightsError(),
 )

@@ -19,7 +19,7 @@ from types import FrameType
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.errors import LeaseLostError
+from service.errors import DamagedWeightsError, LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.logs import set_up
@@ -36,6 +36,7 @@ from service.store import Store, open_store
 from service.store.leases import Lease
 from service.store.states import JobStatus
 from service.store.tables import JobRow
+from service.weights import check_weights
 
 #: Seconds between two looks for what has expired or was left behind.
 _HOUSEKEEPING_SECONDS = 60.0
@@ -117,6 +118,10 @@ class Dispatcher:
                 del self._running[job_id]
         self._renew_leases()
         self._announce_alive()
+        try:
+            check_weights()
+        except DamagedWeightsError:
+            return
         while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
             self._start_attempt(*found)
 

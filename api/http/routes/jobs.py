@@ -31,12 +31,13 @@ from api.http.schemas import (
 )
 from api.http.sending import IfNoneMatch
 from api.http.submission import BODY, REFUSALS, JobFromUploads
-from service.errors import ConflictError, NotFoundError, QueueFullError, RefusedInputError
+from service.errors import ConflictError, DamagedWeightsError, NotFoundError, QueueFullError, RefusedInputError
 from service.files.staging import check_roles, clean_name, region_styles
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
 from service.store.tables import BlobRow, JobRow, UploadRow
+from service.weights import check_weights
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 #: Bytes of a JSON body, which only names uploads.
@@ -131,6 +132,7 @@ Parts = tuple[Received, JobParameters, str | None]
 def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     """Find the files of a job, and prove what can be proved without the inspecting process."""
     received, parameters, webhook = parts
+    check_weights()
     inputs, rows = _resolve_inputs(context, caller, received)
     styles = region_styles(parameters.region_requests)
     check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, of_regions=styles)
@@ -337,6 +339,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
                 "that took this. Submit it anew without.",
                 "invalid-settings",
             ),
+            DamagedWeightsError(),
         ),
     },
     operation_id="retry_job",
@@ -344,6 +347,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
     stored_parameters(find(context, caller, job_id).parameters)
+    check_weights()
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
     return _job_response(context, caller, job_id, status=202)
 

@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse, PlainTextResponse
 from api.http.context import ContextDep
 from api.http.documentation import problems
 from api.http.schemas import Health
+from service.weights import check_weights
 
 router = APIRouter(tags=["operations"])
 
@@ -32,7 +33,7 @@ async def livez() -> Health:
                     "schema": {"$ref": "#/components/schemas/Health"},
                     "example": {
                         "status": "unavailable",
-                        "checks": {"database": "ok", "artifacts": "ok", "disk": "NoSpaceError"},
+                        "checks": {"database": "ok", "artifacts": "ok", "disk": "NoSpaceError", "weights": "ok"},
                     },
                 }
             },
@@ -41,7 +42,8 @@ async def livez() -> Health:
     },
 )
 def readyz(context: ContextDep) -> Response:
-    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room.
+    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room, no weights of the
+    feature networks are damaged.
 
     Without a dispatcher they still can be, and wait in the queue: the answer is 200, its status `waiting` and its check
     `dispatchers` "none". Otherwise this check tells how many are alive.
@@ -50,6 +52,7 @@ def readyz(context: ContextDep) -> Response:
         "database": context.store.database.ping,
         "artifacts": context.artifacts.ping,
         "disk": lambda: context.blobs.ensure_room(0),
+        "weights": check_weights,
     }
     found = {}
     for name, check in checks.items():

@@ -778,7 +778,11 @@ def test_damaged_weights_are_refused(
     (tmp_path / "vgg16.safetensors").write_bytes(data)
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
     assert main(files.stylize()) == 2
-    assert "corrupt" in capsys.readouterr().err
+    assert "damaged" in capsys.readouterr().err
+    assert main(["weights", "list"]) == 1
+    listed = capsys.readouterr()
+    assert next(line for line in listed.out.splitlines() if line.startswith("vgg16")).split()[3] == "DAMAGED"
+    assert "sgsst weights fetch vgg16" in " ".join(listed.err.split())
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,28 @@
+"""Verification of network weights in the processes of the service: at their start, and when a file has changed."""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+
+from service.errors import DamagedWeightsError
+from sgsst_core.features.weight_files import damaged_weights
+
+_log = logging.getLogger(__name__)
+
+
+def check_weights() -> None:
+    """Check that no installed weights are damaged, and log once which are and what the operator has to do.
+
+    Raises:
+        DamagedWeightsError: Some are.
+    """
+    if found := damaged_weights():
+        for damage in found:
+            _log_once(damage)
+        raise DamagedWeightsError
+
+
+@lru_cache
+def _log_once(damage: str) -> None:
+    _log.error("no job is accepted or started: %s", damage)

@@ -1,0 +1,79 @@
+"""Damaged weights of the feature network, from a bit on the disk to the service's answers."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.api.service import Service, check_documented, wait_for
+from tests.small_scenes import wall, write_files
+
+PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_stop": False}
+
+
+class Unready(Service):
+    """A service that is waited for until it answers, ready or not."""
+
+    def ready(self) -> bool:
+        """Whether it answers."""
+        try:
+            return httpx.get(f"{self.url}/livez", timeout=5).status_code == 200
+        except httpx.TransportError:
+            return False
+
+
+@pytest.fixture
+def cache(tiny_cache: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(tiny_cache, tmp_path / "cache"))
+
+
+def flip_a_bit(path: Path) -> None:
+    """Flip one bit of a file as a disk does: its size and times stay."""
+    status = path.stat()
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+def test_no_job_is_accepted_or_started_on_damaged_weights(cache: Path, tmp_path: Path) -> None:
+    """A job waits when the service starts on damaged weights; once they are mended it runs, without a restart."""
+    scene, cameras, style = write_files(tmp_path, wall())
+    paths = {"scene": scene, "cameras": cameras, "style": style}
+    files = {role: (path.name, path.read_bytes()) for role, path in paths.items()}
+    data, weights = tmp_path / "data", cache / "vgg16.safetensors"
+    sound = tmp_path / "sound"
+    shutil.copy2(weights, sound)
+
+    def submit(client: httpx.Client) -> httpx.Response:
+        return client.post("/v1/jobs", files=files, data={"parameters": json.dumps(PARAMETERS)})
+
+    with Service(data, alone=True, SGSST_CACHE=str(cache)) as service, service.client() as client:
+        assert client.get("/readyz").json()["checks"]["weights"] == "ok"
+        job = f"/v1/jobs/{submit(client).json()['id']}"
+        canceled = f"/v1/jobs/{submit(client).json()['id']}"
+        assert client.post(f"{canceled}/cancel").status_code == 202
+    flip_a_bit(weights)
+    with Unready(data, SGSST_CACHE=str(cache)) as service, service.client() as client:
+        wait_for(lambda: service.said().count("no job is accepted or started") == 2, "both processes", service.said)
+        assert "sgsst weights fetch vgg16" in service.said()
+        answer = client.get("/readyz")
+        assert answer.status_code == 503
+        assert answer.json()["status"] == "unavailable"
+        assert answer.json()["checks"]["weights"] == "DamagedWeightsError"
+        for refused in (submit(client), client.post(f"{canceled}/retry")):
+            assert refused.status_code == 503
+            assert refused.json()["code"] == "weights-damaged"
+            assert int(refused.headers["retry-after"]) > 0
+            check_documented(refused)
+        found = client.get(job).json()
+        assert (found["status"], found["attempt"]) == ("queued", 0)
+        os.replace(sound, weights)
+        wait_for(lambda: client.get("/readyz").status_code == 200, "the service to be ready", service.said)
+        wait_for(lambda: client.get(job).json()["status"] == "succeeded", "the job to succeed", service.said)
+        assert submit(client).status_code == 202
