@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, bindparam, case, delete, func, literal, select
+from sqlalchemy import ColumnElement, SQLColumnExpression, bindparam, case, delete, func, literal, select
 
 from service.store.database import Database, upsert
 from service.store.states import JobStatus
@@ -40,7 +40,7 @@ class Delivery:
     tries: int
 
 
-def _counted(counts: Mapping[str, int], column: ColumnElement[str]) -> ColumnElement[int]:
+def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
     """Return the count of a column's value."""
     return case(dict(counts), value=column, else_=0) if counts else literal(0)
 
