@@ -44,6 +44,8 @@ _MAX_REASON = 300
 _NAME = re.compile(r"(?=.{1,253}$)[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*\.?", re.ASCII)
 #: The only part of IPv6 that is assigned for global unicast.
 _GLOBAL_UNICAST = ipaddress.IPv6Network("2000::/3")
+#: IETF protocol assignments, with the metadata service of a cloud; older versions of Python take most of it for public.
+_PROTOCOL_ASSIGNMENTS = ipaddress.IPv4Network("192.0.0.0/24")
 #: Prefix under which NAT64 translates to IPv4 (RFC 6052).
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 
@@ -110,12 +112,12 @@ def is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
             return is_public(embedded)
         if address not in _GLOBAL_UNICAST or address.teredo is not None:
             return False
-    return address.is_global and not address.is_multicast
+    return address.is_global and not address.is_multicast and address not in _PROTOCOL_ASSIGNMENTS
 
 
 def _look_up(host: str, port: int) -> Future[list[str]]:
     """Look up the addresses of a host on a daemon thread: the resolver cannot be interrupted, and an executor's thread
-    would hold up the end of the process.
+    would hold up the end of the process. A thread that outlives its delivery ends with the resolver's own timeout.
     """
     future: Future[list[str]] = Future()
     future.set_running_or_notify_cancel()
@@ -156,7 +158,7 @@ class Deliverer:
 
     def __init__(self, settings: ServiceSettings, store: Store, tls: ssl.SSLContext | None = None) -> None:
         self._settings, self._store = settings, store
-        self._tls = tls or httpx.create_ssl_context(trust_env=False)
+        self._given_tls = tls
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
 
@@ -242,6 +244,10 @@ class Deliverer:
             ) as answer,
         ):
             return None if answer.is_success else f"answered {answer.status_code}"
+
+    @cached_property
+    def _tls(self) -> ssl.SSLContext:
+        return self._given_tls or httpx.create_ssl_context(trust_env=False)
 
     @cached_property
     def _secret(self) -> str:
