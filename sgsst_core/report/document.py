@@ -25,9 +25,9 @@ from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Of report.json: raised whenever a field changes its meaning or goes away.
-REPORT_VERSION = 2
+REPORT_VERSION = 3
 #: Of plan.json.
-PLAN_VERSION = 1
+PLAN_VERSION = 2
 
 
 @dataclass(frozen=True)

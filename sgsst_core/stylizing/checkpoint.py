@@ -37,11 +37,7 @@ from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "5"
-#: Version whose predictions count GPU memory as process memory, and whose plans never use cuDNN's search.
-_ONE_MEMORY = "4"
-#: Version whose plans do not specify precision and rasterizer; see `_completed`.
-_PLANS_WITHOUT_DEVICE = "3"
+FORMAT_VERSION = "6"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit", "measure"}
@@ -240,7 +236,7 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        if metadata["version"] not in (FORMAT_VERSION, _ONE_MEMORY, _PLANS_WITHOUT_DEVICE):
+        if metadata["version"] != FORMAT_VERSION:
             raise CheckpointError(f"{path}: is of another version of this program. Start again without --resume.")
         if metadata.pop("digest") != _digest(tensors, metadata):
             raise ValueError("its content is not what was written")
@@ -253,7 +249,7 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
             raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
         return Checkpoint(
             state=_state(tensors, metadata),
-            plan=_plan(tensors, _plan_values(metadata)),
+            plan=_plan(tensors, json.loads(metadata["plan"])),
             ranks=int(metadata["ranks"]),
             run=metadata["run"],
             written_by=json.loads(metadata["written_by"]),
@@ -316,30 +312,6 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
         del values["refinement"]["pieces"], values["refinement"]["sh_dc"]
     del values["optimized"], values["seen"], values["survey"]["total_blend_weights"]
     return tensors, values
-
-
-def _plan_values(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values of a plan from any supported format version."""
-    values: dict[str, Any] = json.loads(metadata["plan"])
-    if metadata["version"] == _PLANS_WITHOUT_DEVICE:
-        return _completed(values, json.loads(metadata["memory"]))
-    return values
-
-
-def _completed(values: dict[str, Any], memory: int) -> dict[str, Any]:
-    """Complete a plan of version 3 with what it left to the stylizer, as on a CPU.
-
-    All measurements of that version were made on CPUs. On a GPU gsplat may have run instead; there, a new plan decides.
-    """
-    precision = "features in bfloat16" in [line["decision"] for line in values["decisions"]]
-    return {
-        **values,
-        "memory_limit": memory,
-        "device": "cpu",
-        "rasterizer": "cpu" if values["cached_weights"] == "none" else "cached",
-        "precision": "bfloat16" if precision else "float32",
-        "measured": True,
-    }
 
 
 def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:

@@ -17,7 +17,6 @@ from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
-from tests.sgsst_core.stylizing.old_checkpoints import of_version_3
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
@@ -75,20 +74,6 @@ def test_planning_is_shown_and_a_resumed_job_follows_the_plan_of_the_first(
     assert request_.out.read_bytes() == whole.out.read_bytes()
     assert not Path(request_.out).with_name("s.checkpoint.safetensors").exists()
     assert not Path(request_.out).with_name("s.checkpoint.previous.safetensors").exists()
-
-
-def test_a_checkpoint_of_the_version_before_goes_on_with_its_plan(request_: StylizeRequest, tmp_path: Path) -> None:
-    whole = small_request(tmp_path / "whole", 8)
-    go_on(prepare(whole))
-    first = prepare(request_)
-    go_on(first, steps=3)
-    of_version_3(first.outputs.checkpoint)
-    told: list[PlanningProgress] = []
-    second = prepare(request_, resume=Resume(True), show_planning=told.append)
-    assert not told, "it has a survey"
-    assert second.stylizer.plan.prediction == first.stylizer.plan.prediction
-    assert go_on(second).stopped == "finished"
-    assert request_.out.read_bytes() == whole.out.read_bytes()
 
 
 def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: StylizeRequest) -> None:

@@ -15,7 +15,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
     before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}
     after = {str(scale): _terms(1e5 / 4**scale) for scale in range(scales)}
     return {
-        "version": 2,
+        "version": 3,
         "program": {"name": "sgsst-service", "version": "0.1.0"},
         "created": "2026-01-02T03:04:05+00:00",
         "stopped": "finished",

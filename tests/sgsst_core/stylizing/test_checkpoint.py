@@ -28,7 +28,6 @@ from sgsst_core.stylizing.checkpoint import (
     versions,
 )
 from sgsst_core.stylizing.state import StepRecord, StylizerState
-from tests.sgsst_core.stylizing.old_checkpoints import of_version_3, of_version_4
 from tests.small_scenes import cameras, style, wall
 
 
@@ -118,27 +117,9 @@ def test_a_refined_scene_is_known_again(kept: Checkpoint, tmp_path: Path) -> Non
     assert found.plan.refinement is not None
 
 
-def test_a_checkpoint_of_version_4_comes_back_without_memory_of_a_gpu(kept: Checkpoint, tmp_path: Path) -> None:
+def test_checkpoint_of_an_earlier_version_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", kept, "job")
-    of_version_4(tmp_path / "c")
-    assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
-
-
-def test_a_checkpoint_of_version_3_comes_back_with_what_its_plan_meant(kept: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", kept, "job")
-    of_version_3(tmp_path / "c")
-    assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
-    for form, rasterizer in (("none", "cpu"), ("float32", "cached")):
-        other = replace(kept, plan=replace(kept.plan, cached_weights=form))  # type: ignore[arg-type]
-        save_checkpoint(tmp_path / "c", other, "job")
-        of_version_3(tmp_path / "c", decision="features in bfloat16")
-        found = load_checkpoint(tmp_path / "c", "job").plan
-        assert (found.rasterizer, found.precision) == (rasterizer, "bfloat16")
-
-
-def test_a_checkpoint_of_a_version_before_that_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", kept, "job")
-    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"5"', b'"version":"2"'))
+    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"6"', b'"version":"5"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
 
