@@ -30,7 +30,7 @@ export class RegionList {
     };
     setStyles(this.styles);
     const value = () => ({ name: name.value.trim(), ...(select.value.trim() ? { select: select.value.trim() } : {}), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
-    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), field("Select", select), field(say.style, style), h("label.check", freeze, h("span", "Keep")));
+    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), field("Select", select), field(say.style, style), h("label.check", freeze, h("span", "Freeze")));
     const row = { element, value, setStyles };
     const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(this.rows.length + 1)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove()) }, icon("close"));
     element.append(remove);

@@ -110,7 +110,7 @@ class Watched:
         """The 3D view [h, w, 3], 0 to 255, as the page saves it."""
         self.settled()
         with self.page.expect_download() as download:
-            self.page.get_by_role("button", name="Save a picture").click()
+            self.page.get_by_role("button", name="Save image").click()
         with Image.open(download.value.path()) as picture:
             return np.asarray(picture.convert("RGB"), dtype=np.float64)
 

@@ -101,12 +101,12 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     drop(watched, files)
     page.get_by_text("616 Gaussians · SH degree 1").wait_for()
     watched.settled()
-    page.get_by_text("3 cameras, drawn in the scene").wait_for()
+    page.get_by_text("3 cameras shown in the scene").wait_for()
     assert httpx.get(f"{service.url}/v1/jobs").json()["jobs"] == []  # nothing was sent to show it
 
     set_options(watched, **STEPS)
-    page.get_by_role("button", name="What would it cost?").click()
-    cost = page.get_by_role("region", name="What it would cost")
+    page.get_by_role("button", name="Estimate time").click()
+    cost = page.get_by_role("region", name="Estimate")
     cost.get_by_text("616", exact=True).wait_for()
     cost.get_by_text("network layers").wait_for()
 
@@ -114,7 +114,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.locator("h1", has_text="scene").wait_for()
     page.locator(".badge", has_text="Done").wait_for()
     page.get_by_role("img", name="Loss against seconds").wait_for()
-    page.get_by_role("heading", name="What was decided").wait_for()
+    page.get_by_role("heading", name="How it will run").wait_for()
     page.get_by_label("Wipe", exact=True).wait_for()
     job_id = page.url.rsplit("/", 1)[1]
 
@@ -168,7 +168,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     page.get_by_role("button", name="Pause").wait_for()
     page.unroute_all(behavior="ignoreErrors")
     page.reload()
-    page.get_by_text("had arrived to").wait_for()
+    page.get_by_text("Choose it again to finish").wait_for()
 
     first, before = next((url, offset) for url, offset, _ in sent if offset > 0)
     sent.clear()
@@ -207,9 +207,9 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
     page.get_by_role("button", name="Start").click()
     wait_for(lambda: page.evaluate("1") and held, "a part to be sent")
     page.get_by_role("button", name="Pause").click()
-    page.get_by_text("paused at 0 %").wait_for()
+    page.get_by_text("paused at 0%").wait_for()
     page.unroute_all(behavior="ignoreErrors")
-    page.get_by_role("button", name="Go on").click()
+    page.get_by_role("button", name="Resume").click()
     page.get_by_role("button", name="Cancel").click()
     page.locator(".badge", has_text="Canceled").wait_for()
     watched.check("net::ERR")
@@ -220,12 +220,12 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     job_id = submit(service, files, **LONG)
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
-    page.get_by_text("All scales · step").wait_for()
+    page.get_by_text("Adding detail · step").wait_for()
     page.get_by_role("img", name="Loss against seconds").wait_for()
     service.kill("api.http.server")
-    page.get_by_text("The connection is lost").wait_for()
+    page.get_by_text("Connection lost").wait_for()
     wait_for(service.ready, "the API to be back", service.said)
-    page.get_by_text("The connection is lost").wait_for(state="hidden")
+    page.get_by_text("Connection lost").wait_for(state="hidden")
     step = page.locator(".state").inner_text()
     wait_for(lambda: page.locator(".state").inner_text() != step, "news of the job", service.said)
     page.reload()
@@ -244,12 +244,12 @@ def test_refusals_stand_beside_their_field(visit: Visit, files: dict[str, Path],
     picture = tmp_path / "style.png"
     picture.write_bytes(b"this is no picture")
     choose(watched, files | {"style": picture})
-    page.get_by_role("button", name="What would it cost?").click()
+    page.get_by_role("button", name="Estimate time").click()
     page.locator(".slot", has_text="Style").get_by_text("not an image").wait_for()
     page.get_by_role("button", name="Remove style.png").click()
     page.get_by_label("Style", exact=True).set_input_files(files["style"])
     set_options(watched, resolution=-5)
-    page.get_by_role("button", name="What would it cost?").click()
+    page.get_by_role("button", name="Estimate time").click()
     field = page.locator("[data-name=resolution]")
     field.get_by_text("greater than or equal to 1").wait_for()
     assert field.locator("input").get_attribute("aria-invalid") == "true"
@@ -292,7 +292,7 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     page.get_by_label("Filter").fill("of three")
     for name in ("run 0 of three", "run 1 of three"):
         page.get_by_label(f"Compare {name}").check()
-    page.get_by_role("button", name="Compare the two").click()
+    page.get_by_role("button", name="Compare", exact=True).click()
     page.get_by_label("Left").wait_for()
     watched.settled()
     watched.wipe("Home")
@@ -428,7 +428,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
             page.goto(f"{service.url}/#/jobs")
             page.get_by_label("API key").fill("sgsst_wrong")
             page.get_by_role("button", name="Sign in").click()
-            page.get_by_text("does not know this key").wait_for()
+            page.get_by_text("key isn't valid").wait_for()
             page.get_by_label("API key").fill(key)
             page.get_by_role("button", name="Sign in").click()
             page.get_by_role("button", name="Sign out").wait_for()
@@ -471,7 +471,7 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     region = page.get_by_role("group", name="Region 1")
     region.get_by_label("Name").fill("left")
     region.get_by_label("Select").fill("half-space=1,0,0,0")
-    region.get_by_label("Keep").check()
+    region.get_by_label("Freeze").check()
     page.get_by_role("button", name="Start").click()
     page.locator(".badge", has_text="Done").wait_for()
     job_id = page.url.rsplit("/", 1)[1]

@@ -253,10 +253,10 @@ def test_nothing_is_drawn_while_nothing_changes(visit: Visit, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"no scene at all", "This is no scene"),
+        (b"no scene at all", "Not a scene file"),
         (b"ply" + bytes(70_000), "This is not a PLY file."),
         (b"NGSP" + bytes(60), "SPZ of this version"),
-        (gzip.compress(b"no scene, but text that somebody has packed"), "This is no scene"),
+        (gzip.compress(b"no scene, but text that somebody has packed"), "Not a scene file"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
             "Only binary little-endian PLY",
@@ -281,5 +281,5 @@ def test_cut_file_says_so(visit: Visit, tmp_path: Path) -> None:
     ply.write_bytes(ply.read_bytes()[:-100])
     watched = visit()
     watched.page.get_by_label("Scene", exact=True).set_input_files(ply)
-    watched.page.locator(".frame .note").filter(has_text="ends too early").wait_for()
+    watched.page.locator(".frame .note").filter(has_text="is incomplete").wait_for()
     watched.check()
