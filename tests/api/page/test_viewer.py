@@ -254,8 +254,8 @@ def test_nothing_is_drawn_while_nothing_changes(visit: Visit, tmp_path: Path) ->
     ("content", "said"),
     [
         (b"no scene at all", "Not a scene file"),
-        (b"ply" + bytes(70_000), "This is not a PLY file."),
-        (b"NGSP" + bytes(60), "SPZ of this version"),
+        (b"ply" + bytes(70_000), "Not a PLY file."),
+        (b"NGSP" + bytes(60), "This SPZ version"),
         (gzip.compress(b"no scene, but text that somebody has packed"), "Not a scene file"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
