@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 from sgsst_core.errors import InfrastructureError, SgsstError
+
+_AGAIN = "If you have sent it, send it again; a result has to be computed again."
 
 
 class ServiceError(SgsstError):
@@ -86,7 +90,7 @@ class BusyError(ServiceError):
 
 
 class StoreError(ServiceError, InfrastructureError):
-    """The store of files cannot be reached, or has lost or damaged a file; the cause says what has happened."""
+    """The store of files cannot be reached; the cause says what has happened."""
 
     code, status = "store-unavailable", 503
 
@@ -102,6 +106,39 @@ class DamagedWeightsError(ServiceError, InfrastructureError):
             "log and `sgsst weights list` say which.",
             retry_after=60,
         )
+
+
+class LostFileError(ServiceError):
+    """A file that a row refers to is not in the store of files, which itself answers."""
+
+    code, status = "file-lost", 500
+
+    @classmethod
+    def of(cls, sha256: str) -> Self:
+        """Return the error of a file of this SHA-256."""
+        return cls(f"The service has lost the file with SHA-256 {sha256}. {_AGAIN}")
+
+
+class DamagedFileError(ServiceError):
+    """A file of the store does not have the SHA-256 that was recorded for it; it is neither sent nor used."""
+
+    code, status = "file-damaged", 500
+
+    @classmethod
+    def of(cls, sha256: str) -> Self:
+        """Return the error of a file whose SHA-256 should be this."""
+        return cls(f"The service's copy of the file with SHA-256 {sha256} is damaged. {_AGAIN}")
+
+
+class LockedError(ServiceError):
+    """Another request is writing to this upload."""
+
+    code, status = "upload-locked", 423
+
+    def __init__(
+        self, message: str = "Another request is writing to this upload. Ask for its offset, and go on from there."
+    ) -> None:
+        super().__init__(message)
 
 
 class LeaseLostError(ServiceError):

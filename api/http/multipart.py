@@ -252,13 +252,13 @@ class _Form:
     def _end(self) -> None:
         if self._file is not None:
             file, self._file = self._file, None
-            sha256 = file.close()
+            file.close()
             try:
                 check_file(self._role, self._name, file.path, file.size, self._settings)
             except ServiceError:
                 file.discard()
                 raise
-            self._blobs.keep(file.path, sha256, file.size)
+            sha256 = self._blobs.keep(file.path)
             entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": file.size}
             self.received.files.append(entry)
             return

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import contextlib
 import hashlib
-from collections.abc import Iterator
 
 from fastapi import Request
 
@@ -19,36 +17,12 @@ from service.store.tables import UploadRow
 ALGORITHMS = ("sha256", "sha1", "md5")
 #: Bytes after which an upload's state is saved, so that a crash costs no more than these.
 _SAVE_BYTES = 64 << 20
-#: Uploads that a request is writing to now: a second one has to wait for its turn.
-_written_now: set[str] = set()
 
 
 class ChecksumError(ServiceError):
     """What arrived is not what was sent."""
 
     code, status = "checksum-mismatch", 460
-
-
-class LockedError(ServiceError):
-    """Another request is writing to this upload."""
-
-    code, status = "upload-locked", 423
-
-
-@contextlib.contextmanager
-def only_writer(upload_id: str) -> Iterator[None]:
-    """Keep other requests from writing to an upload.
-
-    Raises:
-        LockedError: one does already.
-    """
-    if upload_id in _written_now:
-        raise LockedError("Another request is writing to this upload. Ask for its offset, and go on from there.")
-    _written_now.add(upload_id)
-    try:
-        yield
-    finally:
-        _written_now.discard(upload_id)
 
 
 async def append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
@@ -105,6 +79,7 @@ class _Writer:
             self._part.discard()
             raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
         expires = self.save()
+        self.close()
         if self._offset == self._row.length:
             self._context.blobs.finish_upload(self._row, self._seconds)
         return expires

@@ -10,6 +10,8 @@ from itertools import chain
 from typing import Annotated, Any
 from urllib.parse import quote
 
+import anyio
+import anyio.to_thread
 from fastapi import Header, Request, Response
 from fastapi.responses import StreamingResponse
 
@@ -17,6 +19,8 @@ from api.http.documentation import Responses, headers
 from api.http.schemas import SHA256
 from service.errors import NotFoundError, ServiceError
 
+#: Files that are hashed at the same time before they are sent: others wait, and no other request does.
+_CHECKS = anyio.CapacityLimiter(2)
 #: Letters of a name that is suggested for a file.
 _MAX_NAME = 120
 
@@ -39,6 +43,7 @@ class RangeError(ServiceError):
 
 #: Of every answer that has a file, and as an example of a refused range.
 _SENT = ("ETag", "Accept-Ranges", "Cache-Control", "Content-Disposition", "X-Content-Type-Options")
+JUST_REMOVED = NotFoundError("The file has just been removed.")
 NO_SUCH_RANGE = RangeError("The file has 42301 bytes.", headers={"Content-Range": "bytes */42301"})
 
 
@@ -52,6 +57,7 @@ class SentFile:
         kind: media type.
         inline: a browser may show it in place.
         policy: Content-Security-Policy; None for none.
+        check: proves that the stored file has this content; quick where that has just been done.
         read: its bytes from one up to another, in pieces.
     """
 
@@ -61,6 +67,7 @@ class SentFile:
     kind: str
     inline: bool
     policy: str | None
+    check: Callable[[], None]
     read: Callable[[int, int], Iterator[bytes]]
 
 
@@ -100,6 +107,7 @@ async def send_file(
     Raises:
         RangeError: the range lies behind the end.
         NotFoundError: the file has just been removed.
+        LostFileError, DamagedFileError: it is not what its row says; nothing of it is sent.
     """
     tag = f'"{file.sha256}"'
     sent = _headers(file, tag)
@@ -113,6 +121,7 @@ async def send_file(
     status = 206 if span else 200
     if request.method == "HEAD":
         return Response(status_code=status, headers=sent, media_type=file.kind)
+    await anyio.to_thread.run_sync(file.check, limiter=_CHECKS)
     body = file.read(start, stop)
     first = await asyncio.to_thread(_first, body)  # what fails now can still be answered
     return StreamingResponse(chain(first, body), status, sent, file.kind)
@@ -123,7 +132,7 @@ def _first(body: Iterator[bytes]) -> list[bytes]:
     try:
         return [piece for piece in (next(body, None),) if piece is not None]
     except FileNotFoundError as error:
-        raise NotFoundError("The file has just been removed.") from error
+        raise JUST_REMOVED from error
 
 
 def _headers(file: SentFile, tag: str) -> dict[str, str]:

@@ -8,10 +8,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from api.http.documentation import invalid
 from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError
+from api.http.schemas import SHA256
 from service.errors import (
     BusyError,
     DamagedWeightsError,
+    DamagedFileError,
     IdempotencyError,
+    LockedError,
+    LostFileError,
     NoSpaceError,
     NotFoundError,
     QueueFullError,
@@ -161,4 +165,7 @@ REFUSALS: tuple[ServiceError, ...] = (
     NoSpaceError("The service's disk is too full to take this in. Try again later."),
     StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
     DamagedWeightsError(),
+    LockedError(),
+    LostFileError.of(SHA256),
+    DamagedFileError.of(SHA256),
 )

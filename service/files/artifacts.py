@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-import hashlib
+import logging
 import mimetypes
 import os
 import secrets
@@ -12,11 +12,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from service.errors import DamagedFileError, LostFileError
+from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 
-_CHUNK = 1 << 20
 #: What the system says where a file cannot have another name there: it is on another file system, or on one without.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK)
 _MEDIA_TYPES = {
@@ -25,6 +26,8 @@ _MEDIA_TYPES = {
     ".txt": "text/plain; charset=utf-8",
     ".html": "text/html; charset=utf-8",
 }
+
+_log = logging.getLogger(__name__)
 
 
 class Artifacts:
@@ -46,7 +49,7 @@ class Artifacts:
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
         if not self.local:
             with _held(source) as held:
-                size, sha256 = _digest(held)
+                size, sha256 = held.stat().st_size, file_digest(held)
                 self.objects.put(held, location)
             return Published(name, location, size, sha256)
         target = Path(self.objects.root, location)
@@ -54,17 +57,37 @@ class Artifacts:
         with atomic_path(target) as temporary:
             if not (final and _linked(source, temporary)):
                 shutil.copyfile(source, temporary)
-            size, sha256 = _digest(temporary)
+            size, sha256 = temporary.stat().st_size, file_digest(temporary)
         return Published(name, location, size, sha256)
 
     def read(self, location: str, start: int, stop: int) -> Iterator[bytes]:
         """The bytes from `start` up to `stop`, in pieces."""
         return self.objects.read(location, start, stop)
 
-    def fetch(self, location: str, target: Path) -> None:
-        """Copy a result to a local file; it appears whole or not at all."""
-        with atomic_path(target) as temporary:
-            self.objects.get(location, temporary)
+    def check(self, location: str, sha256: str) -> None:
+        """Prove that a result is what its row says, unless that has just been done.
+
+        Raises:
+            LostFileError, DamagedFileError: It is not.
+        """
+        self.objects.check_once(location, sha256)
+
+    def fetch(self, location: str, target: Path, sha256: str) -> None:
+        """Copy a result to a local file; it appears whole or not at all.
+
+        Raises:
+            LostFileError: The result is not in the store of files.
+            DamagedFileError: What came has another SHA-256.
+        """
+        try:
+            with atomic_path(target) as temporary:
+                self.objects.get(location, temporary)
+                found = file_digest(temporary)
+                if found != sha256:
+                    _log.error("%s is damaged: its SHA-256 is %s, and should be %s", location, found, sha256)
+                    raise DamagedFileError.of(sha256)
+        except FileNotFoundError as error:
+            raise LostFileError.of(sha256) from error
 
     def remove(self, location: str) -> None:
         """Remove one file, where it is still there."""
@@ -123,12 +146,3 @@ def _held(source: Path) -> Iterator[Path]:
         yield held
     finally:
         held.unlink(missing_ok=True)
-
-
-def _digest(path: Path) -> tuple[int, str]:
-    digest, size = hashlib.sha256(), 0
-    with path.open("rb") as file:
-        while data := file.read(_CHUNK):
-            digest.update(data)
-            size += len(data)
-    return size, digest.hexdigest()

@@ -6,54 +6,40 @@ Where the store of files is a local folder they are files of the data folder (`B
 
 from __future__ import annotations
 
-import hashlib
+import fcntl
 import os
 import secrets
 import shutil
 import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Protocol
 
-from service.errors import NoSpaceError, NotFoundError, StoreError, TooLargeError
+from service.errors import LockedError, NoSpaceError, NotFoundError, TooLargeError
 from service.files.cache import file_digest
-from service.store.inputs import Inputs
+from service.files.objects import ObjectStore
+from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
 
 #: Files that no row refers to are removed at this age: a younger one's row may still be on its way.
 _ORPHAN_SECONDS = 3600.0
-#: Bytes that a blob is read in.
-_PIECE = 1 << 20
-#: Unfinished uploads whose digests so far are remembered; what is forgotten is read again at the end.
-_MAX_DIGESTS = 10_000
-
-
-class Digest(Protocol):
-    """What `hashlib` makes."""
-
-    def update(self, data: bytes, /) -> None:
-        """Take bytes in."""
-
-    def copy(self) -> Digest:
-        """One more, of the same bytes so far."""
-
-    def hexdigest(self) -> str:
-        """Of all bytes so far."""
+#: Folders of the store of files, and of the data folder where that is a local one; all others are those of jobs.
+BLOBS, UPLOADS = "blobs", "uploads"
+#: Inodes that a file system must have left: a request needs some, and the database too.
+_MIN_FREE_INODES = 1000
 
 
 class Receiver:
-    """A file on its way in: bytes are hashed and written as they come, and are no blob before `Blobs.keep`."""
+    """A file that is being received; it becomes a blob by `Blobs.keep`."""
 
     def __init__(self, path: Path, limit: int, room: Callable[[int], None]) -> None:
         self.path = path
         self.size = 0
         self._limit = limit
         self._room = room
-        self._digest = hashlib.sha256()
         self._file = path.open("wb", buffering=0)
 
     def write(self, data: bytes) -> None:
@@ -68,13 +54,11 @@ class Receiver:
             raise TooLargeError(f"A file has more than {self._limit:,} bytes.", limit=self._limit)
         self._room(len(data))
         write_all(self._file, data)
-        self._digest.update(data)
 
-    def close(self) -> str:
-        """Make the bytes durable; returns their SHA-256."""
+    def close(self) -> None:
+        """Make the bytes durable."""
         os.fsync(self._file.fileno())
         self._file.close()
-        return self._digest.hexdigest()
 
     def discard(self) -> None:
         """Forget what has arrived."""
@@ -108,9 +92,11 @@ class Blobs(ABC):
     Args:
         folder: of what is on its way in.
         min_free: bytes of its disk below which nothing is taken in.
+        objects: Store of files that holds the blobs, below `BLOBS`.
     """
 
-    def __init__(self, folder: Path, inputs: Inputs, min_free: int) -> None:
+    def __init__(self, folder: Path, inputs: Inputs, min_free: int, objects: ObjectStore) -> None:
+        self.objects = objects
         self.incoming = folder / "incoming"
         self.incoming.mkdir(parents=True, exist_ok=True)
         self._inputs, self._min_free = inputs, min_free
@@ -119,31 +105,44 @@ class Blobs(ABC):
         """Raise NoSpaceError where `size` more bytes would leave too little of the disk."""
         if shutil.disk_usage(self.incoming).free - size < self._min_free:
             raise NoSpaceError("The service's disk is too full to take this in. Try again later.")
+        inodes = os.statvfs(self.incoming)
+        if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without a table of inodes say 0
+            raise NoSpaceError("The service's disk cannot hold more files. Try again later.")
 
     def receive(self, limit: int) -> Receiver:
-        """A new file to write to."""
+        """Return a new file to write to."""
+        self.ensure_room(0)
         return Receiver(self.incoming / f"{secrets.token_hex(12)}.part", limit, self.ensure_room)
 
     @abstractmethod
-    def keep(self, path: Path, sha256: str, size: int) -> None:
-        """Make a received, durable file a blob; the file is gone then."""
+    def keep(self, path: Path) -> str:
+        """Make a received, durable file a blob, and return its SHA-256; the file is gone then.
+
+        What is hashed is the file that gets the name. A blob of the same content that was lost or damaged is replaced.
+        """
 
     @abstractmethod
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
-        """Blobs as files of this machine, by digest. They stay as long as `folder`, which is for them alone, does.
+        """Return blobs as files of this machine, by digest, after comparing each with its digest.
+
+        Args:
+            rows: Blobs by digest.
+            folder: Folder for these files alone; they stay as long as it does.
 
         Raises:
-            StoreError: one cannot be had.
+            LostFileError: The store of files does not have one.
+            DamagedFileError: One is not what its digest says.
+            StoreError: The store of files does not answer.
         """
 
-    @abstractmethod
     def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
-        """The bytes of a blob from `start` up to `stop`, in pieces.
+        """Yield the bytes of a blob from `start` up to `stop`, straight from the store of files.
 
         Raises:
-            FileNotFoundError: it has just been removed.
-            StoreError: the store of files is away.
+            FileNotFoundError: The blob has just been removed.
+            StoreError: The store of files does not answer.
         """
+        return self.objects.read(f"{BLOBS}/{row.location}", start, stop)
 
     @contextmanager
     def lent(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
@@ -157,25 +156,27 @@ class Blobs(ABC):
 
     @abstractmethod
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
-        """Write behind what an upload has.
+        """Return a writer of an upload's next bytes.
 
         Args:
-            upload: its row, of this moment.
-            seconds: after which it expires, from each `save` on.
+            upload: Row of the upload.
+            seconds: Time after each `save` until the upload expires.
 
         Raises:
-            NotFoundError: what it has had is gone.
+            NotFoundError: The bytes before them are gone.
+            ConflictError: The next byte is another one by now.
+            LockedError: Another writer of the upload is open, in this process or in another one.
         """
 
     @abstractmethod
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Make an upload whose last byte has been saved a blob, and tie it to that; returns the blob's SHA-256.
+        """Make an upload whose last byte has been saved a blob, and return the blob's SHA-256.
 
-        What the upload has stays until the store knows of the blob: when the process dies on the way, the same can be
-        done again.
+        The upload's bytes stay until the database knows the blob: if the process dies before, this can be repeated.
 
         Raises:
-            NotFoundError: its bytes are gone.
+            NotFoundError: The upload's bytes are gone.
+            LockedError: Another request is doing the same.
         """
 
     @abstractmethod
@@ -203,94 +204,74 @@ class BlobFolder(Blobs):
     """Inputs as files of the data folder."""
 
     def __init__(self, folder: Path, inputs: Inputs, min_free_bytes: int) -> None:
-        super().__init__(folder, inputs, min_free_bytes)
-        self._blobs, self.uploads = folder / "blobs", folder / "uploads"
+        super().__init__(folder, inputs, min_free_bytes, ObjectStore(f"file://{folder}"))
+        self._blobs, self.uploads = folder / BLOBS, folder / UPLOADS
         for path in (self._blobs, self.uploads):
             path.mkdir(parents=True, exist_ok=True)
-        self._digests: OrderedDict[str, tuple[int, Digest]] = OrderedDict()
 
-    def keep(self, path: Path, sha256: str, size: int, *, leave: bool = False) -> None:
-        """Move a received file to its place, or remove it where its content is there already.
+    def keep(self, path: Path, *, leave: bool = False) -> str:
+        """Move a received file to its place, and return its SHA-256.
 
         Args:
-            leave: let it have its old name as well.
+            path: File that nobody writes to any more.
+            leave: Whether the file keeps its old name as well.
         """
-        location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
-        final = self._blobs / location
+        path.chmod(0o400)
+        size, sha256 = path.stat().st_size, file_digest(path)
+        final = self._blobs / sha256[:2] / f"{sha256}-{secrets.token_hex(4)}"
         final.parent.mkdir(exist_ok=True)
         if leave:
             os.link(path, final)
         else:
             path.replace(final)
-        final.chmod(0o440)
         flush_folder(final.parent)
-        if self._inputs.add_blob(sha256, location, size) != location:
-            final.unlink()
+        location = self._inputs.add_blob(sha256, f"{final.parent.name}/{final.name}", size)
+        known = self._blobs / location
+        if known != final:  # it takes the place of a file of the same content, which may be lost or damaged
+            known.parent.mkdir(exist_ok=True)
+            final.replace(known)
+            final.unlink(missing_ok=True)  # two names of one file: the system renames nothing
+            flush_folder(known.parent)
+        return sha256
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (others need it)
-        """Where they are; nothing is put into `folder`."""
-        found = {sha256: self._blobs / row.location for sha256, row in rows.items()}
-        gone = next((path for path in found.values() if not path.is_file()), None)
-        if gone is not None:
-            raise StoreError("An input is not in the service's data folder.", retry_after=30) from FileNotFoundError(
-                gone
-            )
-        return found
-
-    def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
-        """From its file."""
-        with (self._blobs / row.location).open("rb", buffering=0) as file:
-            file.seek(start)
-            while start < stop and (data := file.read(min(_PIECE, stop - start))):
-                start += len(data)
-                yield data
+        """Return their places; nothing is put into `folder`."""
+        for sha256, row in rows.items():
+            self.objects.check(f"{BLOBS}/{row.location}", sha256)
+        return {sha256: self._blobs / row.location for sha256, row in rows.items()}
 
     def begin_upload(self, upload_id: str) -> None:
-        """Its file, empty."""
+        """Create its file, empty."""
         self.upload_path(upload_id).touch()
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Write to the upload's file."""
-        return _FileWriter(self, self._inputs, upload, seconds)
-
-    def digest_so_far(self, upload_id: str, offset: int) -> Digest | None:
-        """The SHA-256 of an upload's bytes before an offset, to go on with; None where this process has not seen all of
-        them, or has forgotten it.
-        """
-        if not offset:
-            return hashlib.sha256()
-        at, digest = self._digests.get(upload_id, (-1, None))
-        return digest.copy() if digest is not None and at == offset else None
-
-    def keep_digest(self, upload_id: str, offset: int, digest: Digest | None) -> None:
-        """Remember an upload's digest up to an offset for the request that goes on there."""
-        self._digests.pop(upload_id, None)
-        if digest is not None:
-            self._digests[upload_id] = offset, digest.copy()
-            if len(self._digests) > _MAX_DIGESTS:
-                self._digests.popitem(last=False)
+        return _FileWriter(self.upload_path(upload.id), self._inputs, upload, seconds)
 
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Link its file; that is read for its digest only where that was not computed while it came."""
+        """Link its file."""
         path = self.upload_path(upload.id)
         try:
-            digest = self.digest_so_far(upload.id, upload.length)
-            sha256 = digest.hexdigest() if digest is not None else file_digest(path)
-            self.keep(path, sha256, upload.length, leave=True)
-        except FileNotFoundError:  # unless another request has just done it
+            with path.open("rb") as file:
+                _lock(file)
+                known = self._inputs.upload(upload.id, upload.owner).sha256
+                if known is not None:
+                    return known
+                if path.stat().st_size != upload.length:
+                    raise gone(upload)
+                sha256 = self.keep(path, leave=True)
+                self._inputs.finish_upload(upload.id, sha256, seconds)
+                path.unlink(missing_ok=True)
+                return sha256
+        except FileNotFoundError:  # unless another request has just finished it
             known = self._inputs.upload(upload.id, upload.owner).sha256
             if known is None:
-                raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
+                raise gone(upload) from None
             return known
-        self._inputs.finish_upload(upload.id, sha256, seconds)
-        self.keep_digest(upload.id, upload.length, None)
-        path.unlink(missing_ok=True)
-        return sha256
 
     def forget_upload(self, upload_id: str) -> None:
         """Remove its file."""
         self.upload_path(upload_id).unlink(missing_ok=True)
-        self.keep_digest(upload_id, 0, None)
 
     def _collect_blobs(self) -> int:
         removed = 0
@@ -306,42 +287,69 @@ class BlobFolder(Blobs):
         return removed
 
     def upload_path(self, upload_id: str) -> Path:
-        """Where the bytes of an unfinished upload are."""
+        """Return the path of the bytes of an unfinished upload."""
         return self.uploads / f"{upload_id}.part"
 
 
 class _FileWriter:
-    """The file of an unfinished upload, from the offset that the store knows on."""
+    """Writer to the file of an unfinished upload, from the offset that the database has.
 
-    def __init__(self, blobs: BlobFolder, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
-        self._blobs, self._inputs, self._upload, self._seconds = blobs, inputs, upload, seconds
-        path = blobs.upload_path(upload.id)
-        there = path.stat().st_size if path.exists() else 0
-        if there < upload.offset:  # zeros would take the place of what is missing
-            raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.")
-        self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
-        self._file.truncate(upload.offset)  # a crash may have left more, of which nothing is known
-        self._file.seek(upload.offset)
-        self._digest = blobs.digest_so_far(upload.id, upload.offset)
+    Only one is open at a time, in whatever process: it holds a lock on the file, by the descriptor that it writes to.
+    """
+
+    def __init__(self, path: Path, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
+        self._inputs, self._upload, self._seconds = inputs, upload, seconds
         self._offset = self._saved = upload.offset
+        try:
+            self._file = path.open("r+b", buffering=0)
+        except FileNotFoundError:
+            raise gone(upload) from None
+        try:
+            _lock(self._file)
+            check_offset(inputs.upload(upload.id, upload.owner), upload.offset)  # as it is now that nobody changes it
+            if os.fstat(self._file.fileno()).st_size < upload.offset:  # zeros would take the place of what is missing
+                raise gone(upload)
+            self._file.truncate(upload.offset)  # a crash may have left more, of which nothing is known
+            self._file.seek(upload.offset)
+        except BaseException:
+            self._file.close()
+            raise
 
     def write(self, data: bytes) -> None:
         write_all(self._file, data)
         self._offset += len(data)
-        if self._digest is not None:
-            self._digest.update(data)
 
     def save(self) -> float:
         os.fsync(self._file.fileno())
+        size = self._offset - self._saved
+        expires = self._inputs.advance_upload(self._upload.id, self._saved, size, self._seconds)
         self._saved = self._offset
-        self._blobs.keep_digest(self._upload.id, self._offset, self._digest)
-        return self._inputs.advance_upload(self._upload.id, self._offset, self._seconds)
+        return expires
 
     def discard(self) -> None:
         self._file.truncate(self._saved)
+        self._file.seek(self._saved)
+        self._offset = self._saved
 
     def close(self) -> None:
         self._file.close()
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Lock an upload's file until it is closed; the system lets go of a lock whose process dies.
+
+    Raises:
+        LockedError: Somebody else has it open like this.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise LockedError from None
+
+
+def gone(upload: UploadRow) -> NotFoundError:
+    """Return the error of an upload whose bytes are not there any more."""
+    return NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.")
 
 
 def write_all(file: object, data: bytes) -> None:

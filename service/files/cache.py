@@ -11,6 +11,7 @@ import contextlib
 import errno
 import fcntl
 import hashlib
+import logging
 import os
 import secrets
 import time
@@ -18,7 +19,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import NoSpaceError, StoreError
+from service.errors import DamagedFileError, LostFileError, NoSpaceError
 
 _CHUNK = 1 << 20
 #: Fetches of one file before what comes counts as damaged in the store itself.
@@ -27,6 +28,8 @@ _TRIES = 2
 _HALF_SECONDS = 6 * 3600.0
 #: What the system says when there is no room left.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+_log = logging.getLogger(__name__)
 
 #: Copies an object of the store to a file.
 Fetch = Callable[[Path], None]
@@ -55,14 +58,16 @@ class FileCache:
             path.mkdir(parents=True, exist_ok=True)
 
     def link(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
-        """Give a file one more name, after fetching it where it is not there.
+        """Give a file one more name, after fetching it where it is not there, or damaged on this host's disk.
 
         Args:
             target: on the file system of the cache; nothing is there yet.
             fetch: brings it from the store.
 
         Raises:
-            StoreError: what came is not what was asked for, or `fetch` raised it.
+            LostFileError: the store does not have it.
+            DamagedFileError: what came is not what was asked for.
+            StoreError: `fetch` raised it.
             NoSpaceError: the disk is full, whatever was evicted.
         """
         if self._linked(sha256, target):
@@ -117,10 +122,11 @@ class FileCache:
                     self._keep(half, sha256)
                     return
         except FileNotFoundError as error:
-            raise StoreError(f"The store has lost the file with SHA-256 {sha256}.") from error
+            raise LostFileError.of(sha256) from error
         finally:
             half.unlink(missing_ok=True)
-        raise StoreError(f"The file with SHA-256 {sha256} is damaged in the store: what comes has {found}.")
+        _log.error("the file with SHA-256 %s is damaged in the store: what comes has %s", sha256, found)
+        raise DamagedFileError.of(sha256)
 
     def _fetch(self, half: Path, fetch: Fetch) -> None:
         """Fetch; where the disk is full, evict all that is not in use, and fetch again."""
@@ -156,7 +162,12 @@ class FileCache:
             os.utime(target, ns=(time.time_ns(), target.stat().st_mtime_ns))
         except FileNotFoundError:
             return False
-        return True
+        if file_digest(target) == sha256:
+            return True
+        _log.error("%s is damaged; it is fetched again", path)
+        target.unlink()
+        path.unlink(missing_ok=True)
+        return False
 
     def _path(self, sha256: str) -> Path:
         return self._files / sha256[:2] / sha256

@@ -7,7 +7,10 @@ broken is raised as `StoreError`; a local folder's errors are the system's own.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import logging
 import time
+from collections import OrderedDict
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -16,7 +19,7 @@ from typing import Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from service.errors import StoreError
+from service.errors import DamagedFileError, LostFileError, StoreError
 
 #: Of S3: seconds to connect and for an answer, and tries. What answers 503 (SlowDown) is asked again after waits that
 #: double, by the client itself; together a store that is away is given up after half a minute.
@@ -28,6 +31,13 @@ _PIECE_BYTES, _PIECES = 16 << 20, 3
 #: What S3 takes as a part of an object, at least but for the last one, and at most; and how many of them.
 MIN_PART_BYTES, _MAX_PART_BYTES, _MAX_PARTS = 5 << 20, 5 << 30, 10_000
 _CHUNK = 1 << 20
+#: An unchanged file is hashed again before it is sent after this time, and the most recent ones are remembered.
+_CHECKED_SECONDS, _MAX_CHECKED = 3600.0, 10_000
+
+_log = logging.getLogger(__name__)
+
+#: What an object's file system says of it that changes with its content: size, times, and inode or ETag.
+Stamp = tuple[Any, ...]
 
 
 class TruncatedError(OSError):
@@ -42,6 +52,7 @@ class ObjectStore:
         self._files, self.root = fsspec.core.url_to_fs(url, **_options(url))
         self.local = isinstance(self._files, LocalFileSystem)
         self._s3 = "s3" in self._protocols()
+        self._checked: OrderedDict[str, tuple[Stamp, str, float]] = OrderedDict()
         if self._s3:
             self._files.retries = _TRIES
 
@@ -100,6 +111,74 @@ class ObjectStore:
         with self._told(name):
             self._files.invalidate_cache()
             return bool(self._files.isfile(self._path(name)))
+
+    def stamp(self, name: str) -> Stamp:
+        """Return what changes when an object's content does.
+
+        Raises:
+            FileNotFoundError: There is no such object.
+        """
+        with self._told(name):
+            if self.local:
+                status = Path(self._path(name)).stat()
+                return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
+            self._files.invalidate_cache()
+            entry = self._files.info(self._path(name))
+            return entry["size"], _changed(entry), entry.get("ETag")
+
+    def digest(self, name: str) -> str:
+        """Return the SHA-256 of an object, read as a whole.
+
+        Raises:
+            FileNotFoundError: There is no such object.
+        """
+        with self._told(name), self._files.open(self._path(name), "rb") as file:
+            digest = hashlib.sha256()
+            while data := file.read(_CHUNK):
+                digest.update(data)
+            return digest.hexdigest()
+
+    def check(self, name: str, sha256: str) -> None:
+        """Read an object, and raise where it is not the file that it should be.
+
+        Raises:
+            LostFileError: There is no such object.
+            DamagedFileError: Its SHA-256 is another one.
+        """
+        try:
+            before = self.stamp(name)
+            found = self.digest(name)
+        except FileNotFoundError as error:
+            _log.error("%s in %s is lost", name, self.url)
+            raise LostFileError.of(sha256) from error
+        if found != sha256:
+            _log.error("%s in %s is damaged: its SHA-256 is %s, and should be %s", name, self.url, found, sha256)
+            raise DamagedFileError.of(sha256)
+        self._checked[name] = before, sha256, time.monotonic()
+        if len(self._checked) > _MAX_CHECKED:
+            self._checked.popitem(last=False)
+
+    def is_checked(self, name: str, sha256: str) -> bool:
+        """Return whether an object has passed `check` within the last hour and has not changed since."""
+        known = self._checked.get(name)
+        if known is None or known[1] != sha256 or time.monotonic() - known[2] > _CHECKED_SECONDS:
+            return False
+        try:
+            return known[0] == self.stamp(name)
+        except FileNotFoundError:
+            return False
+
+    def check_once(self, name: str, sha256: str) -> None:
+        """Do as `check`, unless `is_checked`."""
+        if not self.is_checked(name, sha256):
+            self.check(name, sha256)
+
+    def move(self, name: str, new_name: str) -> None:
+        """Give an object another name."""
+        with self._told(name):
+            if self.local:
+                Path(self._path(new_name)).parent.mkdir(parents=True, exist_ok=True)
+            self._files.mv(self._path(name), self._path(new_name))
 
     def remove(self, name: str) -> None:
         """Remove an object, where it is still there."""

@@ -6,21 +6,26 @@ import logging
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from service.errors import ConflictError, NoSpaceError, NotFoundError, StoreError
+from service.errors import (
+    ConflictError,
+    DamagedFileError,
+    LostFileError,
+    NoSpaceError,
+    NotFoundError,
+    StoreError,
+)
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder, Blobs, PartWriter, write_all
+from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, gone, write_all
 from service.files.cache import FileCache, file_digest
 from service.files.objects import ObjectStore
 from service.settings import ServiceSettings
 from service.store.inputs import Inputs
-from service.store.tables import BlobRow, UploadRow
+from service.store.tables import BlobRow, UploadPartRow, UploadRow
 
-#: Folders of the store; all others are those of jobs.
-BLOBS, UPLOADS = "blobs", "uploads"
 #: Objects that no row refers to are removed at this age: a younger one's row may still be on its way.
 _ORPHAN_SECONDS = 6 * 3600.0
 #: The store is looked through for these so often.
@@ -45,8 +50,8 @@ class StoredBlobs(Blobs):
     """Inputs as objects of the store."""
 
     def __init__(self, settings: ServiceSettings, inputs: Inputs, objects: ObjectStore) -> None:
-        super().__init__(settings.folder, inputs, settings.min_free_bytes)
-        self._objects, self._cache = objects, open_cache(settings)
+        super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
+        self._cache = open_cache(settings)
         self._before = settings.folder / "blobs"  # of a service whose files were in a local folder
         self._looked_at = float("-inf")
 
@@ -58,10 +63,18 @@ class StoredBlobs(Blobs):
             self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
             super().ensure_room(size)
 
-    def keep(self, path: Path, sha256: str, size: int) -> None:
+    def keep(self, path: Path) -> str:
         """Put a received file into the store, unless its content is there, and into the cache."""
-        self._put(path, sha256, size, [])
+        sha256 = file_digest(path)
+        location = self._known(sha256)
+        if location is not None:
+            self._heal(location, sha256, path)
+        else:
+            location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+            self.objects.put(path, f"{BLOBS}/{location}")
+            self._register(sha256, location, path.stat().st_size)
         self._cache.adopt(path, sha256)
+        return sha256
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Links to this host's copies, in `folder`; what is not in the cache is fetched."""
@@ -70,38 +83,29 @@ class StoredBlobs(Blobs):
         found = {}
         for sha256, row in rows.items():
             found[sha256] = place / sha256
-            self._cache.link(sha256, row.size, found[sha256], partial(self._objects.get, f"{BLOBS}/{row.location}"))
+            self._cache.link(sha256, row.size, found[sha256], partial(self.objects.get, f"{BLOBS}/{row.location}"))
         return found
 
-    def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
-        """From the store: who downloads a part needs no copy of the whole on this host."""
-        return self._objects.read(f"{BLOBS}/{row.location}", start, stop)
-
-    def _put(self, path: Path, sha256: str, size: int, parts: list[str]) -> None:
-        """Make a file a blob of the store.
-
-        Args:
-            path: the file.
-            parts: objects that are it, one behind the other; empty to send it.
-        """
+    def _known(self, sha256: str) -> str | None:
+        """Return the location of a blob, which stays for a while from now on; None where there is none."""
         try:
-            self._inputs.hold([sha256])
-            return
+            return self._inputs.hold([sha256])[sha256].location
         except NotFoundError:
-            location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
-        self._send(path, f"{BLOBS}/{location}", parts)
-        if self._inputs.add_blob(sha256, location, size) != location:
-            self._objects.remove(f"{BLOBS}/{location}")
+            return None
 
-    def _send(self, path: Path, name: str, parts: list[str]) -> None:
-        """Join the parts, or, where there are none or the store cannot, send the file."""
-        if parts:
-            try:
-                self._objects.join(parts, name)
-                return
-            except StoreError as error:
-                _log.warning("the store does not join parts, the whole is sent: %s", error.__cause__)
-        self._objects.put(path, name)
+    def _register(self, sha256: str, location: str, size: int) -> str:
+        """Make an object a blob, and return the blob's location; an object whose content is there already goes."""
+        known = self._inputs.add_blob(sha256, location, size)
+        if known != location:
+            self.objects.remove(f"{BLOBS}/{location}")
+        return known
+
+    def _heal(self, location: str, sha256: str, path: Path) -> None:
+        """Put a file in the place of its blob where that is lost or damaged."""
+        try:
+            self.objects.check_once(f"{BLOBS}/{location}", sha256)
+        except (LostFileError, DamagedFileError):
+            self.objects.put(path, f"{BLOBS}/{location}")
 
     # --- uploads ---------------------------------------------------------------------------------------------------
 
@@ -110,76 +114,106 @@ class StoredBlobs(Blobs):
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Write objects of the store, one at each `save`: any API process can go on behind them."""
-        return _ObjectWriter(self.incoming, self._objects, self._inputs, upload, seconds)
+        return _ObjectWriter(self.incoming, self.objects, self._inputs, upload, seconds)
 
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Join its parts in the store; they are fetched once, for their digest and for the cache."""
+        """Join its parts in the store where that can, and fetch the whole once, for its digest and for the cache."""
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
-            parts = self._inputs.parts(upload.id)
-            locations = [part.location for part in parts]
             try:
-                self._gather(locations, whole, upload)
-                sha256 = file_digest(whole)
-                can_join = self._objects.can_join([part.size for part in parts])
-                self._put(whole, sha256, upload.length, locations if can_join else [])
-            except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
+                sha256 = self._finish(upload, whole)
+            except FileNotFoundError:  # unless another request has just finished it
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
-                    raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.") from None
+                    raise gone(upload) from None
                 return known
             self._inputs.finish_upload(upload.id, sha256, seconds)
-            self._cache.adopt(whole, sha256)
         finally:
             whole.unlink(missing_ok=True)
         self.forget_upload(upload.id)
         return sha256
 
-    def _gather(self, locations: list[str], whole: Path, upload: UploadRow) -> None:
-        """Fetch the parts of an upload, one behind the other."""
+    def _finish(self, upload: UploadRow, whole: Path) -> str:
+        """Make an upload's bytes a blob and a file of the cache; return their SHA-256.
+
+        Args:
+            upload: Row of the upload.
+            whole: Place for all bytes meanwhile.
+
+        Raises:
+            FileNotFoundError: A part is missing.
+        """
+        parts = self._inputs.parts(upload.id)
+        if sum(part.size for part in parts) != upload.length:
+            raise FileNotFoundError(upload.id)
         self.ensure_room(upload.length)
+        joined = self._join(upload.id, parts)
+        if joined is None:
+            self._gather([part.location for part in parts], whole)
+            return self.keep(whole)
+        # what is hashed is the very object that becomes the blob
+        self.objects.get(f"{BLOBS}/{joined}", whole)
+        sha256 = file_digest(whole)
+        location = self._register(sha256, joined, upload.length)
+        if location != joined:
+            self._heal(location, sha256, whole)
+        self._cache.adopt(whole, sha256)
+        return sha256
+
+    def _join(self, upload_id: str, parts: Sequence[UploadPartRow]) -> str | None:
+        """Join parts to an object among the blobs, and return its location; None where the store cannot."""
+        if not self.objects.can_join([part.size for part in parts]):
+            return None
+        location = f"joined/{upload_id}-{secrets.token_hex(4)}"
+        try:
+            self.objects.join([part.location for part in parts], f"{BLOBS}/{location}")
+        except StoreError as error:
+            _log.warning("the store does not join parts, the whole is sent: %s", error.__cause__)
+            return None
+        return location
+
+    def _gather(self, locations: list[str], whole: Path) -> None:
+        """Fetch the parts of an upload, one behind the other."""
         piece = whole.with_suffix(".piece")
         try:
             with whole.open("wb", buffering=0) as file:
                 for location in locations:
-                    self._objects.get(location, piece)
+                    self.objects.get(location, piece)
                     with piece.open("rb") as part:
                         while data := part.read(1 << 20):
                             write_all(file, data)
         finally:
             piece.unlink(missing_ok=True)
-        if whole.stat().st_size != upload.length:
-            raise NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.")
 
     def forget_upload(self, upload_id: str) -> None:
         """Remove its objects."""
-        self._objects.remove_below(f"{UPLOADS}/{upload_id}")
+        self.objects.remove_below(f"{UPLOADS}/{upload_id}")
 
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
     def _collect_blobs(self) -> int:
         removed = 0
         for location in self._inputs.collect():
-            self._objects.remove(f"{BLOBS}/{location}")
+            self.objects.remove(f"{BLOBS}/{location}")
             removed += 1
         self._cache.evict()
         if time.monotonic() - self._looked_at > _LOOK_SECONDS:
             self._looked_at = time.monotonic()
             self._take_over()
-            removed += self._collect_orphans() + self._objects.abort_old_parts(_ORPHAN_SECONDS)
+            removed += self._collect_orphans() + self.objects.abort_old_parts(_ORPHAN_SECONDS)
         return removed
 
     def _collect_orphans(self) -> int:
         """Remove objects that a process which died had put, without their rows."""
         before = time.time() - _ORPHAN_SECONDS
-        old = [name for name, changed in self._objects.below(BLOBS).items() if changed < before]
+        old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
         orphans = [name for name in old if name not in known]
-        parts = [name for name, changed in self._objects.below(UPLOADS).items() if changed < before]
+        parts = [name for name, changed in self.objects.below(UPLOADS).items() if changed < before]
         uploads = self._inputs.known_uploads(sorted({name.split("/")[1] for name in parts}))
         orphans += [name for name in parts if name.split("/")[1] not in uploads]
         for name in orphans:
-            self._objects.remove(name)
+            self.objects.remove(name)
         return len(orphans)
 
     def _take_over(self) -> None:
@@ -188,7 +222,7 @@ class StoredBlobs(Blobs):
         for path in self._before.glob("*/*"):
             location = f"{path.parent.name}/{path.name}"
             if location in known:
-                self._objects.put(path, f"{BLOBS}/{location}")
+                self.objects.put(path, f"{BLOBS}/{location}")
             path.unlink()
 
 
@@ -211,7 +245,7 @@ class _ObjectWriter:
         location = f"{UPLOADS}/{self._upload.id}/{self._start:016d}-{secrets.token_hex(6)}"
         self._objects.put(self._path, location)
         try:
-            expires = self._inputs.add_part(self._upload.id, self._start, self._size, location, self._seconds)
+            expires = self._inputs.advance_upload(self._upload.id, self._start, self._size, self._seconds, location)
         except (ConflictError, NotFoundError):
             self._objects.remove(location)
             raise

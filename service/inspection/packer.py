@@ -91,7 +91,7 @@ class Packer:
         """The job's inputs, and the result in the scene's place."""
         rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
         staged = stage(folder, job.inputs, self._blobs.bring(rows, folder))
-        self._artifacts.fetch(result.location, folder / RESULT)
+        self._artifacts.fetch(result.location, folder / RESULT, result.sha256)
         return replace(staged, scene=Path(RESULT))
 
     def _publish(self, folder: Path, job: JobRow, result: ArtifactRow, name: str, loss: dict[str, Any]) -> None:

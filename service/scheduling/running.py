@@ -17,12 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from service.errors import LeaseLostError
+from service.errors import DamagedFileError, LeaseLostError, LostFileError, ServiceError
 from service.files.artifacts import Artifacts
-from service.files.blobs import Blobs
+from service.files.blobs import BLOBS, Blobs
 from service.files.names import CHECKPOINT, RESULT
 from service.files.staging import Staged, layout, stage
-from service.files.stored_blobs import BLOBS
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.attempt_process import Task
 from service.scheduling.backfill import Holding
@@ -130,7 +129,11 @@ class RunningAttempt:
             _log.warning("the lease was lost: another dispatcher has the job", extra=self._log_fields)
         except Exception as error:
             _log.exception("the attempt broke", extra=self._log_fields)
-            told = {"code": "internal", "message": f"{type(error).__name__}: {error}"}
+            told = (
+                {"code": error.code, "message": str(error)}
+                if isinstance(error, ServiceError)
+                else {"code": "internal", "message": f"{type(error).__name__}: {error}"}
+            )
             with contextlib.suppress(Exception):
                 self._fail(OUTAGE if is_outage(error) else told, permanent=False)
         finally:
@@ -197,7 +200,10 @@ class RunningAttempt:
         """Lay the job's files out in the attempt's folder."""
         if checkpoint is not None:
             target = self._folder / "out" / f"{Path(RESULT).stem}.checkpoint.safetensors"
-            self._artifacts.fetch(checkpoint.location, target)
+            try:
+                self._artifacts.fetch(checkpoint.location, target, checkpoint.sha256)
+            except (LostFileError, DamagedFileError) as error:
+                _log.warning("the checkpoint cannot be used: %s The job starts again.", error, extra=self._log_fields)
         return stage(self._folder, self.lease.job.inputs, self._blobs.bring(self._input_rows(), self._folder))
 
     def _input_rows(self) -> dict[str, BlobRow]:

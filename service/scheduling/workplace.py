@@ -21,8 +21,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from service.errors import StoreError
+from service.errors import DamagedFileError, LostFileError, StoreError
 from service.files.artifacts import Artifacts
+from service.files.cache import file_digest
 from service.files.names import CHECKPOINT, RESULT
 from service.files.objects import ObjectStore
 from service.files.staging import stage
@@ -166,8 +167,11 @@ class RankFolder:
 
         blobs = {file.sha256: link(file, kept / file.sha256) for file in workplace.files}
         stage(self.folder, workplace.inputs, blobs)
-        for name, file in workplace.weights.items():
-            link(file, weights / name)
+        try:
+            for name, file in workplace.weights.items():
+                link(file, weights / name)
+        except (LostFileError, DamagedFileError) as error:  # nothing that the job's user has sent, or could send again
+            raise StoreError("The network's weights in the store of files cannot be used.") from error
         if workplace.weights:
             os.environ["SGSST_CACHE"] = str(weights)
         if workplace.checkpoint is not None and rank == 0:
@@ -269,9 +273,13 @@ def _locked(path: Path) -> Any:
 
 
 def _fetch_checkpoint(objects: ObjectStore, checkpoint: StoredFile, target: Path) -> None:
-    """Bring a checkpoint; one that has been replaced meanwhile is no longer there, and the job begins anew."""
+    """Bring a checkpoint; without one that was replaced meanwhile, or is damaged, the job starts again."""
     try:
         objects.get(checkpoint.name, target)
     except FileNotFoundError:
         target.unlink(missing_ok=True)
-        _log.warning("the checkpoint %s is gone: the job begins anew", checkpoint.name)
+        _log.warning("the checkpoint %s is gone: the job starts again", checkpoint.name)
+        return
+    if file_digest(target) != checkpoint.sha256:
+        target.unlink()
+        _log.error("the checkpoint %s is damaged: the job starts again", checkpoint.name)

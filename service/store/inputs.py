@@ -30,6 +30,12 @@ _UPLOADS = select(Base.metadata.tables["uploads"]).where(
 _INSPECTION = select(Base.metadata.tables["inspections"].c.result).where(InspectionRow.key == bindparam("key"))
 
 
+def check_offset(upload: UploadRow, offset: int) -> None:
+    """Raise ConflictError where an upload's next byte is another one."""
+    if upload.offset != offset:
+        raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {upload.offset}.", offset=upload.offset)
+
+
 class Inputs:
     """The input part of the store."""
 
@@ -151,30 +157,29 @@ class Inputs:
                 found |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, wanted)}
         return found
 
-    def advance_upload(self, upload_id: str, offset: int, seconds: float) -> float:
-        """Record how much of an upload is on the disk for good; returns when it expires now."""
-        expires = self._database.clock() + seconds
-        with self._database.writing() as session:
-            row = session.get(UploadRow, upload_id, with_for_update=True)
-            if row is None:
-                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
-            row.offset, row.expires_at = offset, expires
-        return expires
+    def advance_upload(
+        self, upload_id: str, start: int, size: int, seconds: float, location: str | None = None
+    ) -> float:
+        """Record bytes that were saved behind those that an upload had; return when it expires now.
 
-    def add_part(self, upload_id: str, start: int, size: int, location: str, seconds: float) -> float:
-        """Record bytes of an upload that are in the store of files; returns when the upload expires now.
+        Args:
+            upload_id: Id of the upload.
+            start: Offset of the first of these bytes.
+            size: Number of bytes.
+            seconds: Time until the upload expires.
+            location: Name of the object that holds them; None for the upload's own local file.
 
         Raises:
-            ConflictError: the next byte is another one by now: somebody else was faster.
+            ConflictError: Another request has saved bytes there meanwhile.
         """
         expires = self._database.clock() + seconds
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None:
                 raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
-            if row.offset != start:
-                raise ConflictError(f"Upload-Offset is {start}, but the next byte is {row.offset}.", offset=row.offset)
-            session.add(UploadPartRow(upload_id=upload_id, start=start, size=size, location=location))
+            check_offset(row, start)
+            if location is not None:
+                session.add(UploadPartRow(upload_id=upload_id, start=start, size=size, location=location))
             row.offset, row.expires_at = start + size, expires
         return expires
 

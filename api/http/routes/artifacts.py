@@ -14,9 +14,26 @@ from fastapi.responses import StreamingResponse
 from api.http.context import CallerDep, Context, ContextDep
 from api.http.documentation import Responses, invalid, links, problems
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import JOB_ID, ArtifactList, artifact_view
-from api.http.sending import NO_SUCH_RANGE, IfNoneMatch, IfRange, RangeHeader, SentFile, file_answers, send_file
-from service.errors import BusyError, NoSpaceError, NotFoundError, RefusedInputError, StoreError
+from api.http.schemas import JOB_ID, SHA256, ArtifactList, artifact_view
+from api.http.sending import (
+    JUST_REMOVED,
+    NO_SUCH_RANGE,
+    IfNoneMatch,
+    IfRange,
+    RangeHeader,
+    SentFile,
+    file_answers,
+    send_file,
+)
+from service.errors import (
+    BusyError,
+    DamagedFileError,
+    LostFileError,
+    NoSpaceError,
+    NotFoundError,
+    RefusedInputError,
+    StoreError,
+)
 from service.files.artifacts import media_type
 from service.files.names import RESULT
 from service.store.tables import ArtifactRow, JobRow
@@ -79,6 +96,8 @@ _ANSWERS: Responses = {
         BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10),
         NoSpaceError("The service's disk is too full to take this in. Try again later."),
         StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
+        LostFileError.of(SHA256),
+        DamagedFileError.of(SHA256),
     ),
 }
 
@@ -123,6 +142,7 @@ async def get_artifact(
         kind=kind,
         inline=kind.startswith(_INLINE),
         policy=_SANDBOX if kind.startswith("text/html") else None,
+        check=partial(_check, context, row),
         read=partial(context.artifacts.read, row.location),
     )
     return await send_file(request, file, range_, if_range, if_none_match)
@@ -138,6 +158,22 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | 
     if row is None:
         raise NotFoundError(f"Job {job.id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")
     return row
+
+
+def _check(context: Context, row: ArtifactRow) -> None:
+    """Prove that a result is what its row says.
+
+    Raises:
+        LostFileError, DamagedFileError: It is not.
+        NotFoundError: Another file has just taken its name, or its job was removed.
+    """
+    try:
+        context.artifacts.check(row.location, row.sha256)
+    except LostFileError:
+        now = context.store.jobs.artifact(row.job_id, row.name)
+        if now is None or now.location != row.location:
+            raise JUST_REMOVED from None
+        raise
 
 
 def _file_name(job_name: str, name: str) -> str:

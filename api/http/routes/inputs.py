@@ -14,9 +14,19 @@ from fastapi.responses import StreamingResponse
 from api.http.context import Caller, CallerDep, Context, ContextDep
 from api.http.documentation import Responses, links, problems
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import JOB_ID, InputList, input_views
-from api.http.sending import NO_SUCH_RANGE, IfNoneMatch, IfRange, RangeHeader, SentFile, file_answers, send_file
-from service.errors import NotFoundError, StoreError
+from api.http.schemas import JOB_ID, SHA256, InputList, input_views
+from api.http.sending import (
+    JUST_REMOVED,
+    NO_SUCH_RANGE,
+    IfNoneMatch,
+    IfRange,
+    RangeHeader,
+    SentFile,
+    file_answers,
+    send_file,
+)
+from service.errors import DamagedFileError, LostFileError, NotFoundError, StoreError
+from service.files.blobs import BLOBS
 from service.store.states import JobStatus
 from service.store.tables import BlobRow
 
@@ -47,6 +57,8 @@ _ANSWERS: Responses = {
         NotFoundError(f"Job {JOB_ID} has no input 'style:1' (any more). Its list of inputs has all there are."),
         NO_SUCH_RANGE,
         StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
+        LostFileError.of(SHA256),
+        DamagedFileError.of(SHA256),
     ),
 }
 
@@ -97,9 +109,25 @@ async def get_input(
         kind=_KINDS.get(PurePosixPath(entry["name"]).suffix.lower(), "application/octet-stream"),
         inline=False,
         policy=_POLICY,
+        check=partial(_check, context, row),
         read=partial(context.blobs.read, row),
     )
     return await send_file(request, file, range_, if_range, if_none_match)
+
+
+def _check(context: Context, row: BlobRow) -> None:
+    """Prove that an input is what its row says.
+
+    Raises:
+        LostFileError, DamagedFileError: It is not.
+        NotFoundError: It has just been removed, with its job.
+    """
+    try:
+        context.blobs.objects.check_once(f"{BLOBS}/{row.location}", row.sha256)
+    except LostFileError:
+        if not context.store.inputs.blobs([row.sha256]):
+            raise JUST_REMOVED from None
+        raise
 
 
 def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tuple[dict[str, Any], BlobRow]:

@@ -13,12 +13,13 @@ from fastapi import APIRouter, Header, Path, Request, Response
 from api.http.context import CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError, body_blocks
-from api.http.receiving import ALGORITHMS, ChecksumError, LockedError, append_body, only_writer, parse_checksum
+from api.http.receiving import ALGORITHMS, ChecksumError, append_body, parse_checksum
 from api.http.routes.jobs import IdempotencyHeader
 from api.http.schemas import UPLOAD_ID, UploadView, upload_view
 from service.errors import (
     ConflictError,
     IdempotencyError,
+    LockedError,
     NoSpaceError,
     NotFoundError,
     QuotaError,
@@ -27,6 +28,7 @@ from service.errors import (
     TooLargeError,
 )
 from service.files.staging import clean_name
+from service.store.inputs import check_offset
 from service.store.tables import UploadRow
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
@@ -165,7 +167,8 @@ def create_upload(
     row = context.store.inputs.create_upload(
         caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
     )
-    context.blobs.begin_upload(row.id)
+    if row.sha256 is None:  # a repeated request may name an upload that has been finished since
+        context.blobs.begin_upload(row.id)
     sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
 
@@ -239,7 +242,7 @@ _PATCH_BODY = {
             TooLargeError("More bytes come than the 42,301 of Upload-Length.", limit=42_301),
             MediaTypeError("The Content-Type must be application/offset+octet-stream."),
             invalid("header.Upload-Offset", "Field required"),
-            LockedError("Another request is writing to this upload. Ask for its offset, and go on from there."),
+            LockedError(),
             ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again."),
             NoSpaceError("The service's disk is too full to take this in. Try again later."),
             StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
@@ -273,18 +276,15 @@ async def append_upload(
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
         raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
-    with only_writer(upload_id):
-        row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
-        if offset != row.offset:
-            raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {row.offset}.", offset=row.offset)
-        expires = row.expires_at
-        if row.sha256 is None and row.offset == row.length:  # the service died before it could tell
-            await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
-        elif row.sha256 is None:
-            expires = await append_body(request, context, row, wanted)
-        else:
-            async for _ in body_blocks(request, context.settings):
-                raise TooLargeError(f"More bytes come than the {row.length:,} of Upload-Length.", limit=row.length)
+    check_offset(row, offset)
+    expires = row.expires_at
+    if row.sha256 is None and row.offset == row.length:  # the service died before it could tell
+        await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
+    elif row.sha256 is None:
+        expires = await append_body(request, context, row, wanted)
+    else:
+        async for _ in body_blocks(request, context.settings):
+            raise TooLargeError(f"More bytes come than the {row.length:,} of Upload-Length.", limit=row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
         status_code=204,

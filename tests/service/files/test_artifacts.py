@@ -23,7 +23,7 @@ def test_a_file_comes_back_whole_and_in_parts(artifacts: Artifacts, tmp_path: Pa
     assert put.size == source.stat().st_size
     assert b"".join(artifacts.read(put.location, 0, put.size)) == source.read_bytes()
     assert b"".join(artifacts.read(put.location, 255, 258)) == b"\xff\x00\x01"
-    artifacts.fetch(put.location, tmp_path / "back")
+    artifacts.fetch(put.location, tmp_path / "back", put.sha256)
     assert (tmp_path / "back").read_bytes() == source.read_bytes()
     with pytest.raises(OSError, match="shorter"):
         list(artifacts.read(put.location, 0, put.size + 1))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import NoSpaceError, StoreError
+from service.errors import DamagedFileError, LostFileError, NoSpaceError
 from service.files import cache as cache_module
 from service.files.cache import FileCache
 
@@ -86,7 +86,7 @@ def test_what_is_damaged_on_the_way_is_fetched_again(cache: FileCache, tmp_path:
 
 def test_what_is_damaged_in_the_store_is_nobodys_file(cache: FileCache, tmp_path: Path) -> None:
     _, sha256 = content(1)
-    with pytest.raises(StoreError, match="damaged in the store"):
+    with pytest.raises(DamagedFileError):
         cache.link(sha256, 1000, tmp_path / "a", Source(b"another"))
     assert not (tmp_path / "a").exists()
     assert files(tmp_path) == set()
@@ -97,7 +97,7 @@ def test_what_the_store_has_lost_is_its_error(cache: FileCache, tmp_path: Path) 
     def fetch(target: Path) -> None:
         raise FileNotFoundError(target)
 
-    with pytest.raises(StoreError, match="has lost"):
+    with pytest.raises(LostFileError):
         cache.link(content(1)[1], 1000, tmp_path / "a", fetch)
 
 

@@ -49,9 +49,9 @@ def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) ->
     upload_id, content = where.rsplit("/", 1)[1], path.read_bytes()
     part = blobs.upload_path(upload_id)
     part.write_bytes(content)
-    store.inputs.advance_upload(upload_id, len(content), 3600)
+    store.inputs.advance_upload(upload_id, len(content) - 1, 1, 3600)
     if linked:
-        blobs.keep(part, hashlib.sha256(content).hexdigest(), len(content), leave=True)
+        blobs.keep(part, leave=True)
     store.close()
 
 

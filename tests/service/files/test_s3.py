@@ -65,7 +65,7 @@ def test_what_is_put_is_read_and_fetched(artifacts: Artifacts, tmp_path: Path) -
     assert b"".join(artifacts.read(put.location, 0, SIZE)) == content
     assert b"".join(artifacts.read(put.location, SIZE - 5, SIZE)) == content[-5:]
     assert b"".join(artifacts.read(put.location, 5_000_000, 5_300_000)) == content[5_000_000:5_300_000]
-    artifacts.fetch(put.location, tmp_path / "fetched")
+    artifacts.fetch(put.location, tmp_path / "fetched", put.sha256)
     assert (tmp_path / "fetched").read_bytes() == content
     with pytest.raises(OSError, match="shorter"):
         list(artifacts.read(put.location, 0, SIZE + 1))

@@ -53,9 +53,8 @@ class Fleet:
         """Receive a file."""
         receiver = Receiver(host.incoming / os.urandom(4).hex(), len(data), lambda size: None)
         receiver.write(data)
-        sha256 = receiver.close()
-        host.keep(receiver.path, sha256, len(data))
-        return sha256
+        receiver.close()
+        return host.keep(receiver.path)
 
     def read(self, host: StoredBlobs, sha256: str) -> bytes:
         with host.lent(self.store.inputs.blobs([sha256])) as paths:
@@ -216,8 +215,7 @@ def test_a_half_upload_is_collected(fleet: Fleet) -> None:
 def test_what_a_local_folder_held_moves_into_the_store(fleet: Fleet) -> None:
     folder = BlobFolder(fleet.folder / "one", fleet.store.inputs, 0)
     data = b"taken in before"
-    sha256 = hashlib.sha256(data).hexdigest()
-    folder.keep(_file(fleet.folder, data), sha256, len(data))
+    sha256 = folder.keep(_file(fleet.folder, data))
     fleet.host("one").collect()
     assert fleet.read(fleet.host("two"), sha256) == data
     assert not [path for path in (fleet.folder / "one" / "blobs").rglob("*") if path.is_file()]

@@ -31,8 +31,8 @@ def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, An
 
     async def ask() -> dict[str, Any]:
         blobs = BlobFolder(settings.folder, store.inputs, 0)
-        for role, path in files.items():
-            blobs.keep(path, digests[role], path.stat().st_size, leave=True)
+        for path in files.values():
+            blobs.keep(path, leave=True)
         inspector = Inspector(settings, store, blobs)
         try:
             rows = store.inputs.blobs(sorted(digests.values()))

@@ -19,7 +19,7 @@ import psutil
 import pytest
 from safetensors.numpy import save_file
 
-from service.errors import StoreError
+from service.errors import LostFileError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
 from service.files.names import CHECKPOINT
@@ -153,8 +153,9 @@ def test_what_a_machine_lacks_is_the_machines_fault(
     s3: FaultyS3, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone = replace(job, files=(*job.files[:2], StoredFile("blobs/none", "e" * 64, 3)))
-    with pytest.raises(StoreError, match="has lost"):
+    with pytest.raises(LostFileError) as lost:
         gone.open(1, Heard())
+    assert pickle.loads(pickle.dumps(lost.value)).code == "file-lost", "it travels from rank to dispatcher"
     s3.fail("reset", 10**6)
     with pytest.raises(StoreError, match="does not answer") as raised:
         job.open(1, Heard())

@@ -1,0 +1,174 @@
+"""Two API processes on one data folder: whatever the order in which they get bytes, no file has a wrong name."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from tests.api.service import Service
+
+TUS = {"Tus-Resumable": "1.0.0"}
+STREAM = "application/offset+octet-stream"
+
+
+@dataclass
+class Pair:
+    """Two API processes, and the database that they share."""
+
+    services: tuple[Service, Service]
+    store: Store
+
+    @property
+    def data(self) -> Path:
+        return self.services[0].data
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
+    data = tmp_path_factory.mktemp("pair") / "data"
+    with Service(data, alone=True) as one, Service(data, alone=True) as two:
+        store = open_store(ServiceSettings(data=data))
+        yield Pair((one, two), store)
+        store.close()
+
+
+def begin(client: httpx.Client, length: int) -> str:
+    answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(length)})
+    assert answer.status_code == 201, answer.text
+    return str(answer.headers["location"])
+
+
+class Patch:
+    """A PATCH whose bytes are sent a few at a time."""
+
+    def __init__(self, service: Service, where: str, offset: int, content: bytes, *, expect: bool = False) -> None:
+        self.content, self.sent = content, 0
+        address = urlsplit(service.url)
+        self.socket = socket.create_connection((address.hostname, address.port), timeout=60)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        head = [
+            f"PATCH {where} HTTP/1.1",
+            f"Host: {address.netloc}",
+            "Tus-Resumable: 1.0.0",
+            f"Upload-Offset: {offset}",
+            f"Content-Type: {STREAM}",
+            f"Content-Length: {len(content)}",
+            "Connection: close",
+            *(["Expect: 100-continue"] if expect else []),
+        ]
+        self.socket.sendall("\r\n".join([*head, "", ""]).encode())
+        if expect:
+            assert b" 100 " in self.socket.recv(100), "it is this one's turn"
+
+    @property
+    def done(self) -> bool:
+        return self.sent == len(self.content)
+
+    def send(self, count: int) -> None:
+        """Send some more; a service that has refused the request may have closed the connection."""
+        part = self.content[self.sent : self.sent + count]
+        try:
+            self.socket.sendall(part)
+        except OSError:
+            self.sent = len(self.content)
+            return
+        self.sent += len(part)
+
+    def status(self) -> int:
+        """The answer's, after the last byte; 0 where the connection was closed without one."""
+        answer = b""
+        try:
+            while part := self.socket.recv(4096):
+                answer += part
+        except OSError:
+            pass
+        self.socket.close()
+        return int(answer.split(b" ", 2)[1]) if answer else 0
+
+    def cut_off(self) -> None:
+        self.socket.close()
+
+
+def interleave(pair: Pair, clients: tuple[httpx.Client, httpx.Client], order: random.Random) -> set[int]:
+    """One upload that several requests write to at once, in both processes; returns the statuses of the answers."""
+    length = order.choice([1, 7, 64, 1000, 300_000])
+    where = begin(clients[0], length)
+    offset, statuses = 0, set()
+    for turn in range(20):
+        writers = [
+            Patch(
+                pair.services[order.randrange(2)],
+                where,
+                offset,
+                bytes([65 + 8 * turn % 80 + number]) * (length - offset),
+            )
+            for number in range(order.choice([2, 2, 3]))
+        ]
+        cut = {writer for writer in writers if order.random() < 0.3}
+        while waiting := [writer for writer in writers if not writer.done and not (writer in cut and writer.sent)]:
+            order.choice(waiting).send(order.choice([1, 13, length]))
+        for writer in writers:
+            if writer in cut:
+                writer.cut_off()
+            else:
+                statuses.add(writer.status())
+        shown = clients[order.randrange(2)].get(where).json()
+        assert shown["offset"] >= offset, "what was saved stays"
+        offset = shown["offset"]
+        if shown["complete"]:
+            check_digest(pair, shown["sha256"], length)
+            return statuses
+    raise AssertionError("the upload was not finished in twenty turns")
+
+
+def check_digest(pair: Pair, sha256: str, length: int) -> None:
+    """The file that has a digest's name has that digest."""
+    row = pair.store.inputs.blobs([sha256])[sha256]
+    content = (pair.data / "blobs" / row.location).read_bytes()
+    assert (hashlib.sha256(content).hexdigest(), len(content)) == (sha256, length)
+
+
+def run(pair: Pair, count: int, seed: int) -> None:
+    order, statuses = random.Random(seed), set()
+    with pair.services[0].client() as one, pair.services[1].client() as two:
+        for _ in range(count):
+            statuses |= interleave(pair, (one, two), order)
+    assert statuses <= {0, 204, 404, 409, 423}, statuses
+    for path in (pair.data / "blobs").glob("*/*"):
+        assert path.name.partition("-")[0] == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_file_is_not_written_to_by_two_processes(pair: Pair) -> None:
+    """The second of two writers is refused, or the first one's bytes would get the digest of the second one's."""
+    with pair.services[0].client() as client:
+        where = begin(client, 1000)
+        first = Patch(pair.services[0], where, 0, b"x" * 1000, expect=True)
+        first.send(500)
+        second = Patch(pair.services[1], where, 0, b"y" * 1000)
+        second.send(1000)
+        statuses = {second.status()}
+        first.send(500)
+        statuses.add(first.status())
+        shown = client.get(where).json()
+    assert shown["complete"]
+    check_digest(pair, shown["sha256"], 1000)
+    assert len(statuses & {409, 423}) == 1, statuses
+
+
+def test_interleaved_patches_of_two_processes(pair: Pair) -> None:
+    run(pair, 300, seed=1)
+
+
+@pytest.mark.slow
+def test_ten_thousand_interleaved_patches_of_two_processes(pair: Pair) -> None:
+    run(pair, 10_000, seed=2)
