@@ -54,6 +54,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()
     settings = ServiceSettings()
+    os.umask(0o077)
     try:
         (save if options.what == "save" else restore)(settings, options.folder)
     except (BackupError, ServiceError, OSError, subprocess.CalledProcessError) as error:

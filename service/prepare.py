@@ -15,6 +15,7 @@ from sqlalchemy.exc import OperationalError
 from service.errors import StoreError
 from service.files.objects import ObjectStore
 from service.logs import set_up
+from service.private import keep_private
 from service.settings import ServiceSettings
 from service.store import open_store
 
@@ -25,6 +26,7 @@ def main() -> int:
     """Returns 0 where everything is there at the end."""
     settings = ServiceSettings()
     set_up(settings.log_format)
+    keep_private(settings)
     try:
         open_store(settings, patience=settings.start_seconds).close()
         _make_bucket(ObjectStore(settings.artifacts_url), settings.start_seconds)

@@ -1,9 +1,10 @@
-"""Commands for those who run a service on this machine: `serve` and `keys`. They import no PyTorch."""
+"""Commands for those who run a service on this machine: `serve`, `keys` and `fsck`. They import no PyTorch."""
 
 from __future__ import annotations
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,12 +18,17 @@ if TYPE_CHECKING:
     from service.settings import ServiceSettings
     from service.store import Store
 
+#: Exit codes of `sgsst fsck`, which are added up.
+_FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
+_FSCK_ROLLED_BACK = 32
+
 DataOption = Annotated[Path | None, typer.Option(help="Folder of the service. [SGSST_DATA, else ./sgsst-data]")]
 
 
 def add_to(app: typer.Typer) -> None:
     """Add all commands of this module."""
     app.command()(serve)
+    app.command()(fsck)
     keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
     keys_app.command("create")(create_key)
     keys_app.command("list")(list_keys)
@@ -41,6 +47,45 @@ def serve(
     from api.cli.supervisor import serve as run
 
     run(_service_settings(), error_console.print)
+
+
+def fsck(
+    mend: Annotated[
+        bool,
+        typer.Option(
+            "--mend",
+            help="Move damaged files to the folder 'quarantine', delete rows of files that are gone, and delete files "
+            "that no row has referred to for an hour (six in an object store).",
+        ),
+    ] = False,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare all files of the service with its database, beside a service that runs.
+
+    Exit code: 0 for no finding, else the sum of 4 (files are missing), 8 (damaged), 16 (orphaned) and 32 (the database
+    has gone back in time).
+    """
+    store = _open_store(data)
+    from service.fsck import FileCheck
+
+    check, found = FileCheck(_service_settings(), store), []
+    for finding in check.findings(mend=mend):
+        found.append(finding)
+        if not as_json:
+            needed = f"  needed by {', '.join(finding.holders)}" if finding.holders else ""
+            done = f"  {finding.mended}" if finding.mended else ""
+            out_console.print(f"{finding.kind:<8}  {finding.what:<10}  {finding.name}{needed}{done}")
+    if as_json:
+        out_console.print(json.dumps([asdict(finding) for finding in found]))
+    kinds = [finding.kind for finding in found]
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
+    error_console.print(f"{check.checked} files of the database were read: {counts}")
+    if store.database.rolled_back:
+        error_console.print("The database has gone back in time: orphaned files are kept. Its folder has a note on it.")
+    code = sum(_FSCK_CODES[kind] for kind in set(kinds)) + (_FSCK_ROLLED_BACK if store.database.rolled_back else 0)
+    store.close()
+    raise typer.Exit(code)
 
 
 def create_key(
@@ -106,6 +151,9 @@ def _service_settings() -> ServiceSettings:
 def _open_store(data: Path | None) -> Store:
     if data is not None:
         os.environ["SGSST_DATA"] = str(data.absolute())
+    from service.private import keep_private
     from service.store import open_store
 
-    return open_store(_service_settings())
+    settings = _service_settings()
+    keep_private(settings)
+    return open_store(settings)

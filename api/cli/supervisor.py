@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 
+from service.private import keep_private
 from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
@@ -74,7 +75,7 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
     Raises:
         ServeError: the address is taken, or others could use the service and there is no key.
     """
-    settings.folder.mkdir(parents=True, exist_ok=True)
+    keep_private(settings)
     store = open_store(settings)
     if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
         raise ServeError(

@@ -13,6 +13,7 @@ import uvicorn
 from api.http.app import create_app
 from api.http.connection import Connection
 from service.logs import set_up
+from service.private import keep_private
 from service.settings import ServiceSettings
 
 #: Seconds that open requests have to end at a shutdown.
@@ -28,6 +29,7 @@ def main() -> None:
     _allow_many_connections()
     settings = ServiceSettings()
     set_up(settings.log_format)
+    keep_private(settings)
     # as a socket, of which the family is known: uvicorn takes a bare descriptor for a Unix socket's and leaves Nagle's
     # algorithm on, by which every answer waits 40 ms for the client's acknowledgment of its head
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None

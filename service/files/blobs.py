@@ -184,10 +184,13 @@ class Blobs(ABC):
         """Remove what has arrived of an upload whose row is gone."""
 
     def collect(self) -> int:
-        """Remove blobs that nobody needs, and what crashes have left behind; returns how many files."""
+        """Remove blobs that nobody needs, and what crashes have left behind; return how many files.
+
+        A database that has gone back in time does not know who needs what: then no blob is removed.
+        """
         for upload_id in self._inputs.expire_uploads():
             self.forget_upload(upload_id)
-        removed = self._collect_blobs()
+        removed = 0 if self._inputs.rolled_back else self._collect_blobs()
         before = time.time() - _ORPHAN_SECONDS
         for path in self.incoming.iterdir():
             if _older(path, before):

@@ -148,7 +148,7 @@ class FileCache:
     def _keep(self, source: Path, sha256: str) -> None:
         """Give a file its place. Its time is by its content: the same on every host, and after every fetch."""
         moment = int(sha256[:8], 16)
-        source.chmod(0o440)
+        source.chmod(0o400)
         os.utime(source, ns=(time.time_ns(), moment * 1_000_000_000))
         final = self._path(sha256)
         final.parent.mkdir(exist_ok=True)

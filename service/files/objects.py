@@ -14,7 +14,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
@@ -126,6 +126,13 @@ class ObjectStore:
             entry = self._files.info(self._path(name))
             return entry["size"], _changed(entry), entry.get("ETag")
 
+    def size(self, name: str) -> int:
+        """Return the size of an object in bytes; -1 where there is none."""
+        try:
+            return int(self.stamp(name)[0])
+        except FileNotFoundError:
+            return -1
+
     def digest(self, name: str) -> str:
         """Return the SHA-256 of an object, read as a whole.
 
@@ -145,18 +152,24 @@ class ObjectStore:
             LostFileError: There is no such object.
             DamagedFileError: Its SHA-256 is another one.
         """
+        fault = self.fault(name, sha256)
+        if fault is not None:
+            _log.error("%s in %s, which should have the SHA-256 %s, is %s", name, self.url, sha256, fault)
+            raise LostFileError.of(sha256) if fault == "missing" else DamagedFileError.of(sha256)
+
+    def fault(self, name: str, sha256: str) -> Literal["missing", "damaged"] | None:
+        """Return what is wrong with an object that should have a SHA-256; None for nothing."""
         try:
             before = self.stamp(name)
             found = self.digest(name)
-        except FileNotFoundError as error:
-            _log.error("%s in %s is lost", name, self.url)
-            raise LostFileError.of(sha256) from error
+        except FileNotFoundError:
+            return "missing"
         if found != sha256:
-            _log.error("%s in %s is damaged: its SHA-256 is %s, and should be %s", name, self.url, found, sha256)
-            raise DamagedFileError.of(sha256)
+            return "damaged"
         self._checked[name] = before, sha256, time.monotonic()
         if len(self._checked) > _MAX_CHECKED:
             self._checked.popitem(last=False)
+        return None
 
     def is_checked(self, name: str, sha256: str) -> bool:
         """Return whether an object has passed `check` within the last hour and has not changed since."""
@@ -294,5 +307,8 @@ def _options(url: str) -> dict[str, Any]:
 
 def _changed(entry: dict[str, Any]) -> float:
     """When an object was last changed, by what its file system says of it."""
-    found = entry.get("LastModified") or entry.get("mtime") or entry.get("created")
+    found = entry.get("LastModified") or entry.get("created")
+    if isinstance(found, float):  # a local file: its inode changes with its names, its content's time does not
+        return max(found, float(entry.get("mtime", 0.0)))
+    found = found or entry.get("mtime")
     return found.timestamp() if isinstance(found, datetime) else float(found or 0.0)

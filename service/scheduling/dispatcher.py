@@ -23,6 +23,7 @@ from service.errors import DamagedWeightsError, LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.logs import set_up
+from service.private import keep_private
 from service.scheduling.backfill import Backfill, Holding
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
@@ -264,6 +265,7 @@ def main() -> None:
         die_with_parent()
     settings = ServiceSettings()
     set_up(settings.log_format)
+    keep_private(settings)
     dispatcher = Dispatcher(settings, open_store(settings, patience=settings.start_seconds))
 
     def handle(_number: int, _frame: FrameType | None) -> None:

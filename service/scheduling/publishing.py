@@ -149,5 +149,7 @@ def sweep(store: Store, artifacts: Artifacts, job_id: str, epoch: int) -> None:
     Args:
         epoch: of the job's last lease.
     """
+    if store.database.rolled_back:
+        return
     artifacts.sweep(job_id, epoch, {row.location for row in store.jobs.artifacts(job_id)})
     store.retention.mark_swept(job_id, epoch)

@@ -19,7 +19,9 @@ _PREFIX = "job_"
 
 
 def remove_strays(store: Store, artifacts: Artifacts) -> int:
-    """Remove such files; returns how many."""
+    """Delete stray files, and return how many; a database that has gone back in time cannot tell which these are."""
+    if store.database.rolled_back:
+        return 0
     before = time.time() - _STRAY_SECONDS
     old: dict[str, list[str]] = {}
     for name, changed in artifacts.objects.below("").items():
@@ -28,14 +30,14 @@ def remove_strays(store: Store, artifacts: Artifacts) -> int:
             old.setdefault(job_id, []).append(name)
     removed = 0
     for job_id, names in old.items():
-        for name in _strays(store, job_id, names):
+        for name in strays_of_job(store, job_id, names):
             artifacts.remove(name)
             removed += 1
     return removed
 
 
-def _strays(store: Store, job_id: str, names: list[str]) -> list[str]:
-    """Those of a job's files that nothing refers to, nor will."""
+def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
+    """Return those of a job's files that nothing refers to, nor will."""
     try:
         job = store.jobs.get(job_id, None)
     except NotFoundError:

@@ -28,6 +28,7 @@ from service.files.names import CHECKPOINT, RESULT
 from service.files.objects import ObjectStore
 from service.files.staging import stage
 from service.files.stored_blobs import open_cache
+from service.private import keep_private
 from service.scheduling.outbox import Outbox
 from service.scheduling.publishing import put_patiently
 from service.settings import ServiceSettings
@@ -135,6 +136,7 @@ class RankFolder:
 
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
         settings = node_settings()
+        keep_private(settings)
         above = _ranks_folder(settings)
         above.mkdir(parents=True, exist_ok=True)
         _remove_left(above)

@@ -66,4 +66,5 @@ def open_store(settings: ServiceSettings, clock: Clock = time.time, patience: fl
             _log.warning("the database does not answer yet: %s", type(error.orig).__name__)
             time.sleep(_ASK_AGAIN_SECONDS)
         else:
+            store.database.look_back()
             return store

@@ -19,6 +19,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from service.errors import IdempotencyError
+from service.store.rollback import NEWEST_EVENT, Marker
 from service.store.tables import Base, CounterRow, IdempotencyRow
 
 #: The newest migration; a database that says so needs no look at the migrations themselves.
@@ -69,6 +70,7 @@ class Database:
             event.listen(self.engine, "connect", _set_pragmas)
             event.listen(self.engine, "begin", _begin)
         self._writer = self.engine.execution_options(sgsst_writes=True)
+        self._marker = Marker(Path(self.url.database)) if self.sqlite and self.url.database else None
         # SQLite's writers wait by sleeping and asking again; those of one process need not
         self._writer_lock: AbstractContextManager[Any] = threading.Lock() if self.sqlite else nullcontext()
 
@@ -77,6 +79,9 @@ class Database:
         """A transaction that is committed at the end of the block; on SQLite it is the only writer from the start."""
         with self._writer_lock, Session(self._writer, expire_on_commit=False) as session, session.begin():
             yield session
+            newest = session.scalar(NEWEST_EVENT) if self._marker is not None else None
+        if self._marker is not None and newest is not None:
+            self._marker.reach(newest)
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -101,6 +106,20 @@ class Database:
         with self._upgrading():
             if not self.is_up_to_date():
                 self._migrate()
+
+    def look_back(self) -> None:
+        """Find out whether an SQLite database has gone back in time; `rolled_back` says so from then on."""
+        if self._marker is not None:
+            with self._upgrading():
+                marked = self._marker.read()
+                with self.reading() as session:
+                    newest = session.scalar(NEWEST_EVENT)
+                self._marker.compare(marked, newest or 0)
+
+    @property
+    def rolled_back(self) -> bool:
+        """Whether there may be files that this database should know and does not."""
+        return self._marker is not None and self._marker.note.exists()
 
     def is_up_to_date(self) -> bool:
         """Whether the tables are those of this version, or of a later one."""

@@ -91,6 +91,11 @@ class Inputs:
                 session.delete(row)
             return [row.location for row in rows]
 
+    @property
+    def rolled_back(self) -> bool:
+        """Whether there may be files that the database should know and does not."""
+        return self._database.rolled_back
+
     def locations(self) -> set[str]:
         """All locations that rows refer to."""
         with self._database.reading() as session:

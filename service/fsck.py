@@ -1,0 +1,265 @@
+"""Compare the files of a service with the rows of its database, beside a service that runs, and mend what can be."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from sqlalchemy import delete, exists, select
+
+from service.files.artifacts import Artifacts
+from service.files.blobs import BLOBS, UPLOADS
+from service.files.names import CHECKPOINT
+from service.files.objects import ObjectStore
+from service.files.stored_blobs import open_blobs
+from service.scheduling.strays import strays_of_job
+from service.settings import ServiceSettings
+from service.store import Store
+from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow, UploadRow
+
+#: Rows that are read at a time, and files that are read at the same time.
+_PAGE, _AT_A_TIME = 500, 4
+#: A file without a row is an orphan at this age: a younger one's row may still be on its way. Clocks of object stores
+#: are not this machine's.
+_ORPHAN_SECONDS, _REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
+#: Damaged files are moved to this folder of their store.
+QUARANTINE = "quarantine"
+
+Kind = Literal["missing", "damaged", "orphaned"]
+What = Literal["input", "result", "checkpoint", "upload"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A file that does not agree with the database.
+
+    Attributes:
+        kind: What is wrong with the file.
+        what: What the file is.
+        name: Name of the file in the store of files, or in the data folder.
+        holders: Jobs and uploads that need the file.
+        mended: What was done; empty for nothing.
+    """
+
+    kind: Kind
+    what: What
+    name: str
+    holders: tuple[str, ...] = ()
+    mended: str = ""
+
+
+@dataclass(frozen=True)
+class _File:
+    """A file that a row refers to.
+
+    Attributes:
+        is_current: Tells whether the row still refers to it.
+        forget: Deletes the row, or says why not; returns what was done.
+    """
+
+    what: What
+    objects: ObjectStore
+    name: str
+    fault: Callable[[], Literal["missing", "damaged"] | None]
+    is_current: Callable[[], bool]
+    forget: Callable[[], str]
+    holders: Callable[[], tuple[str, ...]]
+
+
+class FileCheck:
+    """A check of all files that a database and its stores of files have."""
+
+    def __init__(self, settings: ServiceSettings, store: Store) -> None:
+        self._store, self._database = store, store.database
+        self._artifacts = Artifacts(settings.artifacts_url)
+        self._blobs = open_blobs(settings, store.inputs, self._artifacts)
+        self._objects = self._blobs.objects
+        #: Files that have been read so far.
+        self.checked = 0
+
+    def findings(self, *, mend: bool = False) -> Iterator[Finding]:
+        """Yield what is wrong.
+
+        Args:
+            mend: Move damaged files to `QUARANTINE`, delete rows whose files are gone and that nothing else needs, and
+                delete orphans. A database that has gone back in time keeps its orphans.
+        """
+        with ThreadPoolExecutor(_AT_A_TIME) as pool:
+            for files in self._pages():
+                for finding in pool.map(lambda file: self._examine(file, mend=mend), files):
+                    self.checked += 1
+                    if finding is not None:
+                        yield finding
+        yield from self._orphans(mend=mend and not self._database.rolled_back)
+
+    def _examine(self, file: _File, *, mend: bool) -> Finding | None:
+        # twice: a service at work may have replaced or removed it meanwhile, with its row
+        kind = file.fault() and file.is_current() and file.fault()
+        if not kind:
+            return None
+        found = Finding(kind, file.what, file.name, file.holders())
+        if not mend:
+            return found
+        done = ""
+        if kind == "damaged":
+            target = f"{QUARANTINE}/{file.name.replace('/', '_')}-{secrets.token_hex(3)}"
+            file.objects.move(file.name, target)
+            done = f"moved to {target}; "
+        return replace(found, mended=done + file.forget())
+
+    # --- files that rows refer to ----------------------------------------------------------------------------------
+
+    def _pages(self) -> Iterator[Sequence[_File]]:
+        """Yield files in pages, by the order of their rows: a table of any length takes bounded memory."""
+        last = ""
+        while page := self._page_of_blobs(last):
+            last = page[-1].sha256
+            yield [self._input(row) for row in page]
+        place = ("", "")
+        while results := self._page_of_artifacts(place):
+            place = (results[-1].job_id, results[-1].name)
+            yield [self._result(row) for row in results]
+        last = ""
+        while uploads := self._page_of_uploads(last):
+            last = uploads[-1].id
+            yield [file for row in uploads for file in self._parts(row)]
+
+    def _page_of_blobs(self, after: str) -> Sequence[BlobRow]:
+        query = select(BlobRow).where(BlobRow.sha256 > after).order_by(BlobRow.sha256).limit(_PAGE)
+        with self._database.reading() as session:
+            return session.scalars(query).all()
+
+    def _page_of_artifacts(self, after: tuple[str, str]) -> Sequence[ArtifactRow]:
+        job_id, name = after
+        later = (ArtifactRow.job_id > job_id) | ((ArtifactRow.job_id == job_id) & (ArtifactRow.name > name))
+        query = select(ArtifactRow).where(later).order_by(ArtifactRow.job_id, ArtifactRow.name).limit(_PAGE)
+        with self._database.reading() as session:
+            return session.scalars(query).all()
+
+    def _page_of_uploads(self, after: str) -> Sequence[UploadRow]:
+        unfinished = UploadRow.sha256.is_(None) & (UploadRow.offset > 0)
+        query = select(UploadRow).where(UploadRow.id > after, unfinished).order_by(UploadRow.id).limit(_PAGE)
+        with self._database.reading() as session:
+            return session.scalars(query).all()
+
+    def _input(self, row: BlobRow) -> _File:
+        name = f"{BLOBS}/{row.location}"
+
+        def is_current() -> bool:
+            now = self._store.inputs.blobs([row.sha256]).get(row.sha256)
+            return now is not None and now.location == row.location
+
+        def holders() -> tuple[str, ...]:
+            with self._database.reading() as session:
+                query = select(BlobUseRow.holder).where(BlobUseRow.sha256 == row.sha256).order_by(BlobUseRow.holder)
+                return tuple(session.scalars(query))
+
+        def forget() -> str:
+            used = exists().where(BlobUseRow.sha256 == row.sha256)
+            with self._database.writing() as session:
+                gone = session.execute(
+                    delete(BlobRow).where(BlobRow.sha256 == row.sha256, BlobRow.location == row.location, ~used)
+                )
+                return "its row is deleted" if gone.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
+
+        return _File(
+            "input", self._objects, name, lambda: self._objects.fault(name, row.sha256), is_current, forget, holders
+        )
+
+    def _result(self, row: ArtifactRow) -> _File:
+        objects = self._artifacts.objects
+
+        def is_current() -> bool:
+            now = self._store.jobs.artifact(row.job_id, row.name)
+            return now is not None and now.location == row.location
+
+        def forget() -> str:
+            same = (ArtifactRow.job_id == row.job_id) & (ArtifactRow.name == row.name)
+            with self._database.writing() as session:
+                session.execute(delete(ArtifactRow).where(same, ArtifactRow.location == row.location))
+            return "its row is deleted"
+
+        return _File(
+            "checkpoint" if row.name == CHECKPOINT else "result",
+            objects,
+            row.location,
+            lambda: objects.fault(row.location, row.sha256),
+            is_current,
+            forget,
+            lambda: (f"job:{row.job_id}",),
+        )
+
+    def _parts(self, row: UploadRow) -> list[_File]:
+        """Return the files that hold the bytes of an unfinished upload."""
+
+        def is_current() -> bool:
+            with self._database.reading() as session:
+                now = session.get(UploadRow, row.id)
+                return now is not None and now.sha256 is None
+
+        def forget() -> str:
+            self._store.inputs.delete_upload(row.id, row.owner)
+            return "the upload is deleted"
+
+        def part(name: str, size: int) -> _File:
+            return _File(
+                "upload",
+                self._objects,
+                name,
+                lambda: None if self._objects.size(name) >= size else "missing",
+                is_current,
+                forget,
+                lambda: (f"upload:{row.id}",),
+            )
+
+        if self._objects.local:
+            return [part(f"{UPLOADS}/{row.id}.part", row.offset)]
+        return [part(each.location, each.size) for each in self._store.inputs.parts(row.id)]
+
+    # --- files that no row refers to -------------------------------------------------------------------------------
+
+    def _orphans(self, *, mend: bool) -> Iterator[Finding]:
+        for objects, what, name in self._unknown():
+            if mend:
+                objects.remove(name)
+            yield Finding("orphaned", what, name, mended="deleted" if mend else "")
+
+    def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
+        """Yield files that no row refers to, nor will. Files are listed before rows are read."""
+        blobs = self._old(self._objects, BLOBS)
+        known = {f"{BLOBS}/{location}" for location in self._store.inputs.locations()}
+        yield from ((self._objects, "input", name) for name in blobs if name not in known)
+        for name in self._old(self._objects, UPLOADS):
+            if self._is_orphaned_part(name):
+                yield self._objects, "upload", name
+        incoming = ObjectStore(f"file://{self._blobs.incoming}")
+        yield from ((incoming, "upload", name) for name in self._old(incoming, ""))
+        yield from self._unknown_results()
+
+    def _is_orphaned_part(self, name: str) -> bool:
+        upload_id = name.split("/")[1].removesuffix(".part")
+        with self._database.reading() as session:
+            row = session.get(UploadRow, upload_id)
+            if row is None or row.sha256 is not None:
+                return True
+            known = UploadPartRow.location == name
+            return not self._objects.local and session.scalar(select(exists().where(known))) is False
+
+    def _unknown_results(self) -> Iterator[tuple[ObjectStore, What, str]]:
+        objects = self._artifacts.objects
+        jobs: defaultdict[str, list[str]] = defaultdict(list)
+        for name in self._old(objects, ""):
+            job_id = name.partition("/")[0]
+            if job_id.startswith("job_"):
+                jobs[job_id].append(name)
+        for job_id, names in jobs.items():
+            yield from ((objects, "result", name) for name in strays_of_job(self._store, job_id, names))
+
+    def _old(self, objects: ObjectStore, folder: str) -> list[str]:
+        before = time.time() - (_ORPHAN_SECONDS if objects.local else _REMOTE_ORPHAN_SECONDS)
+        return sorted(name for name, changed in objects.below(folder).items() if changed < before)

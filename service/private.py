@@ -1,0 +1,47 @@
+"""Permissions of the service's files: they belong to the user who runs it, and nobody else can read them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+from pathlib import Path
+
+from sqlalchemy.engine import make_url
+
+from service.files.objects import ObjectStore
+from service.settings import ServiceSettings
+
+#: What SQLite puts beside a database.
+_BESIDE = ("", "-wal", "-shm")
+
+_log = logging.getLogger(__name__)
+
+
+def keep_private(settings: ServiceSettings) -> None:
+    """Create the data folder, close it and the database to other users, and let all that this process writes be closed.
+
+    The log names what another user owns and could not be closed.
+    """
+    os.umask(0o077)
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    for path in [settings.folder, *_folder_of_results(settings), *_database_files(settings)]:
+        mode = stat.S_IMODE(path.stat().st_mode)
+        if mode & 0o077:
+            try:
+                path.chmod(mode & 0o700)
+            except PermissionError:
+                _log.warning("%s can be read by other users of this machine, and belongs to another user", path)
+
+
+def _folder_of_results(settings: ServiceSettings) -> list[Path]:
+    store = ObjectStore(settings.artifacts_url)
+    folder = Path(store.root)
+    return [folder] if store.local and folder.is_dir() else []
+
+
+def _database_files(settings: ServiceSettings) -> list[Path]:
+    url = make_url(settings.database_url)
+    if url.get_backend_name() != "sqlite" or not url.database:
+        return []
+    return [path for ending in _BESIDE if (path := Path(url.database + ending)).exists()]

@@ -1,0 +1,209 @@
+"""`sgsst fsck`: every file that is missing, damaged or orphaned is found, and mended where that is possible."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.cli.main import main
+from service import fsck
+from service.errors import LostFileError
+from service.files.artifacts import Artifacts
+from service.files.names import CHECKPOINT
+from service.files.objects import ObjectStore
+from service.files.stored_blobs import open_blobs
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.leases import Lease
+from tests.service.files.s3 import environment_of, s3_server
+
+HOUR = 3600.0
+MISSING, DAMAGED, ORPHANED, ROLLED_BACK = 4, 8, 16, 32
+
+
+@pytest.fixture(autouse=True)
+def umask() -> Iterator[None]:
+    """The command changes that of its process, which is this one."""
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    with s3_server() as url:
+        assert httpx.put(f"{url}/fsck").status_code == 200
+        yield url
+
+
+@pytest.fixture(params=["local", "s3"])
+def service(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Files]:
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path / "data"))
+    monkeypatch.setenv("SGSST_MIN_FREE_BYTES", "0")
+    if request.param == "s3":
+        for name, value in environment_of(request.getfixturevalue("server")).items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv("SGSST_ARTIFACTS", f"s3://fsck/{os.urandom(4).hex()}")
+    made = Files(tmp_path)
+    yield made
+    made.store.close()
+
+
+@dataclass
+class Files:
+    """A service's files, and how they are lost and damaged."""
+
+    folder: Path
+    settings: ServiceSettings = field(init=False)
+    store: Store = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.settings = ServiceSettings()
+        self.store = open_store(self.settings)
+        self.artifacts = Artifacts(self.settings.artifacts_url)
+        self.blobs = open_blobs(self.settings, self.store.inputs, self.artifacts)
+
+    def file(self, content: bytes) -> Path:
+        path = self.folder / os.urandom(6).hex()
+        path.write_bytes(content)
+        return path
+
+    def input(self, content: bytes) -> str:
+        """Take a file in, and return its name."""
+        sha256 = self.blobs.keep(self.file(content))
+        return f"blobs/{self.store.inputs.blobs([sha256])[sha256].location}"
+
+    def job(self, scene: str) -> Lease:
+        sha256 = scene.split("/")[2].partition("-")[0]
+        entry = {"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 1}
+        self.store.jobs.create(NewJob("me", "", 0, {}, [entry]), limit=10_000)
+        lease = self.store.leases.take("one")
+        assert lease is not None
+        return lease
+
+    def results(self, lease: Lease, contents: dict[str, bytes]) -> list[str]:
+        put = [self.artifacts.put(lease.job_id, lease.epoch, name, self.file(data)) for name, data in contents.items()]
+        self.store.leases.publish(lease, put)
+        return [each.location for each in put]
+
+    def upload(self, content: bytes, length: int) -> str:
+        row = self.store.inputs.create_upload("me", length, "scene.ply", "", HOUR)
+        self.blobs.begin_upload(row.id)
+        writer = self.blobs.append(row, HOUR)
+        writer.write(content)
+        writer.save()
+        writer.close()
+        if self.blobs.objects.local:
+            return f"uploads/{row.id}.part"
+        return self.store.inputs.parts(row.id)[0].location
+
+    def orphan(self, name: str) -> None:
+        """Put a file that no row refers to."""
+        objects = self.place(name)
+        if objects.local:
+            Path(objects.root, name).parent.mkdir(parents=True, exist_ok=True)
+        objects.put(self.file(b"x"), name)
+
+    def place(self, name: str) -> ObjectStore:
+        return self.artifacts.objects if name.startswith("job_") else self.blobs.objects
+
+    def lose(self, name: str) -> None:
+        self.place(name).remove(name)
+
+    def flip(self, name: str, order: random.Random) -> None:
+        """Change one bit of a file."""
+        objects = self.place(name)
+        content = bytearray(b"".join(objects.read(name, 0, objects.size(name))))
+        content[order.randrange(len(content))] ^= 1 << order.randrange(8)
+        objects.remove(name)
+        objects.put(self.file(bytes(content)), name)
+
+
+def run(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, dict[str, str]]]:
+    """The exit code, and what was found by the files' names."""
+    capsys.readouterr()
+    code = main(["fsck", "--json", *options])
+    found = {finding["name"]: finding for finding in json.loads(capsys.readouterr().out)}
+    return code, found
+
+
+def kinds(found: dict[str, dict[str, str]]) -> dict[str, str]:
+    return {name: finding["kind"] for name, finding in found.items()}
+
+
+def test_all_of_a_thousand_losses_and_flips_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path / "data"))
+    files, order = Files(tmp_path), random.Random(5)
+    names = [files.input(b"input %d" % number * 9) for number in range(700)]
+    lease = files.job(names[0])
+    names += files.results(lease, {f"previews/step_{number}.jpg": b"%d" % number * 9 for number in range(700)})
+    order.shuffle(names)
+    lost, flipped = names[:500], names[500:1000]
+    for name in lost:
+        files.lose(name)
+    for name in flipped:
+        files.flip(name, order)
+    code, found = run(capsys)
+    assert kinds(found) == dict.fromkeys(lost, "missing") | dict.fromkeys(flipped, "damaged")
+    assert code == MISSING + DAMAGED
+    files.store.close()
+
+
+def test_what_is_found_is_mended(
+    service: Files, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    order = random.Random(1)
+    scene, unused, good = (service.input(b"input %d" % number) for number in range(3))
+    lease = service.job(scene)
+    kept, damaged, checkpoint = service.results(
+        lease, {"plan.json": b"plan", "stylized.ply": b"ply", CHECKPOINT: b"state"}
+    )
+    part, whole_part = service.upload(b"half", 8), service.upload(b"half", 8)
+    assert run(capsys) == (0, {})
+
+    service.flip(scene, order)
+    service.lose(unused)
+    service.flip(damaged, order)
+    service.lose(checkpoint)
+    service.lose(part)
+    orphans = {"blobs/aa/orphan", "uploads/upl_0123456789", "job_0123456789/1/x/plan.json"}
+    for name in orphans:
+        service.orphan(name)
+    expected = {scene: "damaged", unused: "missing", damaged: "damaged", checkpoint: "missing", part: "missing"}
+    code, found = run(capsys)
+    assert (code, kinds(found)) == (MISSING + DAMAGED, expected), "orphans may still get their rows"
+    assert found[scene]["holders"] == [f"job:{lease.job_id}"]
+    monkeypatch.setattr(fsck, "_ORPHAN_SECONDS", -HOUR)
+    monkeypatch.setattr(fsck, "_REMOTE_ORPHAN_SECONDS", -HOUR)
+    expected |= dict.fromkeys(orphans, "orphaned")
+    code, found = run(capsys, "--mend")
+    assert (code, kinds(found)) == (MISSING + DAMAGED + ORPHANED, expected)
+    assert found[scene]["mended"].startswith("moved to quarantine/"), found[scene]
+    assert found[scene]["mended"].endswith("it comes back when it is sent again")
+    assert {row.name for row in service.store.jobs.artifacts(lease.job_id)} == {"plan.json"}
+    assert [name for name in service.blobs.objects.below("quarantine")]
+
+    code, found = run(capsys)
+    assert (code, kinds(found)) == (MISSING, {scene: "missing"}), "a job needs it"
+    assert service.input(b"input 0") == scene
+    assert run(capsys) == (0, {})
+    for name in (scene, good, kept, whole_part):
+        assert service.place(name).size(name) > 0
+
+
+def test_a_lost_file_is_known_by_its_code(service: Files) -> None:
+    name = service.input(b"content")
+    service.lose(name)
+    sha256 = name.split("/")[2].partition("-")[0]
+    with pytest.raises(LostFileError):
+        service.blobs.objects.check(name, sha256)

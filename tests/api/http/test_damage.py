@@ -1,0 +1,143 @@
+"""Files that the disk has lost or changed: they are neither sent nor used, and come back when they are sent again."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.files.artifacts import Artifacts
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.leases import Lease
+from tests.api.service import Service, check_documented
+from tests.small_scenes import wall, write_files
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, bytes]]:
+    paths = zip(("scene", "cameras", "style"), write_files(tmp_path_factory.mktemp("inputs"), wall()), strict=True)
+    return {role: (path.name, path.read_bytes()) for role, path in paths}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    data = tmp_path_factory.mktemp("damage") / "data"
+    data.mkdir()
+    data.chmod(0o755)  # as an earlier version left it
+    with Service(data, alone=True) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[Store]:
+    opened = open_store(ServiceSettings(data=service.data))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[httpx.Client]:
+    with service.client() as made:
+        yield made
+
+
+def submit(client: httpx.Client, files: dict[str, tuple[str, bytes]]) -> str:
+    answer = client.post("/v1/jobs", files=files)
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+def lease_of(store: Store, job_id: str) -> Lease:
+    while (lease := store.leases.take("one")) is not None:
+        if lease.job_id == job_id:
+            return lease
+    raise AssertionError(f"{job_id} is not in the queue")
+
+
+def publish(service: Service, store: Store, job_id: str, name: str, content: bytes, folder: Path) -> Path:
+    """Make a file a result of a job; returns where it lies."""
+    artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
+    source = folder / "made"
+    source.write_bytes(content)
+    lease = lease_of(store, job_id)
+    put = artifacts.put(job_id, lease.epoch, name, source)
+    store.leases.publish(lease, [put])
+    return service.data / "artifacts" / put.location
+
+
+def flip(path: Path) -> None:
+    """Change one bit of a file in its place."""
+    path.chmod(0o600)
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size // 2)
+        byte = file.read(1)[0]
+        file.seek(-1, 1)
+        file.write(bytes([byte ^ 4]))
+
+
+def refused(answer: httpx.Response, code: str) -> None:
+    assert (answer.status_code, answer.json()["code"]) == (500, code), answer.text
+    check_documented(answer)
+    assert "etag" not in answer.headers
+
+
+def blob_of(service: Service, store: Store, job_id: str, role: str) -> Path:
+    (sha256,) = (entry["sha256"] for entry in store.jobs.get(job_id, None).inputs if entry["role"] == role)
+    return service.data / "blobs" / store.inputs.blobs([sha256])[sha256].location
+
+
+def test_a_damaged_result_is_not_sent(
+    service: Service, store: Store, client: httpx.Client, files: dict[str, Any], tmp_path: Path
+) -> None:
+    job_id = submit(client, files)
+    path = publish(service, store, job_id, "plan.json", b'{"a": 1}' * 1000, tmp_path)
+    where = f"/v1/jobs/{job_id}/artifacts/plan.json"
+    sent = client.get(where)
+    assert (sent.status_code, sent.content) == (200, b'{"a": 1}' * 1000)
+    flip(path)
+    logged = service.log.stat().st_size
+    for headers in ({}, {"Range": "bytes=0-9"}, {"Range": "bytes=10-", "If-Range": sent.headers["etag"]}):
+        refused(client.get(where, headers=headers), "file-damaged")
+    assert f"{path.name} in " in service.log.read_text()[logged:]
+    path.unlink()
+    refused(client.get(where), "file-lost")
+
+
+def test_what_was_replaced_meanwhile_is_not_taken_for_lost(
+    service: Service, store: Store, client: httpx.Client, files: dict[str, Any]
+) -> None:
+    job_id = submit(client, files)
+    store.jobs.cancel(job_id, None)
+    where = f"/v1/jobs/{job_id}/artifacts/plan.json"
+    assert client.get(where).status_code == 404
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_file_that_is_sent_again_comes_back(
+    service: Service, store: Store, client: httpx.Client, files: dict[str, Any], lost: bool
+) -> None:
+    job_id = submit(client, files)
+    path, where = blob_of(service, store, job_id, "scene"), f"/v1/jobs/{job_id}/inputs/scene"
+    assert client.get(where).content == files["scene"][1]
+    if lost:
+        path.unlink()
+    else:
+        flip(path)
+    refused(client.get(where), "file-lost" if lost else "file-damaged")
+    # other parameters: what was found in the same files before is no reason not to read them
+    again = submit(client, files)
+    assert client.get(where).content == files["scene"][1]
+    assert blob_of(service, store, again, "scene") == path
+
+
+def test_nobody_else_can_read_the_data(service: Service, client: httpx.Client, files: dict[str, Any]) -> None:
+    submit(client, files)
+    assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
+    everything = list(service.data.rglob("*"))
+    assert {"sgsst.db", "sgsst.db-wal"} <= {path.name for path in everything}
+    assert not [path for path in everything if path.stat().st_mode & 0o077]
