@@ -78,7 +78,7 @@ def fsck(
             out_console.print(f"{finding.kind:<8}  {finding.what:<10}  {finding.name}{needed}{done}")
     if as_json:
         out_console.print(json.dumps([asdict(finding) for finding in found]))
-    kinds = [finding.kind for finding in found]
+    kinds: list[str] = [finding.kind for finding in found]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
     error_console.print(f"{check.checked} files of the database were read: {counts}")
     if store.database.rolled_back:

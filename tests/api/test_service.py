@@ -187,6 +187,7 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
                 f"{entry['name']} tells where the service's data is"
             )
         assert result(client, job_id) == expected
+    assert not [path for path in service.data.rglob("*") if path.is_file() and path.stat().st_mode & 0o077]
 
 
 def test_the_ply_in_ranges(service: Service, files: dict[str, Path], short_job: str, tmp_path: Path) -> None:

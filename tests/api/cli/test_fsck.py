@@ -191,7 +191,7 @@ def test_what_is_found_is_mended(
     assert found[scene]["mended"].startswith("moved to quarantine/"), found[scene]
     assert found[scene]["mended"].endswith("it comes back when it is sent again")
     assert {row.name for row in service.store.jobs.artifacts(lease.job_id)} == {"plan.json"}
-    assert [name for name in service.blobs.objects.below("quarantine")]
+    assert service.blobs.objects.below("quarantine")
 
     code, found = run(capsys)
     assert (code, kinds(found)) == (MISSING, {scene: "missing"}), "a job needs it"

@@ -5,11 +5,14 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 
+from api.http.routes import artifacts as routes
+from service.errors import LostFileError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -108,13 +111,22 @@ def test_a_damaged_result_is_not_sent(
     refused(client.get(where), "file-lost")
 
 
-def test_what_was_replaced_meanwhile_is_not_taken_for_lost(
-    service: Service, store: Store, client: httpx.Client, files: dict[str, Any]
+def test_a_result_that_was_replaced_meanwhile_is_not_taken_for_lost(
+    service: Service, store: Store, client: httpx.Client, files: dict[str, Any], tmp_path: Path
 ) -> None:
     job_id = submit(client, files)
+    path = publish(service, store, job_id, "plan.json", b"{}", tmp_path)
+    before = store.jobs.artifact(job_id, "plan.json")
+    assert before is not None
+    context: Any = SimpleNamespace(store=store, artifacts=Artifacts(ServiceSettings(data=service.data).artifacts_url))
+    path.unlink()
+    with pytest.raises(LostFileError):
+        routes._check(context, before)
     store.jobs.cancel(job_id, None)
-    where = f"/v1/jobs/{job_id}/artifacts/plan.json"
-    assert client.get(where).status_code == 404
+    store.leases.stop(Lease(store.jobs.get(job_id, None), "one", 1))
+    store.jobs.delete(job_id, None)
+    with pytest.raises(NotFoundError):
+        routes._check(context, before)
 
 
 @pytest.mark.parametrize("lost", [True, False])
@@ -129,7 +141,6 @@ def test_a_file_that_is_sent_again_comes_back(
     else:
         flip(path)
     refused(client.get(where), "file-lost" if lost else "file-damaged")
-    # other parameters: what was found in the same files before is no reason not to read them
     again = submit(client, files)
     assert client.get(where).content == files["scene"][1]
     assert blob_of(service, store, again, "scene") == path
@@ -138,6 +149,7 @@ def test_a_file_that_is_sent_again_comes_back(
 def test_nobody_else_can_read_the_data(service: Service, client: httpx.Client, files: dict[str, Any]) -> None:
     submit(client, files)
     assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
-    everything = list(service.data.rglob("*"))
-    assert {"sgsst.db", "sgsst.db-wal"} <= {path.name for path in everything}
-    assert not [path for path in everything if path.stat().st_mode & 0o077]
+    # below the folder of results are those of this test's process
+    own = [path for path in service.data.rglob("*") if "artifacts" not in path.parts[:-1]]
+    assert {"sgsst.db", "sgsst.db-wal", "artifacts"} <= {path.name for path in own}
+    assert not [path for path in own if path.stat().st_mode & 0o077]

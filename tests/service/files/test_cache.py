@@ -93,6 +93,16 @@ def test_what_is_damaged_in_the_store_is_nobodys_file(cache: FileCache, tmp_path
     assert list((tmp_path / "cache" / "half").iterdir()) == []
 
 
+def test_what_the_hosts_disk_damages_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:
+    data, sha256 = content(1)
+    source = Source(data)
+    cache.link(sha256, len(data), tmp_path / "a", source)
+    (tmp_path / "a").chmod(0o600)
+    (tmp_path / "a").write_bytes(data[:-1] + b"x")
+    cache.link(sha256, len(data), tmp_path / "b", source)
+    assert ((tmp_path / "b").read_bytes(), source.fetched) == (data, 2)
+
+
 def test_what_the_store_has_lost_is_its_error(cache: FileCache, tmp_path: Path) -> None:
     def fetch(target: Path) -> None:
         raise FileNotFoundError(target)

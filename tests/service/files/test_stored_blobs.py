@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import httpx
 import pytest
 
-from service.errors import ConflictError, NoSpaceError, NotFoundError, StoreError
+from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.files import stored_blobs
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Receiver
@@ -104,6 +104,27 @@ def test_what_one_host_takes_in_another_one_reads(fleet: Fleet) -> None:
     asked = len(fleet.s3.asked)
     assert fleet.read(third, sha256) == data
     assert len(fleet.s3.asked) == asked
+
+
+@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("size", [100, 6 * MB])
+def test_what_is_sent_again_heals_the_store(fleet: Fleet, lost: bool, size: int) -> None:
+    data = os.urandom(size)
+    one, two = fleet.host("one"), fleet.host("two")
+    sha256 = fleet.take(one, data)
+    (name,) = fleet.names()
+    objects = Artifacts(fleet.url).objects
+    if lost:
+        objects.remove(name)
+    else:
+        objects.put(_file(fleet.folder, bytes(size)), name)
+    with pytest.raises(LostFileError if lost else DamagedFileError):
+        fleet.read(two, sha256)
+    upload = fleet.upload(size)
+    fleet.append(two, upload, data)
+    assert two.finish_upload(fleet.again(upload), HOUR) == sha256
+    assert fleet.names() == [name]
+    assert fleet.read(fleet.host("three"), sha256) == data
 
 
 def test_parts_are_read_without_a_copy_of_the_whole(fleet: Fleet) -> None:
@@ -199,6 +220,25 @@ def test_what_is_kept_for_later_makes_room(fleet: Fleet, monkeypatch: pytest.Mon
         with pytest.raises(NoSpaceError):
             host.ensure_room(7001)
     host.ensure_room(10_000)
+
+
+def test_a_disk_without_inodes_takes_nothing_in(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    host = fleet.host("one")
+    disk = os.statvfs(host.incoming)
+
+    def inodes(files: int, left: int) -> None:
+        found = SimpleNamespace(f_files=files, f_favail=left, f_bavail=disk.f_bavail, f_frsize=disk.f_frsize)
+        found.f_blocks, found.f_bfree = disk.f_blocks, disk.f_bfree
+        monkeypatch.setattr("service.files.blobs.os.statvfs", lambda _: found)
+
+    host.ensure_room(0)
+    inodes(10_000, 999)
+    with pytest.raises(NoSpaceError, match="more files"):
+        host.ensure_room(0)
+    with pytest.raises(NoSpaceError):
+        host.receive(10)
+    inodes(0, 0)  # a file system that has as many as it needs
+    host.ensure_room(0)
 
 
 def test_a_half_upload_is_collected(fleet: Fleet) -> None:

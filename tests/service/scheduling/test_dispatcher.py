@@ -203,3 +203,26 @@ def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings
     assert left == {"stylized.ply"}
     assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"
     assert b"".join(artifacts.read(published_next.location, 0, 3)) == b"ply", "of a job that has not ended"
+
+
+@pytest.mark.parametrize(("damage", "code"), [("lost", "file-lost"), ("flipped", "file-damaged")])
+def test_a_job_whose_input_is_gone_fails(tmp_path: Path, damage: str, code: str) -> None:
+    """It is tried as often as any other job that comes no further, and not for ever."""
+    settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, retry_seconds=0.01, max_attempts=2)
+    store = open_store(settings)
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
+    (tmp_path / "scene").write_bytes(b"scene")
+    sha256 = blobs.keep(tmp_path / "scene")
+    path = settings.folder / "blobs" / store.inputs.blobs([sha256])[sha256].location
+    path.unlink()
+    if damage == "flipped":
+        path.write_bytes(b"sceme")
+    scene = {"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 5}
+    job, _ = store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+    with at_work(settings, store):
+        wait_for(lambda: store.jobs.get(job.id, None).status == "failed", "the job to fail")
+    ended = store.jobs.get(job.id, None)
+    assert ended.error is not None
+    assert (ended.error["code"], ended.attempt) == (code, 2)
+    assert sha256 in ended.error["message"]
+    store.close()

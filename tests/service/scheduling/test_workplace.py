@@ -133,6 +133,14 @@ def test_what_the_first_rank_makes_is_stored_while_it_makes_it(job: StoreWorkpla
     assert job.after([]) == job
 
 
+def test_a_damaged_checkpoint_is_not_used(job: StoreWorkplace, tmp_path: Path) -> None:
+    saved = put(job.url, "job_1/1/x/checkpoint", b"state", tmp_path)
+    for sha256, used in ((saved.sha256, True), ("e" * 64, False)):
+        rank = replace(job, checkpoint=replace(saved, sha256=sha256)).open(0, Heard())
+        assert (rank.folder / "out" / "stylized.checkpoint.safetensors").exists() == used
+        rank.close()
+
+
 def test_a_store_that_is_away_for_a_while_loses_nothing(s3: FaultyS3, job: StoreWorkplace) -> None:
     heard = Heard()
     rank = job.open(0, heard)
