@@ -19,8 +19,8 @@ from api.http.documentation import Responses, headers
 from api.http.schemas import SHA256
 from service.errors import NotFoundError, ServiceError
 
-#: Files that are hashed at the same time before they are sent: others wait, and no other request does.
-_CHECKS = anyio.CapacityLimiter(2)
+#: Files of more bytes are checked two at a time, so that neither small files nor other requests wait for them.
+_LARGE_BYTES, _LARGE_CHECKS = 64 << 20, anyio.CapacityLimiter(2)
 #: Letters of a name that is suggested for a file.
 _MAX_NAME = 120
 
@@ -121,7 +121,7 @@ async def send_file(
     status = 206 if span else 200
     if request.method == "HEAD":
         return Response(status_code=status, headers=sent, media_type=file.kind)
-    await anyio.to_thread.run_sync(file.check, limiter=_CHECKS)
+    await anyio.to_thread.run_sync(file.check, limiter=_LARGE_CHECKS if file.size > _LARGE_BYTES else None)
     body = file.read(start, stop)
     first = await asyncio.to_thread(_first, body)  # what fails now can still be answered
     return StreamingResponse(chain(first, body), status, sent, file.kind)
