@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import random
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -199,6 +201,37 @@ def test_what_is_found_is_mended(
     assert run(capsys) == (0, {})
     for name in (scene, good, kept, whole_part):
         assert service.place(name).size(name) > 0
+
+
+def test_a_service_at_work_is_no_finding(service: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    """Files that come, are replaced and go while they are checked are not taken for lost or orphaned."""
+    stop = threading.Event()
+
+    def work() -> None:
+        number = 0
+        while not stop.is_set():
+            number += 1
+            scene = service.input(b"input %d" % number)
+            lease = service.job(scene)
+            for turn in range(3):
+                put = service.artifacts.put(lease.job_id, lease.epoch, "log.txt", service.file(b"%d" % turn))
+                for location in service.store.leases.publish(lease, [put]):
+                    service.artifacts.remove(location)
+            upload_id = service.upload(b"upload %d" % number, 7 + len(str(number))).split("/")[1].removesuffix(".part")
+            service.blobs.finish_upload(service.store.inputs.upload(upload_id, "me"), HOUR)
+            service.store.leases.succeed(lease, [], {})
+            if number % 2:
+                service.store.jobs.delete(lease.job_id, None)
+                service.artifacts.remove_job(lease.job_id)
+
+    with ThreadPoolExecutor(1) as pool:
+        working = pool.submit(work)
+        try:
+            for _ in range(8):
+                assert run(capsys, "--mend") == (0, {})
+        finally:
+            stop.set()
+        working.result()
 
 
 def test_a_lost_file_is_known_by_its_code(service: Files) -> None:
