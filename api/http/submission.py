@@ -11,8 +11,8 @@ from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError
 from api.http.schemas import SHA256
 from service.errors import (
     BusyError,
-    DamagedWeightsError,
     DamagedFileError,
+    DamagedWeightsError,
     IdempotencyError,
     LockedError,
     LostFileError,
