@@ -91,6 +91,18 @@ class StoreError(ServiceError, InfrastructureError):
     code, status = "store-unavailable", 503
 
 
+class DatabaseUnavailableError(ServiceError, InfrastructureError):
+    """Database that does not answer."""
+
+    code, status = "database-unavailable", 503
+
+
+class DatabaseBusyError(DatabaseUnavailableError):
+    """Database that others have locked for too long, or whose connections are all in use."""
+
+    code, status = "database-busy", 503
+
+
 class LeaseLostError(ServiceError):
     """Another dispatcher has taken the job over: whatever this one still has to say about it is void."""
 

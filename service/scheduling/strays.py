@@ -20,7 +20,7 @@ _PREFIX = "job_"
 
 def remove_strays(store: Store, artifacts: Artifacts) -> int:
     """Remove such files; returns how many."""
-    before = time.time() - _STRAY_SECONDS
+    before = min(time.time(), store.database.expiry()) - _STRAY_SECONDS
     old: dict[str, list[str]] = {}
     for name, changed in artifacts.objects.below("").items():
         job_id = name.partition("/")[0]

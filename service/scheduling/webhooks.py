@@ -94,7 +94,9 @@ class Deliverer:
         for delivery in self._store.operations.due_deliveries(hold_seconds=4 * _TIMEOUT):
             error = self._send(delivery)
             wait = None if error is None or delivery.tries > len(_WAITS) else _WAITS[delivery.tries - 1]
-            self._store.operations.settle_delivery(delivery.id, None if wait is None else time.time() + wait)
+            self._store.operations.settle_delivery(
+                delivery.id, None if wait is None else self._store.database.clock() + wait
+            )
             if error is not None:
                 _log.warning(
                     "webhook to %s: %s", urlsplit(delivery.url).hostname, error, extra={"job": delivery.job_id}

@@ -76,7 +76,7 @@ class Inputs:
 
     def collect(self) -> list[str]:
         """Drop blobs that nobody has referred to for a while; returns their locations, for removing the files."""
-        before = self._database.clock() - GRACE_SECONDS
+        before = self._database.expiry() - GRACE_SECONDS
         used = exists().where(BlobUseRow.sha256 == BlobRow.sha256)
         with self._database.writing() as session:
             query = select(BlobRow).where(BlobRow.touched_at < before, ~used).limit(1000)
@@ -84,6 +84,10 @@ class Inputs:
             for row in rows:
                 session.delete(row)
             return [row.location for row in rows]
+
+    def expiry(self) -> float:
+        """Return the time by which files expire."""
+        return self._database.expiry()
 
     def locations(self) -> set[str]:
         """All locations that rows refer to."""
@@ -211,8 +215,9 @@ class Inputs:
 
     def expire_uploads(self) -> list[str]:
         """Forget uploads whose time is over; returns their ids, for removing what has arrived of them."""
+        now = self._database.expiry()
         with self._database.writing() as session:
-            query = select(UploadRow).where(UploadRow.expires_at < self._database.clock()).limit(500)
+            query = select(UploadRow).where(UploadRow.expires_at < now).limit(500)
             rows = session.scalars(query.with_for_update(skip_locked=True)).all()
             for row in rows:
                 session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{row.id}"))
