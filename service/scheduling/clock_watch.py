@@ -44,7 +44,7 @@ class ClockWatch:
         expires, database = job.lease_expires_at, self._store.database
         if expires is None or expires == RUN_OUT:
             return True
-        if not database.sqlite and expires <= database.clock():
+        if not database.sqlite and expires < database.clock():
             return True
         lease, now = (job.lease_epoch, expires), self._monotonic()
         seen, since = self._run_out.get(job.id, (None, now))
