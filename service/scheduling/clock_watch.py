@@ -25,16 +25,12 @@ class ClockWatch:
     deleted while another dispatcher sends heartbeats whose times do not agree with this clock.
 
     Args:
-        name: Name of the dispatcher.
         lease_seconds: Seconds that a lease holds.
         monotonic: Monotonic clock.
     """
 
-    def __init__(
-        self, store: Store, name: str, lease_seconds: float, monotonic: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._store, self._name, self._lease_seconds = store, name, lease_seconds
-        self._monotonic = monotonic
+    def __init__(self, store: Store, lease_seconds: float, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._lease_seconds, self._monotonic = store, lease_seconds, monotonic
         self._run_out: dict[str, tuple[tuple[int, float], float]] = {}
         self._heard: dict[str, float] = {}
         self._heard_at: float | None = None
@@ -58,8 +54,9 @@ class ClockWatch:
     def confirm(self) -> bool:
         """Move the expiry time on if no live dispatcher contradicts this clock; returns whether things may be deleted.
 
-        A heartbeat that has come since the last call was sent in the time since then. Those that have not changed are
-        of dispatchers that may be dead, and say nothing.
+        A heartbeat that has come since the last call was sent in the time since then, this dispatcher's own included:
+        so a clock that has just been changed is noticed as well. Heartbeats that have not changed are of dispatchers
+        that may be dead, and say nothing.
         """
         before, now = self._heard_at, self._monotonic()
         since = 0.0 if before is None else now - before

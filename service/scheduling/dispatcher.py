@@ -68,7 +68,7 @@ class Dispatcher:
         self._running: dict[str, RunningAttempt] = {}
         self._stop = threading.Event()
         self.name = own_name()
-        self._clocks = ClockWatch(store, self.name, settings.lease_seconds)
+        self._clocks = ClockWatch(store, settings.lease_seconds)
         self._work = settings.folder / "work" / self.name
         self._renewed_at = self._announced_at = self._strays_at = float("-inf")
         self._ended = threading.Event()

@@ -15,13 +15,16 @@ import pytest
 from sqlalchemy import select
 
 from service.files.artifacts import Artifacts
+from service.scheduling.clock_watch import ClockWatch
 from service.settings import ServiceSettings
 from service.store import Store, open_store
+from service.store.clocks import CATCH_UP
 from service.store.jobs import NewJob
 from service.store.leases import Lease
 from service.store.tables import DispatcherRow
 from tests.api.service import ROOT, SETTINGS, wait_for
 from tests.postgres import fresh_database, is_installed, server
+from tests.service.store.helpers import Clock
 
 SHA = "a" * 64
 DAY = 86_400.0
@@ -152,3 +155,110 @@ def test_a_dispatcher_two_minutes_ahead_takes_no_healthy_lease(settings: Service
     assert set(statuses) == {"starting"}, "the lease was never lost"
     assert [row.outcome for row in store.jobs.detail(held.job_id, None)[2]] == [None]
     assert time.time() - store.database.clock() == pytest.approx(0.0, abs=30.0)
+
+
+# --- with clocks that the tests turn ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def store_with_clock(settings: ServiceSettings, wrong_by: float) -> Iterator[tuple[Store, ClockWatch, Clock]]:
+    """Open the same database with a clock that is wrong by so much, and the doubts of a dispatcher there."""
+    store, monotonic = open_store(settings, lambda: time.time() + wrong_by), Clock()
+    try:
+        yield store, ClockWatch(store, LEASE, monotonic), monotonic
+    finally:
+        store.close()
+
+
+def test_a_lease_is_lost_once_it_is_silent_for_long_enough(tmp_path: Path) -> None:
+    settings = ServiceSettings(data=tmp_path, lease_seconds=LEASE)
+    with store_with_clock(settings, 0.0) as (store, _, _), store_with_clock(settings, 120.0) as (ahead, watch, clock):
+        store.inputs.add_blob(SHA, "aa/blob", 3)
+        held = leased(store, "healthy")
+        for _ in range(5):
+            assert ahead.leases.take("wrong", is_lost=watch.is_lost) is None
+            clock.now += 0.9 * LEASE
+            store.leases.renew([held])
+        assert ahead.leases.take("wrong", is_lost=watch.is_lost) is None
+        clock.now += LEASE
+        assert ahead.leases.take("wrong", is_lost=watch.is_lost) is not None
+
+
+def test_a_dead_dispatcher_of_this_machine_is_not_waited_for(tmp_path: Path) -> None:
+    with store_with_clock(ServiceSettings(data=tmp_path, lease_seconds=LEASE), 0.0) as (store, watch, _):
+        store.inputs.add_blob(SHA, "aa/blob", 3)
+        leased(store, "dead")
+        assert store.leases.take("new", is_lost=watch.is_lost) is None
+        store.leases.run_out("dead")
+        assert store.leases.take("new", is_lost=watch.is_lost) is not None
+
+
+def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSettings, store: Store) -> None:
+    """Neither the lease of its dispatcher, which has died, nor a job that was queued by it."""
+    with (
+        store_with_clock(settings, 31 * DAY) as (ahead, _, _),
+        store_with_clock(settings, 0.0) as (right, watch, clock),
+    ):
+        lost = leased(ahead, "ahead")
+        assert right.leases.take("right", is_lost=watch.is_lost) is None
+        clock.now += LEASE
+        again = right.leases.take("right", is_lost=watch.is_lost)
+        assert again is not None
+        assert again.job_id == lost.job_id
+        scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+        queued, _ = ahead.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
+        found = right.leases.take("right", is_lost=watch.is_lost)
+        assert found is not None
+        assert found.job_id == queued.id
+
+
+def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(settings: ServiceSettings) -> None:
+    """A machine that was off for 40 days, or a clock that is ahead: nobody can tell."""
+    clock = Clock()
+    store = open_store(settings, clock)
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    done = leased(store, "one")
+    store.leases.succeed(done, [], {})
+    store.retention.advance(0.0)
+    clock.now += 40 * DAY
+    store.retention.advance(60.0)
+    assert store.retention.expire() == []
+    assert store.inputs.collect() == []
+    store.close()
+    store = open_store(settings, clock)  # and the next process goes on from there
+    store.retention.advance(29 * DAY / CATCH_UP)
+    assert store.retention.expire() == []
+    store.retention.advance(2 * DAY / CATCH_UP)
+    assert store.retention.expire() == [done.job_id]
+    store.retention.advance(1000 * DAY)
+    assert store.database.expiry() == clock.now, "it is never ahead of the clock"
+    store.close()
+
+
+def test_results_that_a_clock_behind_has_finished_are_kept_as_long(settings: ServiceSettings, store: Store) -> None:
+    store.retention.advance(0.0)
+    held = leased(store, "behind")
+    with store_with_clock(settings, -31 * DAY) as (behind, _, _):
+        behind.leases.succeed(held, [], {})
+    expires = store.jobs.get(held.job_id, None).expires_at
+    assert expires is not None
+    assert expires > store.database.clock() + settings.retention_seconds - 600
+
+
+@pytest.mark.parametrize("wrong_by", [120.0, -120.0, 31 * DAY])
+def test_nothing_is_deleted_while_live_dispatchers_disagree(
+    settings: ServiceSettings, store: Store, wrong_by: float
+) -> None:
+    with store_with_clock(settings, wrong_by) as (wrong, watch, clock):
+        monotonic = Clock()
+        right_watch = ClockWatch(store, LEASE, monotonic)
+        for passing in (True, False, False):  # the first look has nothing to compare with, and moves nothing on
+            store.operations.beat("healthy", 1, 1)
+            wrong.operations.beat("wrong", 1, 1)
+            before = wrong.database.expiry()
+            assert watch.confirm() == passing
+            assert right_watch.confirm() == passing, "nobody knows who is right"
+            assert wrong.database.expiry() <= max(before, store.database.clock())
+            clock.now, monotonic.now = clock.now + 1.0, monotonic.now + 1.0
+        wrong.operations.beat("wrong", 1, 1)  # it knows of its own heartbeats, and hears of no other any more
+        assert watch.confirm()
