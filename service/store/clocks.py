@@ -20,7 +20,7 @@ from collections.abc import Callable
 from sqlalchemy import Connection, func, select
 from sqlalchemy.orm import Session
 
-from service.store.tables import CounterRow, DispatcherRow, JobRow
+from service.store.tables import CounterRow, JobRow
 
 Clock = Callable[[], float]
 
@@ -87,13 +87,8 @@ def advance_expiry_time(session: Session, now: float, seconds: float) -> None:
         seconds: Time that a dispatcher has worked since it moved it last, by its monotonic clock.
     """
     row = session.get(CounterRow, (_NAME, ""), with_for_update=True)
-    if row is None:
-        session.add(CounterRow(name=_NAME, labels="", value=min(now, _newest_time(session, now))))
+    if row is None:  # jobs are created by others: heartbeats may be those of a wrong clock that has just started
+        newest = session.scalar(select(func.max(JobRow.created_at)))
+        session.add(CounterRow(name=_NAME, labels="", value=now if newest is None else min(now, newest)))
     else:
         row.value = max(row.value, min(now, row.value + CATCH_UP * seconds))
-
-
-def _newest_time(session: Session, now: float) -> float:
-    """Return the newest time that the database knows of, from before there was an expiry time."""
-    times = (func.max(JobRow.created_at), func.max(JobRow.finished_at), func.max(DispatcherRow.seen_at))
-    return max((found for time in times if (found := session.scalar(select(time))) is not None), default=now)

@@ -149,14 +149,19 @@ def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
     stack = contextlib.ExitStack()
     pool = stack.enter_context(ThreadPoolExecutor(MANY))
     answers = [pool.submit(send) for _ in range(MANY)]
-    stack.callback(lambda: [check_away(answer.result()) for answer in answers])
+
+    def check_all() -> None:
+        for answer in answers:
+            check_away(answer.result())
+
+    stack.callback(check_all)
     return stack
 
 
 @pytest.mark.parametrize("kind", ["killed", "stopped"])
 def test_every_operation_says_that_the_database_is_away(outage: Outage, files: dict[str, bytes], kind: str) -> None:
     with outage.client() as client, outage.kind(kind), ThreadPoolExecutor(len(operations())) as pool:
-        for answer in pool.map(lambda each: request(client, *each, outage, files), operations()):
+        for answer in pool.map(lambda each: request(client, each[0], each[1], outage, files), operations()):
             check_away(answer)
         check_health(outage.service, 503)
     check_health(outage.service, 200)
