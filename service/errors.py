@@ -141,6 +141,18 @@ class LockedError(ServiceError):
         super().__init__(message)
 
 
+class DatabaseUnavailableError(ServiceError, InfrastructureError):
+    """Database that does not answer."""
+
+    code, status = "database-unavailable", 503
+
+
+class DatabaseBusyError(DatabaseUnavailableError):
+    """Database that others have locked for too long, or whose connections are all in use."""
+
+    code, status = "database-busy", 503
+
+
 class LeaseLostError(ServiceError):
     """Another dispatcher has taken the job over: whatever this one still has to say about it is void."""
 

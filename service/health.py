@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # asked several times a minute: what is not needed is not imp
     from service.store import Store
 
 _SECONDS = 8
+#: Seconds that the database has for each answer.
+_ANSWER_SECONDS = 2.0
 
 
 def main() -> int:
@@ -26,7 +28,7 @@ def main() -> int:
             from service.settings import ServiceSettings
             from service.store import Store
 
-            return 0 if dispatcher_is_well(Store(ServiceSettings())) else 1
+            return 0 if dispatcher_is_well(Store(ServiceSettings(), answer_seconds=_ANSWER_SECONDS)) else 1
     print("usage: python -m service.health api|dispatcher", file=sys.stderr)
     return 2
 
@@ -42,14 +44,13 @@ def _answers(url: str) -> bool:
 
 def dispatcher_is_well(store: Store) -> bool:
     """Whether a dispatcher of this machine, or of this container, was heard of lately, or nobody can tell."""
-    from sqlalchemy.exc import SQLAlchemyError
-
+    from service.errors import DatabaseUnavailableError
     from service.scheduling.identity import is_of_this_machine
 
     try:
         alive = store.operations.dispatchers()
-    except SQLAlchemyError as error:
-        print(f"the database does not answer: {type(error).__name__}", file=sys.stderr)
+    except DatabaseUnavailableError as error:
+        print(error, file=sys.stderr)
         return True
     return any(is_of_this_machine(row.name) for row in alive)
 

@@ -10,9 +10,7 @@ from __future__ import annotations
 import sys
 import time
 
-from sqlalchemy.exc import OperationalError
-
-from service.errors import StoreError
+from service.errors import DatabaseUnavailableError, StoreError
 from service.files.objects import ObjectStore
 from service.logs import set_up
 from service.private import keep_private
@@ -30,7 +28,7 @@ def main() -> int:
     try:
         open_store(settings, patience=settings.start_seconds).close()
         _make_bucket(ObjectStore(settings.artifacts_url), settings.start_seconds)
-    except (OperationalError, StoreError) as error:
+    except (DatabaseUnavailableError, StoreError) as error:
         print(f"error: {error}\n{error.__cause__ or ''}", file=sys.stderr)
         return 1
     return 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -12,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 from sqlalchemy import create_engine, text
 
 
@@ -20,33 +23,74 @@ def is_installed() -> bool:
     return _programs() is not None
 
 
+class Postgres:
+    """A server that tests can stop, kill and start again.
+
+    Attributes:
+        url: URL without the name of a database.
+    """
+
+    def __init__(self, *, durable: bool) -> None:
+        programs = _programs()
+        assert programs is not None
+        self._programs = programs
+        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-pg-"))
+        user: dict[str, Any] = {}
+        if os.geteuid() == 0:  # it refuses to run as root
+            shutil.chown(self._folder, "postgres")
+            user = {"user": "postgres", "group": "postgres", "extra_groups": []}
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        self.url = f"postgresql+psycopg://sgsst@127.0.0.1:{port}"
+        self._options: dict[str, Any] = {**user, "check": True, "stdout": subprocess.DEVNULL, "cwd": self._folder}
+        self._data = str(self._folder / "data")
+        subprocess.run([programs / "initdb", "-U", "sgsst", "-A", "trust", "-D", self._data], **self._options)
+        fsync = "on" if durable else "off"
+        self._started = f"-p {port} -k {self._folder} -c listen_addresses=127.0.0.1 -c fsync={fsync}"
+
+    def start(self) -> None:
+        """Start the server, and wait until it answers."""
+        self._control("-o", self._started, "-l", str(self._folder / "log"), "-w", "start")
+
+    def signal(self, number: int) -> None:
+        """Send a signal to all processes of the server."""
+        main = psutil.Process(int((Path(self._data) / "postmaster.pid").read_text().split()[0]))
+        for process in [main, *main.children(recursive=True)]:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.send_signal(number)
+        if number == signal.SIGKILL:
+            main.wait()
+
+    def remove(self) -> None:
+        """End the server, and delete its folder."""
+        self._control("-m", "immediate", "stop")
+        shutil.rmtree(self._folder)
+
+    def _control(self, *arguments: str) -> None:
+        subprocess.run([self._programs / "pg_ctl", "-D", self._data, *arguments], **self._options)
+
+
 @contextmanager
-def server(*, durable: bool = False) -> Iterator[str]:
-    """The URL of a server that ends with the block, without the name of a database.
+def controlled_server(*, durable: bool = False) -> Iterator[Postgres]:
+    """A server that ends with the block.
 
     Args:
         durable: commits are on the disk before they are answered, as they should be where time is measured.
     """
-    programs = _programs()
-    assert programs is not None
-    folder = Path(tempfile.mkdtemp(prefix="sgsst-pg-"))
-    user: dict[str, Any] = {}
-    if os.geteuid() == 0:  # it refuses to run as root
-        shutil.chown(folder, "postgres")
-        user = {"user": "postgres", "group": "postgres", "extra_groups": []}
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    data = str(folder / "data")
-    options = {**user, "check": True, "stdout": subprocess.DEVNULL, "cwd": folder}
-    subprocess.run([programs / "initdb", "-U", "sgsst", "-A", "trust", "-D", data], **options)
-    started = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync={'on' if durable else 'off'}"
-    subprocess.run([programs / "pg_ctl", "-D", data, "-o", started, "-l", folder / "log", "-w", "start"], **options)
+    made = Postgres(durable=durable)
+    made.start()
     try:
-        yield f"postgresql+psycopg://sgsst@127.0.0.1:{port}"
+        yield made
     finally:
-        subprocess.run([programs / "pg_ctl", "-D", data, "-m", "immediate", "stop"], **options)
-        shutil.rmtree(folder)
+        made.remove()
+
+
+@contextmanager
+def server(*, durable: bool = False) -> Iterator[str]:
+    """As `controlled_server`: its URL, without the name of a database."""
+    with controlled_server(durable=durable) as made:
+        yield made.url
 
 
 def fresh_database(url: str) -> str:

@@ -20,6 +20,7 @@ from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
 from api.http.rates import Rates
+from api.http.readiness import Readiness
 from api.http.routes import artifacts, events, inputs, jobs, operations, session, uploads
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
@@ -36,6 +37,8 @@ from service.weights import check_weights
 
 #: Requests that read the store or the disk side by side.
 _THREADS = 40
+#: Seconds that a request waits for a locked database, and for each answer of its server.
+_ANSWER_SECONDS = 8.0
 
 _access = logging.getLogger("api.access")
 
@@ -50,7 +53,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        store = open_store(settings, patience=settings.start_seconds)
+        store = open_store(settings, patience=settings.start_seconds, answer_seconds=_ANSWER_SECONDS)
         results = Artifacts(settings.artifacts_url)
         blobs = open_blobs(settings, store.inputs, results)
         context = Context(
@@ -64,6 +67,14 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             sign_ins=SignIns(),
             rates=Rates(),
             metrics=Metrics(store, settings.folder),
+            readiness=Readiness(
+                {
+                    "database": store.operations.check,
+                    "artifacts": results.ping,
+                    "disk": lambda: blobs.ensure_room(0),
+                    "weights": check_weights,
+                }
+            ),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
@@ -74,6 +85,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         await context.hub.close()
         await context.inspector.close()
         await context.packer.close()
+        context.readiness.close()
         store.close()
 
     app = FastAPI(

@@ -20,6 +20,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.rates import Rates
+from api.http.readiness import Readiness
 from api.http.sign_ins import SignIns
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
@@ -70,6 +71,7 @@ class Context:
     packer: Packer
     hub: Hub
     metrics: Metrics
+    readiness: Readiness
     sign_ins: SignIns
     rates: Rates
 

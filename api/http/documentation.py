@@ -21,7 +21,7 @@ from api.http.problems import (
     from_service,
 )
 from api.http.schemas import JOB_ID, SHA256
-from service.errors import RateLimitError, RefusedInputError, ServiceError
+from service.errors import DatabaseBusyError, DatabaseUnavailableError, RateLimitError, RefusedInputError, ServiceError
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -81,6 +81,8 @@ _ANYWHERE: tuple[ServiceError, ...] = (
     HeadTooLargeError("The request's line and headers have more than 131,072 bytes."),
     InternalError(),
     TooManyConnectionsError("There are 10,000 connections already. Try again later.", retry_after=5),
+    DatabaseUnavailableError("The service's database does not answer. Try again later.", retry_after=5),
+    DatabaseBusyError("The service's database is busy. Try again later.", retry_after=5),
 )
 _WITH_KEY: tuple[ServiceError, ...] = (
     RateLimitError(

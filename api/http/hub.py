@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pydantic_core import to_jsonable_python
 
 from api.http.schemas import utc
+from service.errors import DatabaseUnavailableError
 from service.store import Store
 from service.store.states import ENDED
 from service.store.tables import EventRow
@@ -106,17 +107,26 @@ class Hub:
     async def _events_after(self, job_id: str, channel: _Channel, after: int) -> list[Item]:
         if channel.last and after >= channel.base:
             return [item for item in channel.items if item.id > after]
-        rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
+        try:
+            rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
+        except DatabaseUnavailableError:  # the stream waits, and is woken once the database is back
+            return []
         return [_to_item(row) for row in rows]
 
     async def _poll(self) -> None:
+        away = False
         while True:
             await asyncio.sleep(_POLL_SECONDS)
             if not self._channels:
                 continue
             try:
                 await self._read_new_events()
-            except Exception:  # the store is away: watchers wait, and hear of it when it is back
+                away = False
+            except DatabaseUnavailableError as error:  # watchers wait, and hear of new events when it is back
+                if not away:
+                    _log.warning("events cannot be read: %s", error)
+                away = True
+            except Exception:
                 _log.exception("events could not be read")
 
     async def _read_new_events(self) -> None:

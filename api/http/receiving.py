@@ -29,17 +29,13 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
     """Write the request's body behind what is there; returns when the upload expires now."""
     writer = await asyncio.to_thread(_Writer, context, row, wanted)
     try:
-        async for block in body_blocks(request, context.settings):
-            await asyncio.to_thread(writer.write, block)
-    except ServiceError:
-        if wanted is None:
-            await asyncio.to_thread(writer.save)  # what has come is good
-        writer.close()
-        raise
-    except BaseException:
-        writer.close()
-        raise
-    try:
+        try:
+            async for block in body_blocks(request, context.settings):
+                await asyncio.to_thread(writer.write, block)
+        except ServiceError:
+            if wanted is None:
+                await asyncio.to_thread(writer.save)  # what has come is good
+            raise
         return await asyncio.to_thread(writer.finish)
     finally:
         writer.close()

@@ -191,12 +191,16 @@ class Blobs(ABC):
         for upload_id in self._inputs.expire_uploads():
             self.forget_upload(upload_id)
         removed = 0 if self._inputs.rolled_back else self._collect_blobs()
-        before = time.time() - _ORPHAN_SECONDS
+        before = self._expiry() - _ORPHAN_SECONDS
         for path in self.incoming.iterdir():
             if _older(path, before):
                 _remove(path)
                 removed += 1
         return removed
+
+    def _expiry(self) -> float:
+        """Return the time by which files expire: neither their machine's clock alone decides, nor the database's."""
+        return min(time.time(), self._inputs.expiry())
 
     @abstractmethod
     def _collect_blobs(self) -> int:
@@ -282,7 +286,7 @@ class BlobFolder(Blobs):
             (self._blobs / location).unlink(missing_ok=True)
             removed += 1
         known = self._inputs.locations()
-        before = time.time() - _ORPHAN_SECONDS
+        before = self._expiry() - _ORPHAN_SECONDS
         for path in self._blobs.glob("*/*"):
             if _older(path, before) and f"{path.parent.name}/{path.name}" not in known:
                 path.unlink(missing_ok=True)

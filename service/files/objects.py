@@ -235,14 +235,13 @@ class ObjectStore:
                 raise
             self._files.invalidate_cache()
 
-    def abort_old_parts(self, seconds: float) -> int:
-        """Give up objects that were begun in parts so long ago, and never finished; returns how many."""
+    def abort_old_parts(self, before: float) -> int:
+        """Give up objects that were begun in parts before that time, and never finished; returns how many."""
         if not self._s3:
             return 0
         bucket, _, prefix = self.root.partition("/")
         with self._told(prefix):
             found = self._files.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix)
-            before = time.time() - seconds
             old = [entry for entry in found.get("Uploads", ()) if entry["Initiated"].timestamp() < before]
             for entry in old:
                 self._files.call_s3(

@@ -200,12 +200,12 @@ class StoredBlobs(Blobs):
         if time.monotonic() - self._looked_at > _LOOK_SECONDS:
             self._looked_at = time.monotonic()
             self._take_over()
-            removed += self._collect_orphans() + self.objects.abort_old_parts(_ORPHAN_SECONDS)
+            removed += self._collect_orphans() + self.objects.abort_old_parts(self._expiry() - _ORPHAN_SECONDS)
         return removed
 
     def _collect_orphans(self) -> int:
         """Remove objects that a process which died had put, without their rows."""
-        before = time.time() - _ORPHAN_SECONDS
+        before = self._expiry() - _ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
         orphans = [name for name in old if name not in known]

@@ -17,14 +17,13 @@ import time
 from collections.abc import Callable, Sequence
 from types import FrameType
 
-from sqlalchemy.exc import SQLAlchemyError
-
-from service.errors import DamagedWeightsError, LeaseLostError
+from service.errors import DamagedWeightsError, DatabaseUnavailableError, LeaseLostError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.logs import set_up
 from service.private import keep_private
 from service.scheduling.backfill import Backfill, Holding
+from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant, Room
@@ -71,6 +70,7 @@ class Dispatcher:
         self._running: dict[str, RunningAttempt] = {}
         self._stop = threading.Event()
         self.name = own_name()
+        self._clocks = ClockWatch(store, settings.lease_seconds)
         self._work = settings.folder / "work" / self.name
         self._renewed_at = self._announced_at = self._strays_at = float("-inf")
         self._ended = threading.Event()
@@ -94,7 +94,7 @@ class Dispatcher:
         while not self._stop.is_set():
             try:
                 self._work_once()
-            except (SQLAlchemyError, OSError):  # the database is away or locked; leases run out if it stays so
+            except (DatabaseUnavailableError, OSError):  # the database is away or locked; leases run out if it stays so
                 _log.exception("the store cannot be reached")
                 self._stop.wait(2.0)
             self._stop.wait(self._settings.poll_seconds)
@@ -167,7 +167,7 @@ class Dispatcher:
 
             return is_harmless
 
-        lease = self._store.leases.take(self.name, fits, keeps, before)
+        lease = self._store.leases.take(self.name, fits, keeps, before, self._clocks.is_lost)
         return (lease, grant) if lease is not None and grant is not None else None
 
     def _start_attempt(self, lease: Lease, grant: Grant) -> None:
@@ -223,10 +223,10 @@ class Dispatcher:
         _log.info("shutting down: %d running jobs save their state", len(self._running))
         for attempt in self._running.values():
             attempt.release()
-        with contextlib.suppress(SQLAlchemyError):
+        with contextlib.suppress(DatabaseUnavailableError):
             self._store.operations.gone(self.name)
         while any(attempt.alive for attempt in self._running.values()):
-            with contextlib.suppress(SQLAlchemyError, LeaseLostError):
+            with contextlib.suppress(DatabaseUnavailableError, LeaseLostError):
                 self._renew_leases()
             time.sleep(0.2)
         self._ended.set()
@@ -245,6 +245,8 @@ class Dispatcher:
 
     def _keep_house(self) -> None:
         try:
+            if not self._clocks.confirm():
+                return
             for job_id in self._store.retention.expire():
                 self._artifacts.remove_job(job_id)
             for job_id, epoch in self._store.retention.unswept(_SWEEPS):

@@ -22,7 +22,7 @@ def remove_strays(store: Store, artifacts: Artifacts) -> int:
     """Delete stray files, and return how many; a database that has gone back in time cannot tell which these are."""
     if store.database.rolled_back:
         return 0
-    before = time.time() - _STRAY_SECONDS
+    before = min(time.time(), store.database.expiry()) - _STRAY_SECONDS
     old: dict[str, list[str]] = {}
     for name, changed in artifacts.objects.below("").items():
         job_id = name.partition("/")[0]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import time
 
-from sqlalchemy.exc import OperationalError
-
+from service.errors import DatabaseUnavailableError
 from service.settings import ServiceSettings
-from service.store.database import Clock, Database
+from service.store.clocks import Clock
+from service.store.database import ANSWER_SECONDS, Database
 from service.store.inputs import Inputs
 from service.store.jobs import Jobs
 from service.store.keys import Keys
@@ -26,10 +26,12 @@ _log = logging.getLogger(__name__)
 
 
 class Store:
-    """All parts of the store on one database."""
+    """All parts of the store on one database; for `clock` and `answer_seconds` see `Database`."""
 
-    def __init__(self, settings: ServiceSettings, clock: Clock = time.time) -> None:
-        self.database = Database(settings.database_url, clock)
+    def __init__(
+        self, settings: ServiceSettings, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS
+    ) -> None:
+        self.database = Database(settings.database_url, clock, answer_seconds)
         self.jobs = Jobs(self.database, settings.retention_seconds)
         policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
         self.leases = Leases(self.database, settings.lease_seconds, policy, settings.retention_seconds)
@@ -45,7 +47,12 @@ class Store:
         self.database.close()
 
 
-def open_store(settings: ServiceSettings, clock: Clock = time.time, patience: float = 0.0) -> Store:
+def open_store(
+    settings: ServiceSettings,
+    clock: Clock | None = None,
+    patience: float = 0.0,
+    answer_seconds: float = ANSWER_SECONDS,
+) -> Store:
     """The store, with its tables created or brought up to date.
 
     Args:
@@ -53,17 +60,17 @@ def open_store(settings: ServiceSettings, clock: Clock = time.time, patience: fl
             together, some are ready before it.
 
     Raises:
-        OperationalError: it does not answer.
+        DatabaseUnavailableError: It does not answer.
     """
-    store = Store(settings, clock)
+    store = Store(settings, clock, answer_seconds)
     until = time.monotonic() + (0.0 if store.database.sqlite else patience)
     while True:
         try:
             store.database.upgrade()
-        except OperationalError as error:
+        except DatabaseUnavailableError as error:
             if time.monotonic() >= until:
                 raise
-            _log.warning("the database does not answer yet: %s", type(error.orig).__name__)
+            _log.warning("the database does not answer yet: %s", error.__cause__ or error)
             time.sleep(_ASK_AGAIN_SECONDS)
         else:
             store.database.look_back()

@@ -7,6 +7,7 @@ from typing import Any
 from sqlalchemy import delete, insert
 from sqlalchemy.orm import Session
 
+from service.store.clocks import kept_until
 from service.store.database import count, new_id
 from service.store.states import JobStatus, Transition, next_status
 from service.store.tables import Base, BlobUseRow, DeliveryRow, EventRow, JobRow
@@ -31,7 +32,7 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
         retention: seconds that its results are kept.
     """
     status = next_status(job.status, transition)
-    job.finished_at, job.expires_at = now, now + retention
+    job.finished_at, job.expires_at = now, kept_until(session, now, retention)
     job.lease_owner = job.lease_expires_at = None
     move(session, job, transition, now)
     count(session, "sgsst_jobs_finished_total", f'status="{status}"')

@@ -82,7 +82,7 @@ class Inputs:
 
     def collect(self) -> list[str]:
         """Drop blobs that nobody has referred to for a while; returns their locations, for removing the files."""
-        before = self._database.clock() - GRACE_SECONDS
+        before = self._database.expiry() - GRACE_SECONDS
         used = exists().where(BlobUseRow.sha256 == BlobRow.sha256)
         with self._database.writing() as session:
             query = select(BlobRow).where(BlobRow.touched_at < before, ~used).limit(1000)
@@ -95,6 +95,10 @@ class Inputs:
     def rolled_back(self) -> bool:
         """Whether there may be files that the database should know and does not."""
         return self._database.rolled_back
+
+    def expiry(self) -> float:
+        """Return the time by which files expire."""
+        return self._database.expiry()
 
     def locations(self) -> set[str]:
         """All locations that rows refer to."""
@@ -221,8 +225,9 @@ class Inputs:
 
     def expire_uploads(self) -> list[str]:
         """Forget uploads whose time is over; returns their ids, for removing what has arrived of them."""
+        now = self._database.expiry()
         with self._database.writing() as session:
-            query = select(UploadRow).where(UploadRow.expires_at < self._database.clock()).limit(500)
+            query = select(UploadRow).where(UploadRow.expires_at < now).limit(500)
             rows = session.scalars(query.with_for_update(skip_locked=True)).all()
             for row in rows:
                 session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{row.id}"))

@@ -25,6 +25,8 @@ from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, ReservationRow, TurnRow
 from sgsst_core.errors import InfrastructureError
 
+#: Expiry of a lease whose dispatcher is known to be dead.
+RUN_OUT = 0.0
 #: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
 KEPT_PROGRESS = 200
 #: Attempts that are looked back at for how long to wait: by then the wait is as long as it gets.
@@ -81,6 +83,7 @@ class Leases:
         fits: Callable[[JobRow], bool] = lambda job: True,
         keeps: Callable[[JobRow], bool] = lambda job: True,
         before: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda kept: None,
+        is_lost: Callable[[JobRow], bool] = lambda job: True,
     ) -> Lease | None:
         """Take the next job: the highest priority, then the owner who has waited longest, then the oldest job.
 
@@ -97,6 +100,7 @@ class Leases:
             fits: whether there is room for a job.
             keeps: whether room is to be kept for a job that there is none for; one that is not is passed over.
             before: of a job that room is kept for, tells which jobs are no hindrance to it; None for no job.
+            is_lost: Whether a job whose lease has run out by the clock may be taken over; others are passed over.
         """
         passed: list[str] = []
         while True:
@@ -106,6 +110,9 @@ class Leases:
                 if job is None:
                     return None
                 lost = job.status in ACTIVE
+                if lost and not is_lost(job):
+                    passed.append(job.id)
+                    continue
                 if lost and self._close_lost(session, job, now):
                     continue
                 if fits(job):
@@ -190,10 +197,9 @@ class Leases:
 
     def run_out(self, dispatcher: str) -> None:
         """Let the leases of a dispatcher run out now, and its reservation: it is known to be dead."""
-        now = self._database.clock()
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
-            session.execute(update(JobRow).where(held).values(lease_expires_at=now - 1e-3))
+            session.execute(update(JobRow).where(held).values(lease_expires_at=RUN_OUT))
             session.execute(delete(ReservationRow).where(mine(dispatcher)))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:

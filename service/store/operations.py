@@ -15,9 +15,9 @@ from service.store.database import Database, upsert
 from service.store.states import JobStatus
 from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
 
-#: A dispatcher that was not heard of for so long is not coming back.
-_FORGET_SECONDS = 86_400.0
-_ALIVE = select(func.count()).select_from(DispatcherRow).where(DispatcherRow.seen_at >= bindparam("since"))
+#: Dispatchers that were heard of within a lease's time. A heartbeat of the future is that of a wrong clock.
+_IS_ALIVE = DispatcherRow.seen_at.between(bindparam("since"), bindparam("until"))
+_ALIVE = select(func.count()).select_from(DispatcherRow).where(_IS_ALIVE)
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,10 @@ class Operations:
         self._lease_seconds = lease_seconds
 
     def beat(self, name: str, places: int, free: int) -> None:
-        """A dispatcher is alive, and has so much room; those that were not heard of for long are forgotten."""
+        """Record that a dispatcher is alive, and how much room it has."""
         now = self._database.clock()
         values = {"seen_at": now, "places": places, "free": free}
         with self._database.writing() as session:
-            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
             insert = upsert(session)(DispatcherRow).values(name=name, **values)
             session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))
 
@@ -67,17 +66,35 @@ class Operations:
             session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
 
     def dispatchers(self) -> list[DispatcherRow]:
-        """Those that are alive: heard of within a lease's time."""
-        since = self._database.clock() - self._lease_seconds
+        """Return those that are alive: heard of within a lease's time."""
+        span = self._span()
         with self._database.reading() as session:
-            query = select(DispatcherRow).where(DispatcherRow.seen_at >= since).order_by(DispatcherRow.name)
-            return list(session.scalars(query))
+            return list(session.scalars(select(DispatcherRow).where(_IS_ALIVE).order_by(DispatcherRow.name), span))
 
     def alive(self) -> int:
-        """How many dispatchers are alive."""
-        since = self._database.clock() - self._lease_seconds
+        """Return how many dispatchers are alive."""
+        span = self._span()
         with self._database.reading_rows() as connection:
-            return connection.execute(_ALIVE, {"since": since}).scalar_one()
+            return connection.execute(_ALIVE, span).scalar_one()
+
+    def check(self) -> int:
+        """Prove that the database answers, as health checks do; returns how many dispatchers are alive.
+
+        Raises:
+            DatabaseUnavailableError: The database does not answer within some seconds.
+        """
+        span = self._span()
+        with self._database.aside() as connection:
+            return connection.execute(_ALIVE, span).scalar_one()
+
+    def heartbeats(self) -> dict[str, float]:
+        """Return when each dispatcher was heard of last, by its own clock and whether it is alive or not."""
+        with self._database.reading() as session:
+            return dict(session.execute(select(DispatcherRow.name, DispatcherRow.seen_at)).tuples().all())
+
+    def _span(self) -> dict[str, float]:
+        now = self._database.clock()
+        return {"since": now - self._lease_seconds, "until": now + self._lease_seconds}
 
     def counters(self) -> list[tuple[str, str, float]]:
         """Name, labels and value of every counter."""

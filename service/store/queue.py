@@ -34,18 +34,26 @@ from service.store.database import upsert
 from service.store.states import ACTIVE, JobStatus
 from service.store.tables import JobRow, ReservationRow, TurnRow
 
+#: Seconds that no lease and no wait before an attempt takes: a time that is farther ahead is that of a wrong clock.
+_IMPLAUSIBLE_SECONDS = 3600.0
 #: Of a reservation's time that has to be left, or it is renewed: not every look at the queue is a write.
 _RENEW_SHARE = 0.5
 
 
 def queued_now(now: float | BindParameter[float]) -> ColumnElement[bool]:
     """Queued, and to be started."""
-    return and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= now)
+    return and_(JobRow.status == JobStatus.QUEUED, _may_start(JobRow, now))
 
 
 def expired(now: float | BindParameter[float]) -> ColumnElement[bool]:
-    """Held by a dispatcher that was not heard of again."""
-    return and_(JobRow.lease_expires_at < now, JobRow.status.in_(ACTIVE))
+    """Held by a dispatcher that was not heard of again, by this clock; see `service.scheduling.clock_watch`."""
+    expires = JobRow.lease_expires_at
+    return and_(or_(expires < now, expires > now + _IMPLAUSIBLE_SECONDS), JobRow.status.in_(ACTIVE))
+
+
+def _may_start(job: type[JobRow], now: float | BindParameter[float]) -> ColumnElement[bool]:
+    """Whether a queued job has waited as long as it was to wait."""
+    return or_(job.not_before <= now, job.not_before > now + _IMPLAUSIBLE_SECONDS)
 
 
 def _count(condition: ColumnElement[bool]) -> Select[int]:
@@ -124,7 +132,7 @@ def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) 
     owners = owners.union_all(select(following).where(owners.c.owner.is_not(None)))
     each = (
         select(job.id)
-        .where(queued, job.owner == owners.c.owner, job.not_before <= now, job.id.not_in(passed))
+        .where(queued, job.owner == owners.c.owner, _may_start(job, now), job.id.not_in(passed))
         .order_by(job.priority.desc(), job.queued_at, job.id)
         .limit(1)
         .scalar_subquery()

@@ -5,9 +5,13 @@ from __future__ import annotations
 from sqlalchemy import and_, delete, select, update
 
 from service.store.changes import forget, move, release_inputs
+from service.store.clocks import advance_expiry_time, expiry_time, kept_until
 from service.store.database import IDEMPOTENCY_SECONDS, Database
 from service.store.states import FINISHED, JobStatus, Transition
-from service.store.tables import ArtifactRow, IdempotencyRow, JobRow
+from service.store.tables import ArtifactRow, DispatcherRow, IdempotencyRow, JobRow
+
+#: Seconds after which a dispatcher that was not heard of is forgotten.
+_FORGET_SECONDS = 86_400.0
 
 
 class Retention:
@@ -21,23 +25,35 @@ class Retention:
         self._database = database
         self._retention = retention
 
+    def advance(self, seconds: float) -> None:
+        """Move the expiry time on, by which everything expires (`service.store.clocks`).
+
+        Args:
+            seconds: Time that the caller has worked since it moved it last, by its monotonic clock.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            advance_expiry_time(session, now, seconds)
+
     def expire(self) -> list[str]:
         """End the time of results that have been kept long enough, and forget jobs long after.
 
         Returns:
             Ids of jobs whose files are to be removed.
         """
-        now = self._database.clock()
+        clock = self._database.clock()
         with self._database.writing() as session:
+            now = expiry_time(session, clock)
             due = session.scalars(select(JobRow).where(JobRow.expires_at < now).limit(100).with_for_update()).all()
             for job in due:
                 if job.status == JobStatus.EXPIRED:
                     forget(session, job)
                     continue
-                job.expires_at = now + self._retention
+                job.expires_at = kept_until(session, clock, self._retention)
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
                 release_inputs(session, job.id)
-                move(session, job, Transition.EXPIRE, now)
+                move(session, job, Transition.EXPIRE, clock)
+            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
             return [job.id for job in due]
 

@@ -6,6 +6,7 @@ import secrets
 
 from sqlalchemy import bindparam, delete, select
 
+from service.store.clocks import expiry_time
 from service.store.database import Database
 from service.store.keys import digest
 from service.store.tables import Base, KeyRow, SessionRow
@@ -40,7 +41,7 @@ class Sessions:
         """A new session of a key, and the only copy of its text; sessions that have expired are forgotten."""
         text, now = secrets.token_urlsafe(32), self._database.clock()
         with self._database.writing() as session:
-            session.execute(delete(SessionRow).where(SessionRow.expires_at <= now))
+            session.execute(delete(SessionRow).where(SessionRow.expires_at <= expiry_time(session, now)))
             mine = select(SessionRow.sha256).where(SessionRow.key_id == key_id)
             old = session.scalars(mine.order_by(SessionRow.created_at.desc()).offset(MOST_SESSIONS - 1)).all()
             session.execute(delete(SessionRow).where(SessionRow.sha256.in_(old)))

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from sqlalchemy.exc import OperationalError
 
+from service.errors import DatabaseUnavailableError
 from service.health import dispatcher_is_well
 from service.prepare import main as prepare
 from service.scheduling.identity import is_dead, is_of_this_machine, own_name
@@ -60,10 +60,10 @@ def test_a_database_is_asked_again_for_as_long_as_the_settings_say() -> None:
 
         threading.Thread(target=refuse, daemon=True).start()
         url = f"postgresql+psycopg://nobody@127.0.0.1:{server.getsockname()[1]}/none"
-        with pytest.raises(OperationalError):
+        with pytest.raises(DatabaseUnavailableError):
             open_store(ServiceSettings(database=url))
         once = len(asked)
-        with pytest.raises(OperationalError):
+        with pytest.raises(DatabaseUnavailableError):
             open_store(ServiceSettings(database=url), patience=2.5)
         assert len(asked) >= 3 * once
 

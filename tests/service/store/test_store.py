@@ -304,6 +304,7 @@ def test_dispatchers_are_alive_as_long_as_they_are_heard_of(store: Store, clock:
     assert operations.dispatchers() == []
     clock.now += 2 * 86_400
     operations.beat("three", 1, 1)
+    store.retention.expire()
     with store.database.reading() as session:
         assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
 

@@ -1,0 +1,80 @@
+"""What a dispatcher believes of times that other machines have written, by its own monotonic clock."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from service.store import Store
+from service.store.leases import RUN_OUT
+from service.store.tables import JobRow
+
+#: Seconds that clocks of machines which work together may differ.
+_TOLERANCE = 60.0
+
+_log = logging.getLogger(__name__)
+
+
+class ClockWatch:
+    """A dispatcher's doubts about clocks.
+
+    On PostgreSQL all times are those of the server. On SQLite each process writes those of its own machine, and one of
+    them may be wrong. So a lease that has run out by this clock is not lost yet: it is once it has not been renewed for
+    another lease's time of the monotonic clock, in which its holder would have renewed it several times. And nothing is
+    deleted while another dispatcher sends heartbeats whose times do not agree with this clock.
+
+    Args:
+        lease_seconds: Seconds that a lease holds.
+        monotonic: Monotonic clock.
+    """
+
+    def __init__(self, store: Store, lease_seconds: float, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._lease_seconds, self._monotonic = store, lease_seconds, monotonic
+        self._run_out: dict[str, tuple[tuple[int, float], float]] = {}
+        self._heard: dict[str, float] = {}
+        self._heard_at: float | None = None
+
+    def is_lost(self, job: JobRow) -> bool:
+        """Return whether a job whose lease has run out, by the database's times, may be taken over."""
+        expires, database = job.lease_expires_at, self._store.database
+        if expires is None or expires == RUN_OUT:
+            return True
+        if not database.sqlite and expires < database.clock():
+            return True
+        lease, now = (job.lease_epoch, expires), self._monotonic()
+        seen, since = self._run_out.get(job.id, (None, now))
+        if seen == lease and now - since >= self._lease_seconds:
+            del self._run_out[job.id]
+            return True
+        if seen != lease:
+            self._run_out[job.id] = lease, now
+        return False
+
+    def confirm(self) -> bool:
+        """Move the expiry time on if no live dispatcher contradicts this clock; returns whether things may be deleted.
+
+        A heartbeat that has come since the last call was sent in the time since then, this dispatcher's own included:
+        so a clock that has just been changed is noticed as well. Heartbeats that have not changed are of dispatchers
+        that may be dead, and say nothing.
+        """
+        before, now = self._heard_at, self._monotonic()
+        since = 0.0 if before is None else now - before
+        clock, known = self._store.database.clock(), self._heard
+        self._heard, self._heard_at = self._store.operations.heartbeats(), now
+        off = {
+            name: seen - clock
+            for name, seen in self._heard.items()
+            if name in known and seen != known[name] and not -since - _TOLERANCE <= seen - clock <= _TOLERANCE
+        }
+        if off:
+            name, seconds = max(off.items(), key=lambda item: abs(item[1]))
+            _log.error(
+                "the clock of dispatcher %s is %+.0f s off this one's: nothing is deleted until both agree. "
+                "Set the clocks of all machines by NTP.",
+                name,
+                seconds,
+            )
+            return False
+        self._store.retention.advance(since)
+        return True

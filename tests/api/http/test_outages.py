@@ -1,0 +1,252 @@
+"""The database is stopped, killed or locked: requests get 503 with Retry-After, and health checks answer."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.http.app import create_app
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from tests.api.http.test_api import TUS, form, refused
+from tests.api.service import Service, wait_for
+from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
+from tests.small_scenes import wall, write_files
+
+#: Requests at a time: more than the threads that an API process has for them.
+MANY = 60
+#: Seconds that a health check may take on a busy machine. It would take minutes if it waited for requests.
+HEALTH_SECONDS = 10.0
+#: Operations that need no database.
+WITHOUT_DATABASE = {("get", "/livez"), ("get", "/readyz"), ("options", "/v1/uploads")}
+CODES = ("database-unavailable", "database-busy")
+
+
+@dataclass
+class Outage:
+    """A service whose database can be taken away."""
+
+    service: Service
+    key: str
+    job_id: str
+    upload_id: str
+    postgres: Postgres
+
+    def client(self) -> httpx.Client:
+        """To talk to it, with a key."""
+        return self.service.client(self.key)
+
+    @contextlib.contextmanager
+    def kind(self, name: str) -> Iterator[None]:
+        """Take the database away for as long as the block takes."""
+        self.postgres.signal(signal.SIGSTOP if name == "stopped" else signal.SIGKILL)
+        try:
+            yield
+        finally:
+            self.back(name)
+
+    def back(self, name: str) -> None:
+        """Bring it back, and wait until the service has noticed."""
+        if name == "stopped":
+            self.postgres.signal(signal.SIGCONT)
+        else:
+            self.postgres.start()
+        with self.client() as client:
+            wait_for(lambda: client.get(f"/v1/jobs/{self.job_id}").status_code == 200, "reads", self.service.said)
+            wait_for(lambda: create_upload(client).status_code == 201, "writes", self.service.said)
+
+
+def create_upload(client: httpx.Client) -> httpx.Response:
+    return client.post("/v1/uploads", headers={**TUS, "Upload-Length": "100"})
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
+
+
+def open_service(data: Path, database: str | None, files: dict[str, bytes]) -> Iterator[tuple[Service, str, str, str]]:
+    """Yield a service with keys, a key, a job and an upload of its holder."""
+    settings = {"SGSST_REQUIRE_KEYS": "true", **({"SGSST_DATABASE": database} if database else {})}
+    with Service(data, alone=True, **settings) as service:
+        store = open_store(ServiceSettings(data=data, database=database))
+        _, key = store.keys.create("me")
+        store.close()
+        with service.client(key) as client:
+            answer = client.post("/v1/jobs", files=form(files))
+            assert answer.status_code == 202, answer.text
+            yield service, key, answer.json()["id"], create_upload(client).json()["id"]
+
+
+@pytest.fixture(scope="module")
+def outage(tmp_path_factory: pytest.TempPathFactory, files: dict[str, bytes]) -> Iterator[Outage]:
+    if not is_installed():
+        pytest.skip("PostgreSQL's server is not installed")
+    with controlled_server() as postgres:
+        made = open_service(tmp_path_factory.mktemp("outage") / "data", fresh_database(postgres.url), files)
+        for service, key, job_id, upload_id in made:
+            yield Outage(service, key, job_id, upload_id, postgres)
+
+
+@cache
+def operations() -> list[tuple[str, str]]:
+    """Every operation of the API that needs the database: method and path."""
+    document = create_app(ServiceSettings()).openapi()
+    found = [(method, path) for path, methods in document["paths"].items() for method in methods]
+    return [each for each in found if each not in WITHOUT_DATABASE]
+
+
+def request(client: httpx.Client, method: str, path: str, outage: Outage, files: dict[str, bytes]) -> httpx.Response:
+    """Send a request that would succeed, or be refused for the job's state, if the database were there."""
+    told: dict[str, Any] = {}
+    if (method, path) == ("post", "/v1/jobs"):
+        told = {"files": form(files)}
+    elif path.startswith("/v1/uploads"):
+        told = {"headers": {**TUS, "Upload-Length": "100"}}
+    elif path == "/v1/session":
+        told = {"headers": {"Cookie": "sgsst_session=x", "Origin": outage.service.url}}
+    if path == "/v1/session" and method == "post":
+        told["json"] = {"key": outage.key}
+    if method == "patch":
+        told["headers"] |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+        told["content"] = b"x" * 10
+    values = {"job_id": outage.job_id, "upload_id": outage.upload_id, "role": "scene", "name": "stylized.ply"}
+    return client.request(method, path.format(**values), **told)
+
+
+def check_away(answer: httpx.Response) -> None:
+    """Fail unless it says that the database is away, and when to come back."""
+    assert answer.status_code == 503, (answer.request.method, str(answer.request.url), answer.text)
+    assert int(answer.headers["retry-after"]) > 0
+    if answer.request.method != "HEAD":
+        refused(answer, 503, answer.json()["code"])
+        assert answer.json()["code"] in CODES
+
+
+def check_health(service: Service, ready: int) -> None:
+    """Fail unless both health checks answer."""
+    assert httpx.get(f"{service.url}/livez", timeout=HEALTH_SECONDS).status_code == 200
+    answer = httpx.get(f"{service.url}/readyz", timeout=HEALTH_SECONDS)
+    assert answer.status_code == ready, answer.text
+    assert (answer.json()["checks"]["database"] == "ok") == (ready == 200)
+
+
+def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
+    """Begin MANY requests; the block's end waits for their answers and checks them."""
+    stack = contextlib.ExitStack()
+    pool = stack.enter_context(ThreadPoolExecutor(MANY))
+    answers = [pool.submit(send) for _ in range(MANY)]
+
+    def check_all() -> None:
+        for answer in answers:
+            check_away(answer.result())
+
+    stack.callback(check_all)
+    return stack
+
+
+@pytest.mark.parametrize("kind", ["killed", "stopped"])
+def test_every_operation_says_that_the_database_is_away(outage: Outage, files: dict[str, bytes], kind: str) -> None:
+    with outage.client() as client, outage.kind(kind), ThreadPoolExecutor(len(operations())) as pool:
+        for answer in pool.map(lambda each: request(client, each[0], each[1], outage, files), operations()):
+            check_away(answer)
+        check_health(outage.service, 503)
+    check_health(outage.service, 200)
+    assert "Traceback" not in outage.service.said()
+
+
+def test_health_checks_answer_beside_requests_that_wait(outage: Outage) -> None:
+    with outage.client() as client, outage.kind("stopped"), at_once(lambda: client.get("/v1/jobs")):
+        for _ in range(3):
+            check_health(outage.service, 503)
+
+
+def test_a_stream_goes_on_when_the_database_is_back(outage: Outage, files: dict[str, bytes]) -> None:
+    with outage.client() as client, outage.client() as other:
+        job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
+        with client.stream("GET", f"/v1/jobs/{job_id}/events") as stream:
+            lines = stream.iter_lines()
+            assert (
+                next(line for line in lines if line.startswith("data: ")) == 'data: {"status": "queued", "attempt": 0}'
+            )
+            with outage.kind("killed"):
+                check_away(other.get(f"/v1/jobs/{job_id}"))
+            assert other.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
+            told = [json.loads(line[6:]) for line in lines if line.startswith("data: ")]
+            assert told[-1]["status"] == "canceled"
+
+
+@pytest.mark.parametrize("kind", ["killed", "stopped"])
+def test_an_upload_in_the_middle_can_be_resumed(outage: Outage, kind: str) -> None:
+    with outage.client() as client, contextlib.ExitStack() as away:
+        place = create_upload(client).headers["location"]
+
+        def body() -> Iterator[bytes]:
+            yield b"x" * 50
+            away.enter_context(outage.kind(kind))
+            yield b"y" * 50
+
+        sent = {**TUS, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+        check_away(client.patch(place, content=body(), headers=sent))
+        away.close()
+        offset = int(client.head(place, headers=TUS).headers["upload-offset"])
+        sent["Upload-Offset"] = str(offset)
+        answer = client.patch(place, content=(b"x" * 50 + b"y" * 50)[offset:], headers=sent)
+        assert (answer.status_code, answer.headers["upload-offset"]) == (204, "100")
+
+
+def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[str, bytes]) -> None:
+    for service, key, job_id, _ in open_service(tmp_path / "data", None, files):
+        with service.client(key) as client, contextlib.closing(sqlite3.connect(service.data / "sgsst.db")) as other:
+            other.isolation_level = None
+            other.execute("BEGIN EXCLUSIVE")
+            with at_once(lambda: create_upload(client)):
+                for _ in range(3):
+                    check_health(service, 200)
+            refused(create_upload(client), 503, "database-busy")
+            assert client.get(f"/v1/jobs/{job_id}").status_code == 200
+            sign_in = client.post("/v1/session", json={"key": key}, headers={"Origin": service.url})
+            refused(sign_in, 503, "database-busy")
+            other.execute("ROLLBACK")
+            assert create_upload(client).status_code == 201
+            assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
+
+
+def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) -> None:
+    """One writer at a time tries a database that was locked; the others do not wait for their own time-outs."""
+    store: Store = open_store(ServiceSettings(data=tmp_path), answer_seconds=0.5)
+    with contextlib.closing(sqlite3.connect(tmp_path / "sgsst.db")) as other:
+        other.isolation_level = None
+        other.execute("BEGIN EXCLUSIVE")
+        refusals: list[Exception] = []
+
+        def write() -> None:
+            try:
+                store.operations.beat("one", 1, 1)
+            except Exception as error:
+                refusals.append(error)
+
+        threads = [threading.Thread(target=write) for _ in range(MANY)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [type(error).__name__ for error in refusals] == ["DatabaseBusyError"] * MANY
+        assert store.operations.check() == 0
+        other.execute("ROLLBACK")
+    store.operations.beat("one", 1, 1)
+    assert store.operations.alive() == 1
+    store.close()

@@ -1,0 +1,271 @@
+"""One wrong clock beside a right one: nothing is deleted, and no lease of a live dispatcher is taken."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from service.files.artifacts import Artifacts
+from service.scheduling.clock_watch import ClockWatch
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.clocks import CATCH_UP
+from service.store.jobs import NewJob
+from service.store.leases import Lease
+from service.store.tables import DispatcherRow
+from tests.api.service import ROOT, SETTINGS, wait_for
+from tests.postgres import fresh_database, is_installed, server
+from tests.service.store.helpers import Clock
+
+SHA = "a" * 64
+DAY = 86_400.0
+LEASE = 3.0
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[str]:
+    """A PostgreSQL server of our own; skipped where none is installed."""
+    if not is_installed():
+        pytest.skip("PostgreSQL's server is not installed")
+    with server() as url:
+        yield url
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def settings(request: pytest.FixtureRequest, tmp_path: Path) -> ServiceSettings:
+    """Settings of a service with an empty database and short leases."""
+    database = None if request.param == "sqlite" else fresh_database(request.getfixturevalue("postgres"))
+    return ServiceSettings(data=tmp_path / "data", database=database, poll_seconds=0.05, lease_seconds=LEASE)
+
+
+@pytest.fixture
+def store(settings: ServiceSettings) -> Iterator[Store]:
+    made = open_store(settings)
+    made.inputs.add_blob(SHA, "aa/blob", 3)
+    yield made
+    made.close()
+
+
+def leased(store: Store, dispatcher: str) -> Lease:
+    """Return the lease of a new job."""
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
+    found = store.leases.take(dispatcher)
+    assert found is not None
+    return found
+
+
+def heartbeats(store: Store) -> dict[str, float]:
+    """Return the newest heartbeat of each dispatcher, plausible or not."""
+    with store.database.reading() as session:
+        return {row.name: row.seen_at for row in session.scalars(select(DispatcherRow))}
+
+
+@contextmanager
+def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
+    """Renew a lease and beat, as a dispatcher with the right clock does; yields the statuses of the lease."""
+    stop, found = threading.Event(), list[object]()
+
+    def work() -> None:
+        while not stop.wait(0.2):
+            store.operations.beat(held.dispatcher, 1, 0)
+            found.append(store.leases.renew([held])[held.job_id])
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield found
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def wrong_dispatcher(settings: ServiceSettings, seconds: float) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the dispatcher's own process with a clock that is wrong by so much."""
+    environment = {
+        **os.environ,
+        **SETTINGS,
+        "PYTHONPATH": str(ROOT),
+        "SGSST_DATA": str(settings.data),
+        "SGSST_DATABASE": settings.database_url,
+        "SGSST_LEASE_SECONDS": str(settings.lease_seconds),
+        "SGSST_POLL_SECONDS": "0.05",
+        "SGSST_PARALLEL_JOBS": "2",
+    }
+    command = [sys.executable, "-m", "tests.shifted_clock", str(seconds), "service.scheduling.dispatcher"]
+    process = subprocess.Popen(command, env=environment, cwd=ROOT)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("seconds", [31 * DAY, -31 * DAY], ids=["ahead", "behind"])
+def test_a_dispatcher_a_month_off_deletes_nothing(
+    settings: ServiceSettings, store: Store, tmp_path: Path, seconds: float
+) -> None:
+    artifacts = Artifacts(settings.artifacts_url)
+    source = tmp_path / "stylized.ply"
+    source.write_bytes(b"ply")
+    ended = []
+    for _ in range(3):
+        done = leased(store, "healthy-00000000-1-1")
+        result = artifacts.put(done.job_id, done.epoch, "stylized.ply", source)
+        store.leases.succeed(done, [result], {})
+        ended.append((done.job_id, result))
+    incoming = settings.folder / "incoming" / "arrives.part"
+    incoming.parent.mkdir(parents=True, exist_ok=True)
+    incoming.write_bytes(b"on its way")
+    held = leased(store, "healthy-00000000-1-1")
+    # the wrong heartbeat is there before the first housekeeping, which the process does on a thread of its own
+    with store_with_clock(settings, seconds) as (wrong, _, _):
+        wrong.operations.beat("wrong-00000000-1-1", 1, 1)
+    with healthy(store, held) as statuses, wrong_dispatcher(settings, seconds) as process:
+        wait_for(lambda: store.retention.unswept(10) == [] or process.poll(), "the first housekeeping")
+        wait_for(
+            lambda: heartbeats(store).keys() - {"healthy-00000000-1-1", "wrong-00000000-1-1"} or process.poll(),
+            "the wrong dispatcher's heartbeat",
+        )
+        assert process.poll() is None
+    assert set(statuses) == {"starting"}, "the lease was never lost"
+    assert [store.jobs.get(job_id, None).status for job_id, _ in ended] == ["succeeded"] * 3
+    for job_id, result in ended:
+        assert [row.name for row in store.jobs.artifacts(job_id)] == ["stylized.ply"]
+        assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"
+    assert incoming.exists()
+    assert store.inputs.blobs([SHA])
+
+
+def test_a_dispatcher_two_minutes_ahead_takes_no_healthy_lease(settings: ServiceSettings, store: Store) -> None:
+    held = leased(store, "healthy-00000000-1-1")
+    with healthy(store, held) as statuses, wrong_dispatcher(settings, 120.0) as process:
+        beats = set[float]()
+
+        def beaten() -> bool:
+            beats.update(at for name, at in heartbeats(store).items() if name != held.dispatcher)
+            return len(beats) > 8
+
+        wait_for(lambda: beaten() or process.poll(), "several leases' time of the wrong dispatcher")
+        assert process.poll() is None
+    assert set(statuses) == {"starting"}, "the lease was never lost"
+    assert [row.outcome for row in store.jobs.detail(held.job_id, None)[2]] == [None]
+    assert time.time() - store.database.clock() == pytest.approx(0.0, abs=30.0)
+
+
+# --- with clocks that the tests turn ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def store_with_clock(settings: ServiceSettings, wrong_by: float) -> Iterator[tuple[Store, ClockWatch, Clock]]:
+    """Open the same database with a clock that is wrong by so much, and the doubts of a dispatcher there."""
+    store, monotonic = open_store(settings, lambda: time.time() + wrong_by), Clock()
+    try:
+        yield store, ClockWatch(store, LEASE, monotonic), monotonic
+    finally:
+        store.close()
+
+
+def test_a_lease_is_lost_once_it_is_silent_for_long_enough(tmp_path: Path) -> None:
+    settings = ServiceSettings(data=tmp_path, lease_seconds=LEASE)
+    with store_with_clock(settings, 0.0) as (store, _, _), store_with_clock(settings, 120.0) as (ahead, watch, clock):
+        store.inputs.add_blob(SHA, "aa/blob", 3)
+        held = leased(store, "healthy")
+        for _ in range(5):
+            assert ahead.leases.take("wrong", is_lost=watch.is_lost) is None
+            clock.now += 0.9 * LEASE
+            store.leases.renew([held])
+        assert ahead.leases.take("wrong", is_lost=watch.is_lost) is None
+        clock.now += LEASE
+        assert ahead.leases.take("wrong", is_lost=watch.is_lost) is not None
+
+
+def test_a_dead_dispatcher_of_this_machine_is_not_waited_for(tmp_path: Path) -> None:
+    with store_with_clock(ServiceSettings(data=tmp_path, lease_seconds=LEASE), 0.0) as (store, watch, _):
+        store.inputs.add_blob(SHA, "aa/blob", 3)
+        leased(store, "dead")
+        assert store.leases.take("new", is_lost=watch.is_lost) is None
+        store.leases.run_out("dead")
+        assert store.leases.take("new", is_lost=watch.is_lost) is not None
+
+
+def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSettings, store: Store) -> None:
+    """Neither the lease of its dispatcher, which has died, nor a job that was queued by it."""
+    with (
+        store_with_clock(settings, 31 * DAY) as (ahead, _, _),
+        store_with_clock(settings, 0.0) as (right, watch, clock),
+    ):
+        lost = leased(ahead, "ahead")
+        assert right.leases.take("right", is_lost=watch.is_lost) is None
+        clock.now += LEASE
+        again = right.leases.take("right", is_lost=watch.is_lost)
+        assert again is not None
+        assert again.job_id == lost.job_id
+        scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+        queued, _ = ahead.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
+        found = right.leases.take("right", is_lost=watch.is_lost)
+        assert found is not None
+        assert found.job_id == queued.id
+
+
+def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(settings: ServiceSettings) -> None:
+    """A machine that was off for 40 days, or a clock that is ahead: nobody can tell."""
+    clock = Clock()
+    store = open_store(settings, clock)
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    done = leased(store, "one")
+    store.leases.succeed(done, [], {})
+    store.retention.advance(0.0)
+    clock.now += 40 * DAY
+    store.retention.advance(60.0)
+    assert store.retention.expire() == []
+    assert store.inputs.collect() == []
+    store.close()
+    store = open_store(settings, clock)  # and the next process goes on from there
+    store.retention.advance(29 * DAY / CATCH_UP)
+    assert store.retention.expire() == []
+    store.retention.advance(2 * DAY / CATCH_UP)
+    assert store.retention.expire() == [done.job_id]
+    store.retention.advance(1000 * DAY)
+    assert store.database.expiry() == clock.now, "it is never ahead of the clock"
+    store.close()
+
+
+def test_results_that_a_clock_behind_has_finished_are_kept_as_long(settings: ServiceSettings, store: Store) -> None:
+    store.retention.advance(0.0)
+    held = leased(store, "behind")
+    with store_with_clock(settings, -31 * DAY) as (behind, _, _):
+        behind.leases.succeed(held, [], {})
+    expires = store.jobs.get(held.job_id, None).expires_at
+    assert expires is not None
+    assert expires > store.database.clock() + settings.retention_seconds - 600
+
+
+@pytest.mark.parametrize("wrong_by", [120.0, -120.0, 31 * DAY])
+def test_nothing_is_deleted_while_live_dispatchers_disagree(
+    settings: ServiceSettings, store: Store, wrong_by: float
+) -> None:
+    with store_with_clock(settings, wrong_by) as (wrong, watch, clock):
+        monotonic = Clock()
+        store.retention.advance(0.0)
+        right_watch = ClockWatch(store, LEASE, monotonic)
+        for passing in (True, False, False):  # the first look has nothing to compare with, and moves nothing on
+            store.operations.beat("healthy", 1, 1)
+            wrong.operations.beat("wrong", 1, 1)
+            before = wrong.database.expiry()
+            assert watch.confirm() == passing
+            assert right_watch.confirm() == passing, "nobody knows who is right"
+            assert wrong.database.expiry() <= max(before, store.database.clock())
+            clock.now, monotonic.now = clock.now + 1.0, monotonic.now + 1.0
+        wrong.operations.beat("wrong", 1, 1)  # it knows of its own heartbeats, and hears of no other any more
+        assert watch.confirm()
