@@ -208,8 +208,9 @@ def name_of(case: schemathesis.Case) -> str:
 
 def _upload(client: httpx.Client, path: Path) -> str:
     name = base64.b64encode(path.name.encode()).decode()
-    headers = {"Upload-Length": str(path.stat().st_size), "Upload-Metadata": f"filename {name}"}
+    tus = {"Tus-Resumable": "1.0.0"}
+    headers = {**tus, "Upload-Length": str(path.stat().st_size), "Upload-Metadata": f"filename {name}"}
     made = client.post("/v1/uploads", headers=headers).json()
-    headers = {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+    headers = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
     client.patch(f"/v1/uploads/{made['id']}", content=path.read_bytes(), headers=headers)
     return str(made["id"])
