@@ -47,9 +47,9 @@ class TextFormatter(logging.Formatter):
 
 
 def _value(value: object) -> str:
-    """Return a value as one word, in quotes if it would be several."""
+    """Return a value as one word, in quotes unless it is one of letters alone."""
     text = str(value)
-    return text if re.fullmatch(r'[^\s"\\]+', text) else json.dumps(text)
+    return text if text.isprintable() and re.fullmatch(r'[^\s"\\]+', text) else json.dumps(text)
 
 
 def _printable(text: str) -> str:
