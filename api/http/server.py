@@ -34,7 +34,7 @@ def main() -> None:
     Connection.most = min(settings.max_connections, _affordable_connections())
     config = uvicorn.Config(
         create_app(settings),
-        http=Reader,
+        http=Reader,  # type: ignore[arg-type]  # a BufferedProtocol will do, too
         ws="none",
         host=settings.host,
         port=settings.port,

@@ -790,7 +790,7 @@ def send(client: httpx.Client, where: str, offset: object, data: Any, **headers:
 
 
 #: What Python's `int` takes for a number.
-NO_DIGITS = ["1_0", "+10", "10.0", "1 0", "\u0661\u0660".encode(), "\uff11\uff10".encode()]
+NO_DIGITS: list[Any] = ["1_0", "+10", "10.0", "1 0", "\u0661\u0660".encode(), "\uff11\uff10".encode()]
 
 
 def test_numbers_are_digits_alone(client: httpx.Client, service: Service, done: str) -> None:
