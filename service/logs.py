@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
+import textwrap
 import time
 
 _OWN = ("job", "attempt", "method", "path", "status", "seconds", "owner")
@@ -28,14 +30,31 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Time, level, message, and the job where there is one."""
+    """Time, level, message, and the job where there is one.
+
+    A record starts at the beginning of a line and nothing else does, whatever text of a request it repeats.
+    """
 
     def format(self, record: logging.LogRecord) -> str:
         """As the base class."""
-        own = " ".join(f"{name}={getattr(record, name)}" for name in _OWN if hasattr(record, name))
+        own = " ".join(f"{name}={_value(getattr(record, name))}" for name in _OWN if hasattr(record, name))
         line = f"{self.formatTime(record, '%H:%M:%S')} {record.levelname.lower():<7} {record.getMessage()}"
-        line += f"  {own}" if own else ""
-        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+        line = _printable(f"{line}  {own}" if own else line)
+        if record.exc_info:
+            trace = "\n".join(_printable(part) for part in self.formatException(record.exc_info).split("\n"))
+            line += "\n" + textwrap.indent(trace, "  ")
+        return line
+
+
+def _value(value: object) -> str:
+    """Return a value as one word, in quotes unless it is one of letters alone."""
+    text = str(value)
+    return text if text.isprintable() and re.fullmatch(r'[^\s"\\]+', text) else json.dumps(text)
+
+
+def _printable(text: str) -> str:
+    """Return a text with escapes for what would end its line, steer a terminal, or change the order of its letters."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 def set_up(form: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from functools import cached_property
 from pathlib import Path
 
@@ -9,6 +10,14 @@ from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MB, GB = 1_000_000, 1_000_000_000
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host is `localhost` or a loopback address; no other name counts, wherever it leads."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 class ServiceSettings(BaseSettings):
@@ -31,6 +40,8 @@ class ServiceSettings(BaseSettings):
         max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: quotas
             of keys that have none of their own (`service.store.quotas`); None for no bound.
         max_connections: to one process of the API at the same time, watchers included.
+        trusted_proxies: Addresses and networks of reverse proxies, separated by commas, whose `X-Forwarded-For` and
+            `X-Forwarded-Proto` are believed; empty for none.
         min_free_bytes: nothing is taken in once the disk has less left.
         inspection_seconds, inspection_bytes: what checking a job's files may take, processor time and memory; their
             size adds to both (`service.inspection.inspector`).
@@ -75,6 +86,7 @@ class ServiceSettings(BaseSettings):
     max_bytes_per_key: int | None = Field(None, ge=0)
     max_requests_a_second_per_key: float | None = Field(None, gt=0)
     max_connections: int = Field(10_000, gt=0)
+    trusted_proxies: str = ""
     min_free_bytes: int = Field(2 * GB, ge=0)
     file_cache_bytes: int = Field(50 * GB, ge=0)
     inspection_seconds: float = Field(120, gt=0)
@@ -129,7 +141,7 @@ class ServiceSettings(BaseSettings):
     @property
     def on_loopback(self) -> bool:
         """Whether only programs of this machine can reach the API."""
-        return self.host in ("localhost", "::1") or self.host.startswith("127.")
+        return is_loopback(self.host)
 
     @property
     def keys_required(self) -> bool:

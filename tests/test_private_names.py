@@ -79,8 +79,12 @@ def test_a_process_group_can_be_told_how_long_to_wait() -> None:
         "connection_made",
         "connection_lost",
         "data_received",
+        "on_message_begin",
+        "on_header",
         "on_headers_complete",
+        "on_body",
         "on_message_complete",
+        "on_response_complete",
         "send_400_response",
     ],
 )
@@ -96,7 +100,9 @@ def test_methods_that_the_bounded_connection_overrides(method: str) -> None:
     )
 
 
-@pytest.mark.parametrize("attribute", ["loop", "transport", "cycle"])
+@pytest.mark.parametrize(
+    "attribute", ["loop", "transport", "flow", "connections", "pipeline", "scope", "headers", "cycle"]
+)
 def test_attributes_that_the_bounded_connection_reads(attribute: str) -> None:
     from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -105,7 +111,7 @@ def test_attributes_that_the_bounded_connection_reads(attribute: str) -> None:
     )
 
 
-@pytest.mark.parametrize("attribute", ["response_started", "response_complete"])
+@pytest.mark.parametrize("attribute", ["body", "response_started", "response_complete"])
 def test_attributes_of_an_answer_that_the_bounded_connection_reads(attribute: str) -> None:
     from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
 

@@ -20,6 +20,8 @@ from api.client.transport import Call, FileWork, Hear, Steps
 
 #: Files from this size on are uploaded in parts.
 PART_BYTES = 16 << 20
+#: The version of the protocol of uploads, which every request states.
+_TUS = {"Tus-Resumable": "1.0.0"}
 
 
 def upload(path: Path, name: str, progress: Progress) -> Steps[str]:
@@ -36,14 +38,14 @@ def upload(path: Path, name: str, progress: Progress) -> Steps[str]:
         except ApiError as error:
             if error.status != 409:
                 raise
-            offset = int((yield Call("HEAD", where)).headers["Upload-Offset"])
+            offset = int((yield Call("HEAD", where, {"headers": _TUS})).headers["Upload-Offset"])
         progress(offset, size)
     return str(created["id"])
 
 
 def _creation_headers(name: str, size: int) -> dict[str, str]:
     return {
-        "Tus-Resumable": "1.0.0",
+        **_TUS,
         "Upload-Length": str(size),
         "Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}",
         "Idempotency-Key": secrets.token_hex(16),
@@ -59,7 +61,7 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
         raise RequestError(f"{path}: has become shorter while it was sent. Send it again.")
     digest = base64.b64encode(hashlib.sha256(part).digest()).decode()
     return part, {
-        "Tus-Resumable": "1.0.0",
+        **_TUS,
         "Upload-Offset": str(offset),
         "Upload-Checksum": f"sha256 {digest}",
         "Content-Type": "application/offset+octet-stream",

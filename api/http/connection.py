@@ -1,41 +1,62 @@
-"""HTTP connections that do not wait, nor take in, for ever: uvicorn's own protocol bounds neither time nor size of a
-request's head.
-"""
+"""HTTP connections whose time and memory are bounded; uvicorn's own protocol bounds neither."""
 
 from __future__ import annotations
 
 import asyncio
+from enum import Enum, auto
 from http import HTTPStatus
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from api.http.memory import memory
 from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
 from service.errors import ServiceError
 
-#: Bytes of a request's line and headers, counted in the pieces in which they come.
+#: Bytes of a request's line and headers, unless so many connections are open that each has less (`api.http.memory`).
 MAX_HEAD_BYTES = 1 << 17
+#: Headers of a request: each takes far more memory than its bytes.
+MAX_HEADERS = 200
+#: Requests that wait on one connection for the answer to an earlier one.
+MAX_WAITING = 8
+
+
+class _Stage(Enum):
+    """What the next byte of a connection belongs to."""
+
+    BETWEEN = auto()
+    HEAD = auto()
+    BODY = auto()
 
 
 class Connection(HttpToolsProtocol):
-    """A connection that is closed when a request's head has begun and takes too long, or is too long.
+    """A connection that is closed when its client takes too long or sends too much.
+
+    It reads no more than one piece of a body ahead of the app, and drops trailers.
 
     Attributes:
-        head_seconds: from the connection, or a head's first byte, to the head's end.
-        most: connections of this process at the same time; a further one is told to come back.
+        head_seconds: Time from the connection, or a head's first byte, to the head's end; also from an answer to the
+            end of a body that the app did not read.
+        most: Number of connections of this process at the same time; further ones are answered with 503.
     """
+
+    # an object with more than 30 attributes in its dictionary takes 2 kB more, and the base class has 28
+    __slots__ = ("_error", "_stage", "_steps", "_timer", "_unused_bytes")
 
     head_seconds = 60.0
     most = 10_000
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._in_head, self._head_bytes, self._messages_seen = True, 0, 0
-        self._head_timer: asyncio.TimerHandle | None = None
+        self._stage = _Stage.BETWEEN
+        self._steps = self._unused_bytes = 0
+        self._error: ServiceError | None = None
+        self._timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """The time of the first head begins."""
+        """Start the time of the first head."""
         super().connection_made(transport)
+        memory.connections += 1
         if len(self.connections) > self.most:
             error = f"There are {self.most:,} connections already. Try again later."
             self._refuse(TooManyConnectionsError(error, retry_after=5))
@@ -43,59 +64,156 @@ class Connection(HttpToolsProtocol):
         self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing is waited for any more."""
+        """Stop waiting."""
+        memory.connections -= 1
         self._stop_timer()
         super().connection_lost(exc)
 
-    def data_received(self, data: bytes) -> None:
-        """Take bytes in, as long as a head that they belong to may still grow."""
-        seen = self._messages_seen
-        super().data_received(data)
-        if not self._in_head or self._messages_seen != seen or self.transport.is_closing():
-            return  # all or some of it was no part of a head that is still open
-        self._head_bytes += len(data)
-        if self._head_bytes > MAX_HEAD_BYTES:
-            self._refuse(HeadTooLargeError(f"The request's line and headers have more than {MAX_HEAD_BYTES:,} bytes."))
-        elif self._head_timer is None:
+    def data_received(self, data: bytes | memoryview) -> None:
+        """Parse bytes; refuse them if there are too many that neither end a head nor belong to a body.
+
+        Those are heads, trailers, and extensions of chunks.
+        """
+        steps = self._steps
+        super().data_received(data)  # type: ignore[arg-type]
+        if self.transport.is_closing():
+            return
+        self._unused_bytes = self._unused_bytes + len(data) if self._steps == steps else 0
+        if self._unused_bytes > memory.share():
+            error = f"The request's line and headers, or its trailers, have more than {memory.share():,} bytes."
+            self._refuse(HeadTooLargeError(error))
+        elif self._stage is _Stage.HEAD and self._timer is None:
             self._start_timer()
 
+    def on_message_begin(self) -> None:
+        """Begin a head."""
+        self._stage = _Stage.HEAD
+        super().on_message_begin()
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Take a header; drop a trailer."""
+        if self._stage is _Stage.BODY:
+            return
+        if len(self.headers) == MAX_HEADERS:
+            self._abort(HeadTooLargeError(f"The request has more than {MAX_HEADERS} headers."))
+        super().on_header(name, value)
+
     def on_headers_complete(self) -> None:
-        """The head is whole."""
-        self._in_head, self._head_bytes = False, 0
-        self._messages_seen += 1
+        """Check the head and start the request."""
+        if sum(name == b"host" for name, _ in self.headers) > 1:
+            self._abort(MalformedRequestError("The request has several Host headers. Send one."))
+        if len(self.pipeline) == MAX_WAITING:
+            self._abort(MalformedRequestError(f"More than {MAX_WAITING} requests were sent before an answer was read."))
+        self._stage = _Stage.BODY
+        self._steps += 1
         self._stop_timer()
         super().on_headers_complete()
 
+    def on_body(self, body: bytes) -> None:
+        """Take a piece of a body, and read no further until the app has it."""
+        self._steps += 1
+        super().on_body(body)
+        if not self.cycle.response_complete:
+            self.flow.pause_reading()
+
     def on_message_complete(self) -> None:
-        """What comes from now on is the next head."""
-        self._in_head = True
-        self._messages_seen += 1
+        """End a request."""
         super().on_message_complete()
+        self._stage = _Stage.BETWEEN
+        self._steps += 1
+        self._forget_answered()
+
+    def on_response_complete(self) -> None:
+        """End an answer; the rest of a body that the app did not read has to come soon."""
+        super().on_response_complete()
+        self._forget_answered()
+
+    def _forget_answered(self) -> None:
+        """Free the memory of a request that is answered; wait for its end, or for the next one."""
+        if self.cycle is None or not self.cycle.response_complete or self.transport.is_closing():
+            return
+        if self._stage is _Stage.BODY:
+            self.cycle.body = bytearray()
+            self._start_timer()
+            return
+        self.cycle = None  # type: ignore[assignment]
+        if self._stage is _Stage.BETWEEN:
+            self.scope = self.headers = None  # type: ignore[assignment]
+            if self._timer is not None:  # it was the body's; uvicorn's own timer ended with the body's first byte
+                self._start_timer()
 
     def _start_timer(self) -> None:
-        self._head_timer = self.loop.call_later(self.head_seconds, self._close_late)
+        self._stop_timer()
+        self._timer = self.loop.call_later(self.head_seconds, self._close_late)
 
     def _stop_timer(self) -> None:
-        if self._head_timer is not None:
-            self._head_timer.cancel()
-            self._head_timer = None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
     def _close_late(self) -> None:
-        self._head_timer = None
+        self._timer = None
         if self.cycle is not None and not self.cycle.response_complete:
             self._start_timer()  # an answer is still on its way to the same client
         elif not self.transport.is_closing():
             self.transport.close()
 
+    def _abort(self, error: ServiceError) -> None:
+        """Make the parser stop; `send_400_response` then answers with the error."""
+        self._error = error
+        raise error
+
     def send_400_response(self, msg: str) -> None:
-        """Say that it is no HTTP, as a problem document: uvicorn's own answer is plain text."""
-        self._refuse(MalformedRequestError(f"{msg} Its first line, a header or a chunk is not as HTTP has it."))
+        """Answer what is not HTTP with a problem document; uvicorn's own answer is plain text."""
+        wrong = MalformedRequestError(f"{msg} Its first line, a header or a chunk is not as HTTP has it.")
+        self._refuse(self._error or wrong)
 
     def _refuse(self, error: ServiceError) -> None:
-        """Answer below the app, and close; where an answer is on its way already, only close."""
-        if self.cycle is None or self.cycle.response_complete or not self.cycle.response_started:
+        """Answer below the app unless an answer to this request has begun, and close."""
+        begun = self.cycle is not None and self.cycle.response_started
+        if not begun or (self.cycle.response_complete and self._stage is not _Stage.BODY):
             answer = from_service(error)
             lines = [f"HTTP/1.1 {error.status} {HTTPStatus(error.status).phrase}".encode()]
             lines += [name + b": " + value for name, value in (*answer.raw_headers, (b"connection", b"close"))]
             self.transport.write(b"\r\n".join(lines) + b"\r\n\r\n" + bytes(answer.body))
         self.transport.close()
+
+
+_piece = memoryview(bytearray(MAX_HEAD_BYTES))
+
+
+class Reader(asyncio.BufferedProtocol):
+    """Reads a connection in pieces no larger than its share of the memory; uvloop itself reads 256 kB at once."""
+
+    __slots__ = ("_connection",)
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._connection = Connection(*args, **kwargs)
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
+        """Return where the next piece goes: one buffer for all connections, for each piece is parsed at once."""
+        return _piece[: memory.share()]
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Parse a piece."""
+        self._connection.data_received(_piece[:nbytes])
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """As the connection."""
+        self._connection.connection_made(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """As the connection."""
+        self._connection.connection_lost(exc)
+
+    def eof_received(self) -> None:
+        """As the connection."""
+        self._connection.eof_received()
+
+    def pause_writing(self) -> None:
+        """As the connection."""
+        self._connection.pause_writing()
+
+    def resume_writing(self) -> None:
+        """As the connection."""
+        self._connection.resume_writing()

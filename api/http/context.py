@@ -27,7 +27,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.inspection.inspector import Inspector
 from service.inspection.packer import Packer
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, is_loopback
 from service.store import Store
 from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import KeyRow
@@ -38,7 +38,8 @@ LOCAL_OWNER = "local"
 SESSION_COOKIE = "sgsst_session"
 #: Methods that change nothing.
 _READING = ("GET", "HEAD", "OPTIONS")
-_LOOPBACK_NAMES = {"localhost", "127.0.0.1", "::1"}
+#: A Host header: an IPv6 address in brackets, or a name or IPv4 address, and perhaps a port.
+_HOST = re.compile(r"(?:\[([^\]]*)\]|([^:/?#@\[\]\\]*))(?::[0-9]*)?")
 
 
 class NoKeyError(ServiceError):
@@ -172,9 +173,9 @@ def _check_site(request: Request, settings: ServiceSettings) -> None:
     """Keep web pages out that a browser on this machine shows: neither by their own name nor by a name of theirs that
     leads to this machine may they use a service that asks for no key.
     """
-    host = _hostname(f"//{request.headers.get('host', '')}")
-    if settings.on_loopback and host not in _LOOPBACK_NAMES and not host.startswith("127."):
-        raise ForeignSiteError(f"The service is open to this machine only, and {host!r} is not one of its names.")
+    host = _host_name(request.headers.get("host", ""))
+    if settings.on_loopback and not is_loopback(host):
+        raise ForeignSiteError(f"The service is open to this machine only, and {host[:100]!r} is not one of its names.")
     origin = request.headers.get("origin")
     if origin is not None and _netloc(origin) != request.headers.get("host"):
         raise ForeignSiteError(f"Pages of {origin!r} may not use this service without an API key.")
@@ -187,11 +188,10 @@ def _netloc(origin: str) -> str:
         return ""
 
 
-def _hostname(text: str) -> str:
-    try:
-        return urlsplit(text).hostname or ""
-    except ValueError:
-        return ""
+def _host_name(header: str) -> str:
+    """Return the host of a Host header in lower case, or an empty string if the header is malformed."""
+    match = _HOST.fullmatch(header)
+    return (match[1] or match[2] or "").lower() if match else ""
 
 
 _ID = re.compile(r"[a-z]{3}_[0-9a-f]{8,36}")

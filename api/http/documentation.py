@@ -144,6 +144,12 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
         schemas[model.__name__] = made
     for path in document["paths"].values():
         for method, operation in path.items():
+            for parameter in operation.get("parameters", []):
+                if (
+                    parameter["name"] == "Tus-Resumable"
+                ):  # has a default only because tus answers 412 where it is missing
+                    parameter["required"] = True
+                    parameter["schema"].pop("default", None)
             answers = operation["responses"]
             if "application/json" in answers.get("422", {}).get("content", {}):
                 del answers["422"]  # FastAPI's own form, where nothing can be wrong with a request's parameters

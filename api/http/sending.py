@@ -167,7 +167,7 @@ def _parse_range(text: str, size: int) -> tuple[int, int] | None:
     Raises:
         RangeError: the range lies behind the end.
     """
-    match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", text.strip())
+    match = re.fullmatch(r"bytes=([0-9]{0,18})-([0-9]{0,18})", text.strip())
     if match is None or match[0] == "bytes=-":
         return None
     first, last = match[1], match[2]

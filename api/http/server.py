@@ -11,7 +11,7 @@ import sys
 import uvicorn
 
 from api.http.app import create_app
-from api.http.connection import Connection
+from api.http.connection import Connection, Reader
 from service.logs import set_up
 from service.private import keep_private
 from service.settings import ServiceSettings
@@ -26,7 +26,6 @@ def main() -> None:
         from worker.processes import die_with_parent
 
         die_with_parent()
-    _allow_many_connections()
     settings = ServiceSettings()
     set_up(settings.log_format)
     keep_private(settings)
@@ -34,10 +33,10 @@ def main() -> None:
     # algorithm on, by which every answer waits 40 ms for the client's acknowledgment of its head
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None
     Connection.head_seconds = settings.receive_seconds
-    Connection.most = settings.max_connections
+    Connection.most = min(settings.max_connections, _affordable_connections())
     config = uvicorn.Config(
         create_app(settings),
-        http=Connection,
+        http=Reader,  # type: ignore[arg-type]  # a BufferedProtocol will do, too
         ws="none",
         host=settings.host,
         port=settings.port,
@@ -46,6 +45,8 @@ def main() -> None:
         timeout_graceful_shutdown=_GRACE,
         timeout_keep_alive=75,
         server_header=False,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=settings.trusted_proxies,
     )
     server = uvicorn.Server(config)
     with contextlib.suppress(KeyboardInterrupt):
@@ -54,11 +55,16 @@ def main() -> None:
         sys.exit("The API could not be started.")
 
 
-def _allow_many_connections() -> None:
-    """Take all open files that the system grants: each watcher is one, and without asking there are often 1024."""
+def _affordable_connections() -> int:
+    """Raise the limit of open files as far as the system allows; return how many connections it is enough for.
+
+    A quarter is kept for files, the database and what is being refused, so that further connections can be answered.
+    """
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(ValueError, OSError):  # macOS has a limit that it does not tell
+    with contextlib.suppress(ValueError, OSError):  # macOS has a limit that getrlimit does not report
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return sys.maxsize if soft == resource.RLIM_INFINITY else max(1, soft - soft // 4)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from fastapi.responses import StreamingResponse
 
 from api.http.context import CallerDep, ContextDep
 from api.http.documentation import headers, invalid, problems
+from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import JOB_ID, SHA256
 from service.errors import NotFoundError
@@ -73,7 +74,7 @@ async def watch_job(
     context: ContextDep,
     caller: CallerDep,
     last_event_id: Annotated[
-        int | None,
+        Digits | None,
         Header(alias="Last-Event-ID", ge=0, lt=2**62, description="Go on after this event.", examples=[42]),
     ] = None,
 ) -> Response:

@@ -15,6 +15,7 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import Received, check_file, parse_json, read_json, receive
+from api.http.numbers import Digits
 from api.http.planning import DRY_RUN, answer_plan
 from api.http.schemas import (
     JOB_ID,
@@ -255,7 +256,7 @@ def list_jobs(
     cursor: Annotated[
         str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.", examples=[JOB_ID])
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
+    limit: Annotated[Digits, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
 ) -> JobPage:
     """Jobs of this key, the newest first."""
     jobs = context.store.jobs

@@ -46,7 +46,7 @@ _ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the se
             TooManyTriesError("Too many keys that are no good came from this address. Try again later."),
             invalid("key", "Field required"),
             MediaTypeError("The body must be application/json."),
-            TooLargeError("A JSON body may have 4,096 bytes.", limit=_MAX_BODY),
+            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", limit=_MAX_BODY),
             BadRequestError("The body is not UTF-8."),
             TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
             key=False,

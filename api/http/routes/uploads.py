@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from email.utils import format_datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Path, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
 from api.http.context import CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError, body_blocks
+from api.http.numbers import Digits
 from api.http.receiving import ALGORITHMS, ChecksumError, append_body, parse_checksum
 from api.http.routes.jobs import IdempotencyHeader
 from api.http.schemas import UPLOAD_ID, UploadView, upload_view
@@ -50,29 +51,37 @@ Tus = Annotated[
     str,
     Header(
         alias="Tus-Resumable",
-        description="The protocol's version.",
+        description="The protocol's version. A request without it is refused.",
         examples=[VERSION],
         json_schema_extra={"const": VERSION},
     ),
 ]
 LengthHeader = Annotated[
-    int, Header(alias="Upload-Length", ge=0, lt=2**60, description="Bytes of the whole file.", examples=[42301])
+    Digits, Header(alias="Upload-Length", ge=0, lt=2**60, description="Bytes of the whole file.", examples=[42301])
 ]
 OffsetHeader = Annotated[
-    int, Header(alias="Upload-Offset", ge=0, lt=2**60, description="Where these bytes begin.", examples=[16384])
+    Digits, Header(alias="Upload-Offset", ge=0, lt=2**60, description="Where these bytes begin.", examples=[16384])
 ]
 
 _NOT_THERE = NotFoundError(f"There is no upload {UPLOAD_ID}, or it has expired.")
 
 
-def _check_version(version: str) -> None:
-    if version != VERSION:
-        raise _wrong_version(version)
+def check_version(tus: Tus = "") -> None:
+    """Refuse a request that does not state the protocol's version, which tus asks of all methods but OPTIONS.
+
+    Raises:
+        WrongVersionError: The version is missing, or another one.
+    """
+    if tus != VERSION:
+        raise _wrong_version(tus)
 
 
 def _wrong_version(version: str) -> WrongVersionError:
-    message = f"Tus-Resumable: {version[:20]!r} is not spoken here; {VERSION} is."
-    return WrongVersionError(message, headers={"Tus-Version": VERSION})
+    wrong = f"{version[:20]!r} is not supported" if version else "is missing"
+    return WrongVersionError(f"Tus-Resumable: {wrong}. Send {VERSION}.", headers={"Tus-Version": VERSION})
+
+
+_SPEAKS_TUS = [Depends(check_version)]
 
 
 def _following_operations(**parameters: str) -> dict[str, Any]:
@@ -110,6 +119,7 @@ def describe_uploads(context: ContextDep) -> Response:
 @router.post(
     "",
     status_code=201,
+    dependencies=_SPEAKS_TUS,
     response_model=UploadView,
     operation_id="create_upload",
     responses={
@@ -140,7 +150,6 @@ def create_upload(
     context: ContextDep,
     caller: CallerDep,
     length: LengthHeader,
-    tus: Tus = VERSION,
     metadata: Annotated[
         str,
         Header(
@@ -153,7 +162,6 @@ def create_upload(
     idempotency_key: IdempotencyHeader = None,
 ) -> Response:
     """Begin an upload; its bytes are sent with PATCH to the `Location` of the answer."""
-    _check_version(tus)
     limit = context.settings.max_upload_bytes
     if length > limit:
         raise TooLargeError(f"The file has {length:,} bytes; {limit:,} may be.", limit=limit)
@@ -181,6 +189,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
 
 @router.head(
     "/{upload_id}",
+    dependencies=_SPEAKS_TUS,
     responses={
         200: {
             "description": "All in headers.",
@@ -193,7 +202,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
                 maybe=("Upload-Metadata",),
             ),
         },
-        **problems(_NOT_THERE),
+        **problems(_NOT_THERE, _wrong_version("")),
     },
     operation_id="head_upload",
     response_class=Response,
@@ -228,6 +237,7 @@ _PATCH_BODY = {
 @router.patch(
     "/{upload_id}",
     status_code=204,
+    dependencies=_SPEAKS_TUS,
     responses={
         204: {
             "description": "It is kept; `Upload-Offset` is where the next part begins.",
@@ -258,7 +268,6 @@ async def append_upload(
     context: ContextDep,
     caller: CallerDep,
     offset: OffsetHeader,
-    tus: Tus = VERSION,
     checksum: Annotated[
         str | None,
         Header(
@@ -269,7 +278,6 @@ async def append_upload(
     ] = None,
 ) -> Response:
     """Send the next part. What has arrived when a connection breaks is kept, unless a checksum was announced."""
-    _check_version(tus)
     if request.headers.get("content-type", "").lower() != "application/offset+octet-stream":
         raise MediaTypeError("The Content-Type must be application/offset+octet-stream.")
     wanted = parse_checksum(checksum) if checksum else None
@@ -295,9 +303,10 @@ async def append_upload(
 @router.delete(
     "/{upload_id}",
     status_code=204,
+    dependencies=_SPEAKS_TUS,
     responses={
         204: {"description": "It is gone.", "headers": headers("Tus-Resumable", "Cache-Control")},
-        **problems(_NOT_THERE),
+        **problems(_NOT_THERE, _wrong_version("")),
     },
     operation_id="delete_upload",
 )

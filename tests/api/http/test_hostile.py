@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import gzip
 import io
 import json
 import re
+import select
 import socket
 import struct
 import time
@@ -15,7 +17,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import httpx
 import psutil
@@ -24,7 +26,7 @@ from annotated_types import Ge
 from PIL import Image, PngImagePlugin
 
 from api.cli.options import kind_of
-from api.http.connection import MAX_HEAD_BYTES
+from api.http.connection import MAX_HEAD_BYTES, MAX_HEADERS
 from service.files.artifacts import Artifacts
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
@@ -787,8 +789,40 @@ def send(client: httpx.Client, where: str, offset: object, data: Any, **headers:
     return client.patch(where, content=data, headers={**fixed, **headers})
 
 
+#: What Python's `int` takes for a number.
+NO_DIGITS: list[Any] = ["1_0", "+10", "10.0", "1 0", "\u0661\u0660".encode(), "\uff11\uff10".encode()]
+
+
+def test_numbers_are_digits_alone(client: httpx.Client, service: Service, done: str) -> None:
+    """In queries and headers; lengths of bodies are refused below the app."""
+    for number in ("1_0", "+10", " 10", "10 ", "\u0661\u0660", "10.0"):
+        refused(client.get("/v1/jobs", params={"limit": number}), 422, "invalid-request")
+    for number in NO_DIGITS:
+        answer = client.get(f"/v1/jobs/{done}/events", headers={"Last-Event-ID": number})
+        refused(answer, 422, "invalid-request")
+    for length in ("1_0", "+10", "1 0", "10.0", "0x10", "\xb2"):
+        head, body = exchange(service, f"POST /v1/jobs HTTP/1.1\nContent-Length: {length}")
+        assert head.startswith(b"HTTP/1.1 400 ")
+        assert json.loads(body)["code"] == "malformed-request"
+
+
+def test_uploads_state_their_version(client: httpx.Client) -> None:
+    """As tus 1.0 has it: each of its requests but OPTIONS; `GET` is not of tus."""
+    where = begin(client, 5)
+    data = {"Upload-Length": "5", "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
+    for version in ({}, {"Tus-Resumable": ""}, {"Tus-Resumable": "0.2.2"}):
+        for method, path in (("POST", "/v1/uploads"), ("PATCH", where), ("DELETE", where)):
+            answer = client.request(method, path, headers={**data, **version}, content=b"12345")
+            refused(answer, 412, "unsupported-tus-version")
+            assert answer.headers["tus-version"] == "1.0.0"
+        assert client.head(where, headers=version).status_code == 412
+    assert client.options("/v1/uploads").status_code == 204
+    assert client.get(where).json()["offset"] == 0
+    assert client.delete(where, headers=TUS).status_code == 204
+
+
 def test_uploads_that_begin_wrong(client: httpx.Client) -> None:
-    for length in ("-1", "x", "1.5", "1e3", "0x10", "", str(2**60), "9" * 5000, "NaN"):
+    for length in ("-1", "x", "1.5", "1e3", "0x10", "", str(2**60), "9" * 5000, "NaN", *NO_DIGITS):
         refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": length}), 422, "invalid-request")
     refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "0"}), 400, "malformed-body")
     refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(81 * MB)}), 413, "too-large")
@@ -802,10 +836,10 @@ def test_uploads_that_begin_wrong(client: httpx.Client) -> None:
         b"filename YQ",
         b"name =" + b"=" * 100,
     ):
-        headers = {b"Upload-Length": b"5", b"Upload-Metadata": metadata}
+        headers = {b"Tus-Resumable": b"1.0.0", b"Upload-Length": b"5", b"Upload-Metadata": metadata}
         refused(client.post("/v1/uploads", headers=headers), 400, "malformed-body")
     refused(
-        client.post("/v1/uploads", headers={"Upload-Length": "5", "Upload-Metadata": "x" * 5000}),
+        client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5", "Upload-Metadata": "x" * 5000}),
         422,
         "invalid-request",
     )
@@ -814,14 +848,14 @@ def test_uploads_that_begin_wrong(client: httpx.Client) -> None:
 def test_names_of_uploads_lead_nowhere(client: httpx.Client, service: Service) -> None:
     for name in NAMES:
         metadata = f"filename {base64.b64encode(name.encode()[:2900]).decode()}".strip()
-        answer = client.post("/v1/uploads", headers={"Upload-Length": "5", "Upload-Metadata": metadata})
+        answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5", "Upload-Metadata": metadata})
         if answer.status_code == 400:  # cut within a letter
             continue
         assert answer.status_code == 201, answer.text
         shown = answer.json()["filename"]
         assert not shown.startswith(("/", "."))
         assert ".." not in shown.split("/")
-        assert client.delete(answer.headers["location"]).status_code == 204
+        assert client.delete(answer.headers["location"], headers=TUS).status_code == 204
     assert not list((service.data / "uploads").iterdir())
 
 
@@ -831,7 +865,7 @@ def test_uploads_that_go_on_wrong(client: httpx.Client, service: Service) -> Non
     assert send(client, where, 0, bytes(100)).status_code == 204
     for offset in (0, 99, 101, 1000, 2**59):
         assert refused(send(client, where, offset, bytes(10)), 409, "conflict")["offset"] == 100
-    for told in ("-1", "x", "1.5", str(2**60), "9" * 5000, ""):
+    for told in ("-1", "x", "1.5", str(2**60), "9" * 5000, "", *NO_DIGITS):
         refused(send(client, where, told, bytes(10)), 422, "invalid-request")
     wrong = base64.b64encode(bytes(32)).decode()
     refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": f"sha256 {wrong}"}), 460, "checksum-mismatch")
@@ -845,21 +879,21 @@ def test_uploads_that_go_on_wrong(client: httpx.Client, service: Service) -> Non
     )
     refused(send(client, where, 100, bytes(10), **{"Tus-Resumable": "0.2.2"}), 412, "unsupported-tus-version")
     refused(send(client, where, 100, bytes(10), **{"Content-Encoding": "gzip"}), 415, "unsupported-media-type")
-    assert client.head(where).headers["upload-offset"] == "100"
+    assert client.head(where, headers=TUS).headers["upload-offset"] == "100"
 
     sized = {"Upload-Checksum": f"sha256 {wrong}"}
     refused(send(client, where, 100, bytes(901), **sized), 413, "too-large")
     refused(send(client, where, 100, iter([bytes(MB)] * 70), **sized), 413, "too-large")
-    assert client.head(where).headers["upload-offset"] == "100"
+    assert client.head(where, headers=TUS).headers["upload-offset"] == "100"
     assert file.stat().st_size <= 1000, "more is on the disk than was announced"
     refused(send(client, where, 100, bytes(901)), 413, "too-large")
-    offset = int(client.head(where).headers["upload-offset"])
+    offset = int(client.head(where, headers=TUS).headers["upload-offset"])
     assert send(client, where, offset, bytes(1000 - offset)).status_code == 204
     refused(send(client, where, 5, b"x"), 409, "conflict")
     refused(send(client, where, 1000, b"x"), 413, "too-large")
     assert client.get(where).json()["complete"]
     assert not file.exists()
-    assert client.delete(where).status_code == 204
+    assert client.delete(where, headers=TUS).status_code == 204
 
 
 def test_uploads_that_are_over(client: httpx.Client, store: Store, files: Files) -> None:
@@ -869,15 +903,15 @@ def test_uploads_that_are_over(client: httpx.Client, store: Store, files: Files)
         session.get_one(UploadRow, upload_id).expires_at = time.time() - 1
     refused(send(client, where, 0, bytes(10)), 404, "not-found")
     refused(client.get(where), 404, "not-found")
-    assert client.head(where).status_code == 404
-    refused(client.delete(where), 404, "not-found")
+    assert client.head(where, headers=TUS).status_code == 404
+    refused(client.delete(where, headers=TUS), 404, "not-found")
     refused(
         post(client, json.dumps({"scene": upload_id, "style": upload_id}).encode(), "application/json"),
         422,
         "unknown-upload",
     )
     deleted = begin(client, 1000)
-    assert client.delete(deleted).status_code == 204
+    assert client.delete(deleted, headers=TUS).status_code == 204
     refused(send(client, deleted, 0, bytes(10)), 404, "not-found")
     for name in ("upl_' OR 1=1", "..", "upl_" + "0" * 5000, "%00", "job_00000000000"):
         assert client.get(f"/v1/uploads/{name}").status_code in (404, 405)
@@ -885,13 +919,14 @@ def test_uploads_that_are_over(client: httpx.Client, store: Store, files: Files)
 
 def test_two_writers_of_one_upload(client: httpx.Client, service: Service) -> None:
     where = begin(client, 1000)
-    head = f"PATCH {where} HTTP/1.1\nUpload-Offset: 0\nContent-Type: {OFFSET_STREAM}\nContent-Length: 1000"
+    head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\n"
+    head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: 1000"
     with connect(service) as first:
         first.sendall(lines(head + "\nExpect: 100-continue"))
         assert b" 100 " in first.recv(100)  # it is this one's turn
         first.sendall(bytes(10))
         refused(send(client, where, 0, bytes(10)), 423, "upload-locked")
-    wait_for(lambda: client.head(where).headers["upload-offset"] == "10", "what has come to be saved")
+    wait_for(lambda: client.head(where, headers=TUS).headers["upload-offset"] == "10", "what has come to be saved")
     assert send(client, where, 10, bytes(990)).status_code == 204
 
 
@@ -912,8 +947,8 @@ def test_ids_of_other_keys(client: httpx.Client, service: Service, store: Store,
             problem = refused(you.request(method, f"/v1/jobs/{job_id}{path}"), 404, "not-found")
             assert problem["detail"].replace(job_id, "") == nothing["detail"].replace("job_" + "0" * 31, "")
         for method in ("GET", "DELETE"):
-            refused(you.request(method, where), 404, "not-found")
-        assert you.head(where).status_code == 404
+            refused(you.request(method, where, headers=TUS), 404, "not-found")
+        assert you.head(where, headers=TUS).status_code == 404
         refused(send(you, where, 0, b"12345"), 404, "not-found")
         assert you.get("/v1/jobs", params={"cursor": job_id}).json()["jobs"] == []
         assert me.get(f"/v1/jobs/{job_id}").json()["status"] == "queued"
@@ -1084,6 +1119,19 @@ def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, byt
     return found, rest
 
 
+def answer_on(connection: socket.socket) -> tuple[bytes, bytes]:
+    """Head and body of the next answer, which has a length; the connection stays open."""
+    connection.settimeout(60)
+    answer = connection.recv(65536)
+    while not (found := re.search(rb"content-length: ([0-9]+)\r\n.*?\r\n\r\n", answer, re.DOTALL | re.IGNORECASE)) or (
+        len(answer) < found.end() + int(found[1])
+    ):
+        more = connection.recv(65536)
+        assert more, answer
+        answer += more
+    return answer[: found.end()], answer[found.end() :]
+
+
 def closed(connection: socket.socket) -> bytes:
     """All that still comes until the service closes; fails if it does not."""
     connection.settimeout(60)
@@ -1211,19 +1259,253 @@ def test_a_chunk_that_makes_no_sense(service: Service) -> None:
 
 
 def test_a_head_that_is_too_large(service: Service) -> None:
-    head = lines("GET /v1/jobs HTTP/1.1")[:-2] + b"X: y\r\n" * (MAX_HEAD_BYTES // 6)
+    # no byte more than are read: the answer would be lost with them
+    for headers in (b"X: " + b"y" * MAX_HEAD_BYTES, b"X: y\r\n" * (MAX_HEADERS + 1)):
+        with connect(service) as connection:
+            connection.sendall(lines("GET /v1/jobs HTTP/1.1")[:-2] + headers)
+            answer = closed(connection)
+        assert answer.startswith(b"HTTP/1.1 431 Request Header Fields Too Large\r\n")
+        assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "head-too-large"
+
+
+def send_on(connection: socket.socket, more: bytes, most: int = 60 * MB) -> int:
+    """Send the same bytes until the service closes; return how many went out, at most about `most`."""
+    sent = 0
+    with contextlib.suppress(OSError):
+        while sent < most:
+            connection.sendall(more)
+            sent += len(more)
+    return sent
+
+
+TRAILERS = {
+    "many": (b"0\r\n", b"X: y\r\n" * 100_000),
+    "one": (b"0\r\nX: ", b"y" * 600_000),
+    "of a chunk": (b"1;x=", b"y" * 600_000),
+}
+
+
+@pytest.mark.parametrize(("start", "more"), TRAILERS.values(), ids=TRAILERS)
+@pytest.mark.parametrize("path", ["/livez", "/v1/session"])
+def test_trailers_that_never_end(service: Service, path: str, start: bytes, more: bytes) -> None:
+    head = lines(f"POST {path} HTTP/1.1\nContent-Type: application/json\nTransfer-Encoding: chunked")
     with connect(service) as connection:
-        connection.sendall(head)  # no byte more than are read: the answer would be lost with them
-        answer = closed(connection)
-    assert answer.startswith(b"HTTP/1.1 431 Request Header Fields Too Large\r\n")
-    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "head-too-large"
+        connection.sendall(head + start)
+        assert send_on(connection, more) < 60 * MB, "it was all taken in"
+
+
+def test_trailers_are_no_headers(service: Service, client: httpx.Client) -> None:
+    """Not even of the next request on the connection."""
+    where = begin(client, 5)
+    head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\nContent-Type: {OFFSET_STREAM}"
+    with connect(service) as connection:
+        body = b"5\r\n12345\r\n0\r\nUpload-Checksum: sha256 AAAA\r\nHost: evil.example\r\n\r\n"
+        connection.sendall(lines(head + "\nTransfer-Encoding: chunked") + body)
+        assert connection.recv(65536).startswith(b"HTTP/1.1 204 ")
+        connection.sendall(lines("GET /v1/jobs HTTP/1.1\nConnection: close"))
+        assert closed(connection).startswith(b"HTTP/1.1 200 ")
+    assert client.get(where).json()["complete"]
+
+
+def test_requests_that_wait_for_no_answer(service: Service) -> None:
+    with connect(service) as connection:
+        assert send_on(connection, lines("GET /livez HTTP/1.1") * 10_000) < 60 * MB, "it was all taken in"
+    with connect(service) as connection:
+        connection.sendall(lines("GET /livez HTTP/1.1") * 2 + lines("GET /livez HTTP/1.1\nConnection: close"))
+        assert closed(connection).count(b"HTTP/1.1 200 OK") == 3
+
+
+def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
+    """The request is answered before its body has come: a byte now and then does not hold the connection."""
+    for rest in (b"", b"x"):
+        with connect(service) as connection:
+            connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 1000000"))
+            assert connection.recv(65536).startswith(b"HTTP/1.1 405 ")
+            connection.settimeout(0.3)
+            deadline = time.monotonic() + 60
+            while True:
+                assert time.monotonic() < deadline, "it is still listened to"
+                try:
+                    connection.sendall(rest)
+                    assert connection.recv(1000) == b"", "it is answered twice"
+                    break
+                except TimeoutError:
+                    continue
+                except OSError:
+                    break
+
+
+def test_a_body_that_ends_late_keeps_its_connection(service: Service) -> None:
+    with connect(service) as connection:
+        connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 5"))
+        assert connection.recv(65536).startswith(b"HTTP/1.1 405 ")
+        connection.sendall(b"12345" + lines("GET /livez HTTP/1.1\nConnection: close"))
+        assert closed(connection).startswith(b"HTTP/1.1 200 OK")
+
+
+def test_json_that_is_too_long_is_not_waited_for(service: Service) -> None:
+    """Nor read, where its length is declared; where it is not, it is not read beyond its limit."""
+    kind = "Content-Type: application/json"
+    for path, size in (("/v1/session", 256_000), ("/v1/session", 4097), ("/v1/jobs", 2 * MB)):
+        with connect(service) as connection:
+            connection.sendall(lines(f"POST {path} HTTP/1.1\n{kind}\nContent-Length: {size}"))
+            answer = connection.recv(65536)
+        assert answer.startswith(b"HTTP/1.1 413 ")
+    with connect(service) as connection:
+        connection.sendall(lines(f"POST /v1/session HTTP/1.1\n{kind}\nTransfer-Encoding: chunked"))
+        connection.sendall(b"2000\r\n" + b"x" * 0x2000)  # 8 kB of a chunk that has not ended
+        assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
+
+
+def test_bodies_that_arrive_together(service: Service, client: httpx.Client) -> None:
+    """Large ones are refused while too many are coming; small ones are not."""
+    large = json.dumps({"scene": "x" * (MB - 1000), "style": "x"}).encode()
+    head = lines(f"POST /v1/jobs HTTP/1.1\nContent-Type: application/json\nContent-Length: {len(large)}")
+    with contextlib.ExitStack() as stack:
+        held = [stack.enter_context(connect(service)) for _ in range(80)]
+        for connection in held:
+            connection.setblocking(False)
+            with contextlib.suppress(OSError):
+                connection.send(head)
+        left = dict.fromkeys(held, large[:-1])  # no body ends
+        while left:
+            _, ready, _ = select.select([], list(left), [], 1.0)
+            if not ready:
+                break
+            for connection in ready:
+                try:
+                    left[connection] = left[connection][connection.send(left[connection]) :]
+                except OSError:
+                    left[connection] = b""
+                if not left[connection]:
+                    del left[connection]
+        head, answer = answer_on(select.select(held, [], [], 60)[0][0])
+        refused(post(client, b'{"scene": "x", "style": "x"}', "application/json"), 422, "unknown-upload")
+    assert head.startswith(b"HTTP/1.1 503 ")
+    assert b"retry-after: 5" in head.lower()
+    assert json.loads(answer)["code"] == "busy"
+    wait_for(lambda: post(client, large, "application/json").status_code == 422, "room for a large body")
+
+
+def test_connections_beyond_the_systems_limit(tmp_path: Path) -> None:
+    """Each is answered with 503 or closed, and none of those that are there suffers."""
+    running = Service(tmp_path / "data", alone=True)
+    running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
+    with running, running.client() as client:
+        assert client.get("/livez").status_code == 200
+        with contextlib.ExitStack() as stack:
+            held = [stack.enter_context(connect(running)) for _ in range(400)]
+            wait_for(lambda: len(select.select(held, [], [], 0)[0]) >= 250, "the others to be answered", running.said)
+            assert client.get("/v1/jobs").status_code == 200
+            answers = []
+            for connection in select.select(held, [], [], 0)[0]:
+                with contextlib.suppress(ConnectionResetError):
+                    answers.append(connection.recv(65536))
+            assert any(answer.startswith(b"HTTP/1.1 503 ") for answer in answers)
+            assert all(answer.startswith(b"HTTP/1.1 503 ") or not answer for answer in answers)
+        wait_for(running.ready, "room for a connection", running.said)
+        assert "Traceback" not in running.log.read_text()
+
+
+def test_files_beyond_the_systems_limit(tmp_path: Path) -> None:
+    """Uploads side by side, each with a file: those for which no descriptor is left are told to come back."""
+    running = Service(tmp_path / "data", alone=True)
+    running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
+    head = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 1000000"
+    body = part(FILE.format("style"), bytes(200_000))
+    with running, contextlib.ExitStack() as stack:
+        held = [stack.enter_context(connect(running)) for _ in range(140)]
+        assert running.ready()  # over a later connection, so that all of these are accepted
+        for connection in held:
+            connection.sendall(lines(head) + body[:-2])
+        answered = wait_for(lambda: select.select(held, [], [], 0)[0], "an upload to be refused", running.said)
+        answer, rest = answer_on(answered[0])
+        assert answer.startswith(b"HTTP/1.1 503 ")
+        assert b"retry-after" in answer.lower()
+        assert json.loads(rest)["code"] == "too-many-connections"
+        stack.close()
+        wait_for(running.ready, "room for a connection", running.said)
+
+
+@pytest.mark.parametrize("second", ["127.0.0.1", "evil.example"])
+def test_two_hosts(service: Service, second: str) -> None:
+    for hosts in (f"Host: 127.0.0.1\nHost: {second}", f"Host: {second}\nhost: 127.0.0.1"):
+        head, body = exchange(service, f"GET /v1/jobs HTTP/1.1\n{hosts}\nConnection: close")
+        assert head.startswith(b"HTTP/1.1 400 ")
+        assert json.loads(body)["code"] == "malformed-request"
+
+
+#: Names that a page's author can point at this machine, and texts that are no host.
+FOREIGN = [
+    "127.evil.example",
+    "127.0.0.1.evil.example",
+    "127.0.0.1.nip.io",
+    "localhost.evil.example",
+    "evil.example",
+    "127",
+    "127.1",
+    "127.0.0.1.",
+    "localhost.",
+    "127.0.0.1@evil.example",
+    "evil.example@127.0.0.1",
+    "127.0.0.1:80@evil.example",
+    "127.0.0.1/evil.example",
+    "[::1].evil.example",
+    "[::1]evil",
+    "[::2]",
+    "::1",
+    "[evil.example]",
+    "128.0.0.1",
+    "0.0.0.0",
+    "127.0.0.256",
+    "127.0.0.01",
+    "0x7f.0.0.1",
+]
+OWN = [
+    "127.0.0.1",
+    "127.0.0.1:9",
+    "127.8.9.10",
+    "localhost",
+    "LocalHost:80",
+    "[::1]",
+    "[::1]:8000",
+    "[0:0:0:0:0:0:0:1]",
+]
+
+
+def test_hosts_of_other_sites(client: httpx.Client) -> None:
+    for host in [*FOREIGN, ""]:
+        refused(client.get("/v1/jobs", headers={"Host": host}), 403, "foreign-site")
+    for host in OWN:
+        assert client.get("/v1/jobs", headers={"Host": host}).status_code == 200, host
+
+
+def test_a_name_that_looks_like_an_address_needs_keys() -> None:
+    for host in ("127.evil.example", "127.0.0.1.evil.example", "0.0.0.0", "::", "localhost.evil.example"):
+        assert ServiceSettings(host=host).keys_required
+    for host in ("127.0.0.1", "127.8.9.10", "::1", "localhost"):
+        assert not ServiceSettings(host=host).keys_required
+
+
+def test_paths_write_no_lines_of_the_log(service: Service, client: httpx.Client) -> None:
+    before = service.log.stat().st_size
+    for text in ("\n12:00:00 error   forged", "\r\nforged", "\u2028forged", "\x1b[2Jforged", "a status=200 forged"):
+        assert client.get(f"/v1/{quote(text, safe='')}").status_code == 404
+
+    def logged() -> list[str]:
+        return [line for line in service.log.read_bytes()[before:].decode().split("\n") if "forged" in line]
+
+    found = wait_for(lambda: logged() if len(logged()) == 5 else None, "the requests in the log")
+    for line in found:
+        assert line.isprintable()
+        assert re.fullmatch(r'\S+ info {4}request  method=GET path="/v1/[^"]*forged" status=404 seconds=\S+', line)
 
 
 def test_nothing_of_all_that_is_left(service: Service, client: httpx.Client, store: Store) -> None:
     """Runs last: the service is as ready as before, and every file has its row."""
     assert client.get("/readyz").status_code == 200
     metrics = client.get("/metrics").text
-    assert not re.findall(r'sgsst_requests_total\{[^}]*status="5\d\d"\} [1-9]', metrics)
+    assert not re.findall(r'sgsst_requests_total\{[^}]*status="(?!503)5\d\d"\} [1-9]', metrics)
     known = store.inputs.locations()
     found = {f"{path.parent.name}/{path.name}" for path in (service.data / "blobs").glob("*/*")}
     assert found == known

@@ -299,6 +299,19 @@ def test_wrong_keys_are_refused_and_not_for_ever(tmp_path: Path) -> None:
         store.close()
 
 
+@pytest.mark.parametrize("trusted", ["", "10.0.0.0/8", "127.0.0.1"])
+def test_only_a_trusted_proxy_names_the_client(tmp_path: Path, trusted: str) -> None:
+    """Whoever connects from this machine otherwise gets as many tries as there are addresses to make up."""
+    proxies = {"SGSST_REQUIRE_KEYS": "true", "SGSST_TRUSTED_PROXIES": trusted}
+    with Service(tmp_path / "data", alone=True, **proxies) as service, service.client() as browser:
+        for number in range(MOST_FAILURES + 1):
+            answer = sign_in(browser, "sgsst_wrong", **{"X-Forwarded-For": f"192.0.2.{number}"})
+        if trusted == "127.0.0.1":
+            refused(answer, 401, "unauthorized")
+        else:
+            refused(answer, 429, "too-many-tries")
+
+
 def test_failures_are_forgotten_with_time_and_by_success() -> None:
     now = 0.0
     tries = SignIns(lambda: now)
