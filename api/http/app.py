@@ -19,6 +19,7 @@ from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
 from api.http.rates import Rates
+from api.http.receipts import Receipts
 from api.http.routes import artifacts, events, inputs, jobs, operations, session, uploads
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
@@ -60,12 +61,15 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
+            receipts=Receipts(store.inputs, blobs),
             metrics=Metrics(store, settings.folder),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
         context.hub.start()
+        context.receipts.start()
         yield
+        context.receipts.close()
         await context.hub.close()
         await context.inspector.close()
         await context.packer.close()

@@ -20,6 +20,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.rates import Rates
+from api.http.receipts import Receipts
 from api.http.sign_ins import SignIns
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
@@ -72,6 +73,7 @@ class Context:
     metrics: Metrics
     sign_ins: SignIns
     rates: Rates
+    receipts: Receipts
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
+from api.http.receipts import Receipt
 from service.errors import RefusedInputError, ServiceError, TooLargeError
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
@@ -77,11 +78,7 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
             moves, or was cut off.
     """
     limit = settings.max_request_bytes
-    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
-        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
-    declared = request.headers.get("content-length", "")
-    if declared.isdigit() and int(declared) > limit:
-        raise TooLargeError(f"The request has {int(declared):,} bytes; {limit:,} may be. Use uploads.", limit=limit)
+    declared_bytes(request, settings)
     total = 0
     block = bytearray()
     stream = aiter(request.stream())
@@ -115,11 +112,27 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
         yield bytes(block)
 
 
-async def receive(request: Request, blobs: Blobs, settings: ServiceSettings) -> Received:
-    """Read a multipart request to its end; its files are blobs when this returns.
+def declared_bytes(request: Request, settings: ServiceSettings) -> int:
+    """Return the bytes that a body has by its headers; 0 if they do not say.
 
     Raises:
-        ServiceError: in one of its forms; what had arrived is removed.
+        MediaTypeError, TooLargeError: it is compressed, or too long.
+    """
+    limit = settings.max_request_bytes
+    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
+        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
+    declared = request.headers.get("content-length", "")
+    if declared.isdigit() and int(declared) > limit:
+        raise TooLargeError(f"The request has {int(declared):,} bytes; {limit:,} may be. Use uploads.", limit=limit)
+    return int(declared) if declared.isdigit() else 0
+
+
+async def receive(request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> Received:
+    """Read a multipart request to its end; its files are blobs when this returns, and the receipt holds them.
+
+    Raises:
+        QuotaError: the owner would have too many bytes: before the first one is read, if the request declares them.
+        ServiceError: in one of its forms; the receipt's end removes what had arrived.
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
@@ -127,7 +140,8 @@ async def receive(request: Request, blobs: Blobs, settings: ServiceSettings) -> 
         raise MediaTypeError("The body must be multipart/form-data or application/json.")
     if not boundary:
         raise BadRequestError("The Content-Type multipart/form-data must name a boundary.")
-    form = _Form(boundary, blobs, settings)
+    await asyncio.to_thread(receipt.charge, declared_bytes(request, settings))
+    form = _Form(boundary, blobs, settings, receipt)
     blocks = body_blocks(request, settings)
     try:
         async for block in blocks:
@@ -160,9 +174,9 @@ async def _drain(blocks: AsyncIterator[bytes]) -> None:
 class _Form:
     """The parser's callbacks: which part is open, and where its bytes go."""
 
-    def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings) -> None:
+    def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> None:
         self.received = Received()
-        self._blobs, self._settings = blobs, settings
+        self._blobs, self._settings, self._receipt = blobs, settings, receipt
         self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + 1
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
         self._parts = 0
@@ -193,7 +207,8 @@ class _Form:
             raise BadRequestError(f"The multipart boundary cannot be used: {error}.") from error
 
     def feed(self, block: bytes) -> None:
-        """Take a block of the body in."""
+        """Take a block of the body in, once it is charged."""
+        self._receipt.take(len(block))
         try:
             self._parser.write(block)
         except FormParserError as error:
@@ -258,7 +273,7 @@ class _Form:
             except ServiceError:
                 file.discard()
                 raise
-            self._blobs.keep(file.path, sha256, file.size)
+            self._blobs.keep(file.path, sha256, file.size, self._receipt.id)
             entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": file.size}
             self.received.files.append(entry)
             return

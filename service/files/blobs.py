@@ -14,7 +14,7 @@ import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -125,8 +125,16 @@ class Blobs(ABC):
         return Receiver(self.incoming / f"{secrets.token_hex(12)}.part", limit, self.ensure_room)
 
     @abstractmethod
-    def keep(self, path: Path, sha256: str, size: int) -> None:
-        """Make a received, durable file a blob; the file is gone then."""
+    def keep(self, path: Path, sha256: str, size: int, upload_id: str | None = None) -> None:
+        """Make a received, durable file a blob, which an upload or a receipt holds from then on; the file is gone then.
+
+        Raises:
+            NotFoundError: the upload or receipt is gone.
+        """
+
+    @abstractmethod
+    def remove(self, locations: Iterable[str]) -> None:
+        """Remove the files of blobs whose rows have been deleted; what cannot be removed now is collected later."""
 
     @abstractmethod
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
@@ -209,7 +217,7 @@ class BlobFolder(Blobs):
             path.mkdir(parents=True, exist_ok=True)
         self._digests: OrderedDict[str, tuple[int, Digest]] = OrderedDict()
 
-    def keep(self, path: Path, sha256: str, size: int, *, leave: bool = False) -> None:
+    def keep(self, path: Path, sha256: str, size: int, upload_id: str | None = None, *, leave: bool = False) -> None:
         """Move a received file to its place, or remove it where its content is there already.
 
         Args:
@@ -224,8 +232,18 @@ class BlobFolder(Blobs):
             path.replace(final)
         final.chmod(0o440)
         flush_folder(final.parent)
-        if self._inputs.add_blob(sha256, location, size) != location:
+        try:
+            kept = self._inputs.add_blob(sha256, location, size, upload_id) == location
+        except NotFoundError:
             final.unlink()
+            raise
+        if not kept:
+            final.unlink()
+
+    def remove(self, locations: Iterable[str]) -> None:
+        """Remove their files."""
+        for location in locations:
+            (self._blobs / location).unlink(missing_ok=True)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (others need it)
         """Where they are; nothing is put into `folder`."""
@@ -276,7 +294,7 @@ class BlobFolder(Blobs):
         try:
             digest = self.digest_so_far(upload.id, upload.length)
             sha256 = digest.hexdigest() if digest is not None else file_digest(path)
-            self.keep(path, sha256, upload.length, leave=True)
+            self.keep(path, sha256, upload.length, upload.id, leave=True)
         except FileNotFoundError:  # unless another request has just done it
             known = self._inputs.upload(upload.id, upload.owner).sha256
             if known is None:
@@ -293,10 +311,9 @@ class BlobFolder(Blobs):
         self.keep_digest(upload_id, 0, None)
 
     def _collect_blobs(self) -> int:
-        removed = 0
-        for location in self._inputs.collect():
-            (self._blobs / location).unlink(missing_ok=True)
-            removed += 1
+        unused = self._inputs.collect()
+        self.remove(unused)
+        removed = len(unused)
         known = self._inputs.locations()
         before = time.time() - _ORPHAN_SECONDS
         for path in self._blobs.glob("*/*"):

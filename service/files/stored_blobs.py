@@ -6,7 +6,7 @@ import logging
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -58,10 +58,18 @@ class StoredBlobs(Blobs):
             self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
             super().ensure_room(size)
 
-    def keep(self, path: Path, sha256: str, size: int) -> None:
+    def keep(self, path: Path, sha256: str, size: int, upload_id: str | None = None) -> None:
         """Put a received file into the store, unless its content is there, and into the cache."""
-        self._put(path, sha256, size, [])
+        self._put(path, sha256, size, [], upload_id)
         self._cache.adopt(path, sha256)
+
+    def remove(self, locations: Iterable[str]) -> None:
+        """Remove their objects."""
+        for location in locations:
+            try:
+                self._objects.remove(f"{BLOBS}/{location}")
+            except StoreError as error:
+                _log.warning("an unused input stays until the store is looked through: %s", error.__cause__)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Links to this host's copies, in `folder`; what is not in the cache is fetched."""
@@ -77,21 +85,27 @@ class StoredBlobs(Blobs):
         """From the store: who downloads a part needs no copy of the whole on this host."""
         return self._objects.read(f"{BLOBS}/{row.location}", start, stop)
 
-    def _put(self, path: Path, sha256: str, size: int, parts: list[str]) -> None:
+    def _put(self, path: Path, sha256: str, size: int, parts: list[str], upload_id: str | None) -> None:
         """Make a file a blob of the store.
 
         Args:
-            path: the file.
-            parts: objects that are it, one behind the other; empty to send it.
+            path: File to store.
+            sha256: SHA-256 of the file.
+            size: Bytes of the file.
+            parts: Objects that make up the file, in order; empty to send the file itself.
+            upload_id: Upload or receipt that holds the blob.
         """
-        try:
-            self._inputs.hold([sha256])
+        if self._inputs.hold_known(sha256, size, upload_id):
             return
-        except NotFoundError:
-            location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+        location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
         self._send(path, f"{BLOBS}/{location}", parts)
-        if self._inputs.add_blob(sha256, location, size) != location:
-            self._objects.remove(f"{BLOBS}/{location}")
+        try:
+            kept = self._inputs.add_blob(sha256, location, size, upload_id) == location
+        except NotFoundError:
+            self.remove([location])
+            raise
+        if not kept:
+            self.remove([location])
 
     def _send(self, path: Path, name: str, parts: list[str]) -> None:
         """Join the parts, or, where there are none or the store cannot, send the file."""
@@ -122,7 +136,7 @@ class StoredBlobs(Blobs):
                 self._gather(locations, whole, upload)
                 sha256 = file_digest(whole)
                 can_join = self._objects.can_join([part.size for part in parts])
-                self._put(whole, sha256, upload.length, locations if can_join else [])
+                self._put(whole, sha256, upload.length, locations if can_join else [], upload.id)
             except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
@@ -158,10 +172,9 @@ class StoredBlobs(Blobs):
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
     def _collect_blobs(self) -> int:
-        removed = 0
-        for location in self._inputs.collect():
-            self._objects.remove(f"{BLOBS}/{location}")
-            removed += 1
+        unused = self._inputs.collect()
+        self.remove(unused)
+        removed = len(unused)
         self._cache.evict()
         if time.monotonic() - self._looked_at > _LOOK_SECONDS:
             self._looked_at = time.monotonic()
