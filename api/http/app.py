@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -25,6 +27,7 @@ from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
 from api.http.static import add_static
 from api.http.submission import JobFromUploads
+from api.http.threads import OwnerThreads
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.inspection.inspector import Inspector
@@ -62,10 +65,13 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             sign_ins=SignIns(),
             rates=Rates(),
             receipts=Receipts(store.inputs, blobs),
+            threads=OwnerThreads(),
             metrics=Metrics(store, settings.folder),
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
+        # the default has few threads where there are few processors, and most of these wait for the disk
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         context.hub.start()
         context.receipts.start()
         yield

@@ -22,6 +22,7 @@ from api.http.metrics import Metrics
 from api.http.rates import Rates
 from api.http.receipts import Receipts
 from api.http.sign_ins import SignIns
+from api.http.threads import OwnerThreads
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
@@ -74,6 +75,7 @@ class Context:
     sign_ins: SignIns
     rates: Rates
     receipts: Receipts
+    threads: OwnerThreads
 
 
 @dataclass(frozen=True)

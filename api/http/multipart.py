@@ -17,6 +17,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from api.http.receipts import Receipt
+from api.http.threads import OwnerThreads
 from service.errors import RefusedInputError, ServiceError, TooLargeError
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
@@ -127,7 +128,9 @@ def declared_bytes(request: Request, settings: ServiceSettings) -> int:
     return int(declared) if declared.isdigit() else 0
 
 
-async def receive(request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> Received:
+async def receive(
+    request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt, threads: OwnerThreads
+) -> Received:
     """Read a multipart request to its end; its files are blobs when this returns, and the receipt holds them.
 
     Raises:
@@ -145,8 +148,8 @@ async def receive(request: Request, blobs: Blobs, settings: ServiceSettings, rec
     blocks = body_blocks(request, settings)
     try:
         async for block in blocks:
-            await asyncio.to_thread(form.feed, block)
-        await asyncio.to_thread(form.finish)
+            await threads.run(receipt.owner, form.feed, block)
+        form.finish()
     except BaseException as error:
         form.discard()
         if isinstance(error, ServiceError) and not isinstance(error, TooSlowError | TooLargeError):

@@ -56,12 +56,13 @@ class Receipt:
     At the end of the `async with` block, files that no job has taken over are deleted, unless others use them.
 
     Attributes:
+        owner: Owner of the request.
         id: Id in the store; None as long as nothing is charged.
     """
 
     def __init__(self, receipts: Receipts, owner: str, quotas: Quotas) -> None:
         self.id: str | None = None
-        self._receipts, self._owner, self._quotas = receipts, owner, quotas
+        self._receipts, self.owner, self._quotas = receipts, owner, quotas
         self._charged = self._received = 0
 
     def charge(self, declared: int) -> None:
@@ -70,7 +71,7 @@ class Receipt:
         Raises:
             QuotaError: there would be too many.
         """
-        self.id = self._receipts.inputs.open_receipt(self._owner, declared, self._quotas)
+        self.id = self._receipts.inputs.open_receipt(self.owner, declared, self._quotas)
         self._receipts.active.add(self.id)
         self._charged = declared
 
@@ -83,7 +84,7 @@ class Receipt:
         self._received += size
         more = self._received - self._charged
         if more > 0 and self.id is not None:
-            self._receipts.inputs.grow_receipt(self.id, more, self._owner, self._quotas)
+            self._receipts.inputs.grow_receipt(self.id, more, self.owner, self._quotas)
             self._charged = self._received
 
     def hand_over(self) -> None:

@@ -56,17 +56,17 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
     writer = await asyncio.to_thread(_Writer, context, row, wanted)
     try:
         async for block in body_blocks(request, context.settings):
-            await asyncio.to_thread(writer.write, block)
+            await context.threads.run(row.owner, writer.write, block)
     except ServiceError:
         if wanted is None:
-            await asyncio.to_thread(writer.save)  # what has come is good
+            await context.threads.run(row.owner, writer.save)  # what has come is good
         writer.close()
         raise
     except BaseException:
         writer.close()
         raise
     try:
-        return await asyncio.to_thread(writer.finish)
+        return await context.threads.run(row.owner, writer.finish)
     finally:
         writer.close()
 

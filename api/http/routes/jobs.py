@@ -103,7 +103,7 @@ async def create_job(
         receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         reading = _from_json(request, context) if kind == "application/json" else _from_form(request, context, receipt)
-        wanted = await asyncio.to_thread(_find_files, context, caller, await reading)
+        wanted = await context.threads.run(caller.owner, _find_files, context, caller, await reading)
         if not wanted.checked:
             await context.inspector.inspect("validate", caller.owner, wanted.inputs, wanted.rows, wanted.parameters)
         if not dry_run:
@@ -181,7 +181,7 @@ def _queue_job(
 
 
 async def _from_form(request: Request, context: Context, receipt: Receipt) -> Parts:
-    received = await receive(request, context.blobs, context.settings, receipt)
+    received = await receive(request, context.blobs, context.settings, receipt, context.threads)
     text = received.texts.get("parameters", "").strip() or "{}"
     values = parse_json(text, "parameters")
     if not isinstance(values, dict):

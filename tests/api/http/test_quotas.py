@@ -240,6 +240,32 @@ def stored_bytes(service: Service, owner: str) -> int:
         store.close()
 
 
+# --- one key beside another ----------------------------------------------------------------------------------------
+
+
+def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: dict[str, bytes]) -> None:
+    """The process that checks the hostile key's files stands still; so do further files of this key, and no others."""
+    with (
+        Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service,
+        service.client(key(service, NO_QUOTAS)) as hostile,
+        service.client(key(service, NO_QUOTAS)) as other,
+        ThreadPoolExecutor(3) as pool,
+    ):
+        assert hostile.post("/v1/jobs", files=form(files)).status_code == 202
+        (checking,) = service.processes("service.inspection.process")
+        checking.suspend()
+        try:
+            new = [form({**files, "cameras": files["cameras"] + b" " * count}) for count in (1, 2, 3)]
+            waiting = [pool.submit(hostile.post, "/v1/jobs", files=each, timeout=PATIENCE) for each in new]
+            wait_for(lambda: any((service.data / "inspections").iterdir()), "the first file to be checked")
+            mine = form({**files, "cameras": files["cameras"] + b"\n"})
+            assert other.post("/v1/jobs", files=mine, timeout=PATIENCE).status_code == 202
+            assert not any(each.done() for each in waiting)
+        finally:
+            checking.resume()
+        assert [each.result().status_code for each in waiting] == [202] * 3
+
+
 # --- many requests at once -----------------------------------------------------------------------------------------
 
 
