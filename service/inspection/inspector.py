@@ -85,7 +85,12 @@ class InspectionProcess:
             self._waiting -= 1
         raise BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10)
 
-    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
+    async def warm(self) -> None:
+        """Start the process, so that its first request need not wait for that."""
+        async with self._lock:
+            await self._started()
+
+    async def _started(self) -> asyncio.subprocess.Process:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable,
@@ -97,7 +102,10 @@ class InspectionProcess:
                 env=self._environment(),
                 start_new_session=True,
             )
-        process = self._process
+        return self._process
+
+    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
+        process = await self._started()
         assert process.stdin is not None
         assert process.stdout is not None
         try:
@@ -141,6 +149,7 @@ class Inspector:
         self._store, self._blobs = store, blobs
         # while one owner's files take their whole time in one lane, the other one is free for everybody else's
         self._validating = Lanes([InspectionProcess(), InspectionProcess()])
+        self._warming: asyncio.Task[None] | None = None
         self._validating_large = Lanes([InspectionProcess()])
         self._planning = Lanes([InspectionProcess(_threads_of_a_job(settings))])
         self._folder = settings.folder / "inspections"
@@ -192,6 +201,8 @@ class Inspector:
         recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
         if recalled is not None:
             return recalled
+        if self._settings.keys_required and self._warming is None:  # without keys there is one owner
+            self._warming = asyncio.create_task(self._validating.places[1].warm())
         async with self._lanes(work, inputs).turn(owner) as process:
             answer = await self._ask_process(process, work, inputs, rows, parameters, show)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
