@@ -251,8 +251,9 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
         service.client(key(service, NO_QUOTAS)) as other,
         ThreadPoolExecutor(3) as pool,
     ):
-        assert hostile.post("/v1/jobs", files=form(files)).status_code == 202
-        # of both processes, the one that has had files to check; each is read in a child
+        assert hostile.post("/v1/jobs", files=form(files), timeout=PATIENCE).status_code == 202
+        # of both processes, the one that has had files to check: they were read in a child, which has ended
+        wait_for(lambda: len(service.processes("service.inspection.process")) == 2, "the child to end", service.said)
         both = service.processes("service.inspection.process")
         checking = max(both, key=lambda process: process.cpu_times().children_user)
         checking.suspend()
