@@ -252,10 +252,10 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
         ThreadPoolExecutor(3) as pool,
     ):
         assert hostile.post("/v1/jobs", files=form(files), timeout=PATIENCE).status_code == 202
-        # of both processes, the one that has had files to check: they were read in a child, which has ended
+        # the spare process is started before the one that gets the first files, whose child has to end
         wait_for(lambda: len(service.processes("service.inspection.process")) == 2, "the child to end", service.said)
         both = service.processes("service.inspection.process")
-        checking = max(both, key=lambda process: process.cpu_times().children_user)
+        checking = max(both, key=lambda process: (process.create_time(), process.pid))
         checking.suspend()
         try:
             new = [form({**files, "cameras": files["cameras"] + b" " * count}) for count in (1, 2, 3)]
