@@ -6,6 +6,7 @@ import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -21,11 +22,13 @@ from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
 from api.http.rates import Rates
 from api.http.readiness import Readiness
+from api.http.receipts import Receipts
 from api.http.routes import artifacts, events, inputs, jobs, operations, session, uploads
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
 from api.http.static import add_static
 from api.http.submission import JobFromUploads
+from api.http.threads import OwnerThreads
 from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
@@ -66,6 +69,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
+            receipts=Receipts(store.inputs, blobs),
+            threads=OwnerThreads(),
             metrics=Metrics(store, settings.folder),
             readiness=Readiness(
                 {
@@ -78,10 +83,14 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
+        # the default has few threads where there are few processors, and most of these wait for the disk
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         context.hub.start()
+        context.receipts.start()
         with suppress(DamagedWeightsError):  # it is logged, and /readyz reports it
             await asyncio.to_thread(check_weights)
         yield
+        context.receipts.close()
         await context.hub.close()
         await context.inspector.close()
         await context.packer.close()

@@ -21,7 +21,9 @@ from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.rates import Rates
 from api.http.readiness import Readiness
+from api.http.receipts import Receipts
 from api.http.sign_ins import SignIns
+from api.http.threads import OwnerThreads
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
@@ -75,6 +77,8 @@ class Context:
     readiness: Readiness
     sign_ins: SignIns
     rates: Rates
+    receipts: Receipts
+    threads: OwnerThreads
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from api.http.memory import memory
+from api.http.receipts import Receipt
+from api.http.threads import OwnerThreads
 from service.errors import RefusedInputError, ServiceError, TooLargeError
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
@@ -82,11 +84,7 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
         TooSlowError: The body stands still or hardly moves.
         BadRequestError: The body was cut off.
     """
-    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
-        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
-    total = int(request.headers.get("content-length", "0"))  # digits alone: the HTTP parser refuses anything else
-    if total > limit:
-        raise TooLargeError(f"The request has {total:,} bytes; at most {limit:,} are allowed. {advice}", limit=limit)
+    declared_bytes(request, limit, advice)
     total = 0
     stream = aiter(request.stream())
     started = time.monotonic()
@@ -132,11 +130,29 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
         yield bytes(block)
 
 
-async def receive(request: Request, blobs: Blobs, settings: ServiceSettings) -> Received:
-    """Read a multipart request to its end; its files are blobs when this returns.
+def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -> int:
+    """Return the length of a body by its headers; 0 if they do not give it.
 
     Raises:
-        ServiceError: in one of its forms; what had arrived is removed.
+        MediaTypeError: The body is compressed.
+        TooLargeError: The body is too long.
+    """
+    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
+        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
+    total = int(request.headers.get("content-length", "0"))  # digits alone: the HTTP parser refuses anything else
+    if total > limit:
+        raise TooLargeError(f"The request has {total:,} bytes; at most {limit:,} are allowed. {advice}", limit=limit)
+    return total
+
+
+async def receive(
+    request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt, threads: OwnerThreads
+) -> Received:
+    """Read a multipart request to its end; its files are blobs when this returns, and the receipt holds them.
+
+    Raises:
+        QuotaError: the owner would have too many bytes: before the first one is read, if the request declares them.
+        ServiceError: in one of its forms; the receipt's end removes what had arrived.
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
@@ -144,12 +160,13 @@ async def receive(request: Request, blobs: Blobs, settings: ServiceSettings) -> 
         raise MediaTypeError("The body must be multipart/form-data or application/json.")
     if not boundary:
         raise BadRequestError("The Content-Type multipart/form-data must name a boundary.")
-    form = _Form(boundary, blobs, settings)
+    await asyncio.to_thread(receipt.charge, declared_bytes(request, settings.max_request_bytes))
+    form = _Form(boundary, blobs, settings, receipt)
     blocks = body_blocks(request, settings)
     try:
         async for block in blocks:
-            await asyncio.to_thread(form.feed, block)
-        await asyncio.to_thread(form.finish)
+            await threads.run(receipt.owner, form.feed, block)
+        form.finish()
     except BaseException as error:
         form.discard()
         if isinstance(error, ServiceError) and not isinstance(error, TooSlowError | TooLargeError):
@@ -177,9 +194,9 @@ async def _drain(blocks: AsyncIterator[bytes]) -> None:
 class _Form:
     """The parser's callbacks: which part is open, and where its bytes go."""
 
-    def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings) -> None:
+    def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> None:
         self.received = Received()
-        self._blobs, self._settings = blobs, settings
+        self._blobs, self._settings, self._receipt = blobs, settings, receipt
         self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + 1
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
         self._parts = 0
@@ -210,7 +227,8 @@ class _Form:
             raise BadRequestError(f"The multipart boundary cannot be used: {error}.") from error
 
     def feed(self, block: bytes) -> None:
-        """Take a block of the body in."""
+        """Take a block of the body in, once it is charged."""
+        self._receipt.take(len(block))
         try:
             self._parser.write(block)
         except FormParserError as error:
@@ -275,7 +293,7 @@ class _Form:
             except ServiceError:
                 file.discard()
                 raise
-            sha256 = self._blobs.keep(file.path)
+            sha256 = self._blobs.keep(file.path, self._receipt.id)
             entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": file.size}
             self.received.files.append(entry)
             return

@@ -59,7 +59,11 @@ async def answer_plan(request: Request, plan: Planning, workers: int | None) -> 
     """
     if _EVENTS in request.headers.get("accept", ""):
         sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        return StreamingResponse(_events(plan, workers), 200, sent, _EVENTS)
+        told: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        # started here: what the plan holds is let go of at its end, even if nobody ever asks for the first event
+        task = asyncio.create_task(plan(told.put_nowait))
+        task.add_done_callback(lambda _: told.put_nowait(None))
+        return StreamingResponse(_events(task, told, workers), 200, sent, _EVENTS)
     planning, leaving = asyncio.create_task(plan(lambda now: None)), asyncio.create_task(_left(request))
     try:
         await asyncio.wait((planning, leaving), return_when=asyncio.FIRST_COMPLETED)
@@ -81,11 +85,10 @@ def _view(found: Mapping[str, Any], workers: int | None) -> dict[str, Any]:
     return PlanView(**found, workers=workers).model_dump(mode="json")
 
 
-async def _events(plan: Planning, workers: int | None) -> AsyncIterator[bytes]:
-    """What is told of a plan; who stops listening ends the planning."""
-    told: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-    task = asyncio.create_task(plan(told.put_nowait))
-    task.add_done_callback(lambda _: told.put_nowait(None))
+async def _events(
+    task: asyncio.Task[dict[str, Any]], told: asyncio.Queue[dict[str, Any] | None], workers: int | None
+) -> AsyncIterator[bytes]:
+    """Yield the events of a plan until it is done; the end of the iteration ends the planning."""
     try:
         while True:
             try:

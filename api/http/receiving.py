@@ -31,12 +31,12 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
     try:
         try:
             async for block in body_blocks(request, context.settings):
-                await asyncio.to_thread(writer.write, block)
+                await context.threads.run(row.owner, writer.write, block)
         except ServiceError:
             if wanted is None:
-                await asyncio.to_thread(writer.save)  # what has come is good
+                await context.threads.run(row.owner, writer.save)  # what has come is good
             raise
-        return await asyncio.to_thread(writer.finish)
+        return await context.threads.run(row.owner, writer.finish)
     finally:
         writer.close()
 

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
@@ -115,11 +115,22 @@ class Blobs(ABC):
         return Receiver(self.incoming / f"{secrets.token_hex(12)}.part", limit, self.ensure_room)
 
     @abstractmethod
-    def keep(self, path: Path) -> str:
+    def keep(self, path: Path, upload_id: str | None = None) -> str:
         """Make a received, durable file a blob, and return its SHA-256; the file is gone then.
 
         What is hashed is the file that gets the name. A blob of the same content that was lost or damaged is replaced.
+
+        Args:
+            path: File that nobody writes to any more.
+            upload_id: Upload or receipt that holds the blob from then on.
+
+        Raises:
+            NotFoundError: The upload or receipt is gone.
         """
+
+    @abstractmethod
+    def remove(self, locations: Iterable[str]) -> None:
+        """Remove the files of blobs whose rows have been deleted; what cannot be removed now is collected later."""
 
     @abstractmethod
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
@@ -216,7 +227,7 @@ class BlobFolder(Blobs):
         for path in (self._blobs, self.uploads):
             path.mkdir(parents=True, exist_ok=True)
 
-    def keep(self, path: Path, *, leave: bool = False) -> str:
+    def keep(self, path: Path, upload_id: str | None = None, *, leave: bool = False) -> str:
         """Move a received file to its place, and return its SHA-256.
 
         Args:
@@ -232,7 +243,11 @@ class BlobFolder(Blobs):
         else:
             path.replace(final)
         flush_folder(final.parent)
-        location = self._inputs.add_blob(sha256, f"{final.parent.name}/{final.name}", size)
+        try:
+            location = self._inputs.add_blob(sha256, f"{final.parent.name}/{final.name}", size, upload_id)
+        except NotFoundError:
+            final.unlink()
+            raise
         known = self._blobs / location
         if known != final:  # it takes the place of a file of the same content, which may be lost or damaged
             known.parent.mkdir(exist_ok=True)
@@ -240,6 +255,11 @@ class BlobFolder(Blobs):
             final.unlink(missing_ok=True)  # two names of one file: the system renames nothing
             flush_folder(known.parent)
         return sha256
+
+    def remove(self, locations: Iterable[str]) -> None:
+        """Remove their files."""
+        for location in locations:
+            (self._blobs / location).unlink(missing_ok=True)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (others need it)
         """Return their places; nothing is put into `folder`."""
@@ -266,7 +286,7 @@ class BlobFolder(Blobs):
                     return known
                 if path.stat().st_size != upload.length:
                     raise gone(upload)
-                sha256 = self.keep(path, leave=True)
+                sha256 = self.keep(path, upload.id, leave=True)
                 self._inputs.finish_upload(upload.id, sha256, seconds)
                 path.unlink(missing_ok=True)
                 return sha256
@@ -281,10 +301,9 @@ class BlobFolder(Blobs):
         self.upload_path(upload_id).unlink(missing_ok=True)
 
     def _collect_blobs(self) -> int:
-        removed = 0
-        for location in self._inputs.collect():
-            (self._blobs / location).unlink(missing_ok=True)
-            removed += 1
+        unused = self._inputs.collect()
+        self.remove(unused)
+        removed = len(unused)
         known = self._inputs.locations()
         before = self._expiry() - _ORPHAN_SECONDS
         for path in self._blobs.glob("*/*"):

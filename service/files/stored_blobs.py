@@ -6,7 +6,7 @@ import logging
 import secrets
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -63,18 +63,26 @@ class StoredBlobs(Blobs):
             self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
             super().ensure_room(size)
 
-    def keep(self, path: Path) -> str:
+    def keep(self, path: Path, upload_id: str | None = None) -> str:
         """Put a received file into the store, unless its content is there, and into the cache."""
-        sha256 = file_digest(path)
-        location = self._known(sha256)
+        sha256, size = file_digest(path), path.stat().st_size
+        location = self._inputs.hold_known(sha256, size, upload_id)
         if location is not None:
             self._heal(location, sha256, path)
         else:
             location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
             self.objects.put(path, f"{BLOBS}/{location}")
-            self._register(sha256, location, path.stat().st_size)
+            self._register(sha256, location, size, upload_id)
         self._cache.adopt(path, sha256)
         return sha256
+
+    def remove(self, locations: Iterable[str]) -> None:
+        """Remove their objects."""
+        for location in locations:
+            try:
+                self.objects.remove(f"{BLOBS}/{location}")
+            except StoreError as error:
+                _log.warning("an unused input stays until the store is looked through: %s", error.__cause__)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Links to this host's copies, in `folder`; what is not in the cache is fetched."""
@@ -86,18 +94,19 @@ class StoredBlobs(Blobs):
             self._cache.link(sha256, row.size, found[sha256], partial(self.objects.get, f"{BLOBS}/{row.location}"))
         return found
 
-    def _known(self, sha256: str) -> str | None:
-        """Return the location of a blob, which stays for a while from now on; None where there is none."""
-        try:
-            return self._inputs.hold([sha256])[sha256].location
-        except NotFoundError:
-            return None
+    def _register(self, sha256: str, location: str, size: int, upload_id: str | None) -> str:
+        """Make an object a blob, and return the blob's location; an object whose content is there already goes.
 
-    def _register(self, sha256: str, location: str, size: int) -> str:
-        """Make an object a blob, and return the blob's location; an object whose content is there already goes."""
-        known = self._inputs.add_blob(sha256, location, size)
+        Raises:
+            NotFoundError: The upload or receipt that would hold it is gone; so is the object.
+        """
+        try:
+            known = self._inputs.add_blob(sha256, location, size, upload_id)
+        except NotFoundError:
+            self.remove([location])
+            raise
         if known != location:
-            self.objects.remove(f"{BLOBS}/{location}")
+            self.remove([location])
         return known
 
     def _heal(self, location: str, sha256: str, path: Path) -> None:
@@ -122,7 +131,7 @@ class StoredBlobs(Blobs):
         try:
             try:
                 sha256 = self._finish(upload, whole)
-            except FileNotFoundError:  # unless another request has just finished it
+            except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
                     raise gone(upload) from None
@@ -150,11 +159,11 @@ class StoredBlobs(Blobs):
         joined = self._join(upload.id, parts)
         if joined is None:
             self._gather([part.location for part in parts], whole)
-            return self.keep(whole)
+            return self.keep(whole, upload.id)
         # what is hashed is the very object that becomes the blob
         self.objects.get(f"{BLOBS}/{joined}", whole)
         sha256 = file_digest(whole)
-        location = self._register(sha256, joined, upload.length)
+        location = self._register(sha256, joined, upload.length, upload.id)
         if location != joined:
             self._heal(location, sha256, whole)
         self._cache.adopt(whole, sha256)
@@ -192,10 +201,9 @@ class StoredBlobs(Blobs):
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
     def _collect_blobs(self) -> int:
-        removed = 0
-        for location in self._inputs.collect():
-            self.objects.remove(f"{BLOBS}/{location}")
-            removed += 1
+        unused = self._inputs.collect()
+        self.remove(unused)
+        removed = len(unused)
         self._cache.evict()
         if time.monotonic() - self._looked_at > _LOOK_SECONDS:
             self._looked_at = time.monotonic()

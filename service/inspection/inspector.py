@@ -20,6 +20,7 @@ import psutil
 from service.errors import BusyError, RefusedInputError
 from service.files.blobs import Blobs
 from service.files.staging import stage
+from service.inspection.lanes import Lanes
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -84,7 +85,12 @@ class InspectionProcess:
             self._waiting -= 1
         raise BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10)
 
-    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
+    async def warm(self) -> None:
+        """Start the process, so that its first request need not wait for that."""
+        async with self._lock:
+            await self._started()
+
+    async def _started(self) -> asyncio.subprocess.Process:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable,
@@ -96,7 +102,10 @@ class InspectionProcess:
                 env=self._environment(),
                 start_new_session=True,
             )
-        process = self._process
+        return self._process
+
+    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
+        process = await self._started()
         assert process.stdin is not None
         assert process.stdout is not None
         try:
@@ -138,8 +147,11 @@ class Inspector:
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs) -> None:
         self._settings = settings
         self._store, self._blobs = store, blobs
-        self._validating, self._validating_large = InspectionProcess(), InspectionProcess()
-        self._planning = InspectionProcess(_threads_of_a_job(settings))
+        # while one owner's files take their whole time in one lane, the other one is free for everybody else's
+        self._validating = Lanes([InspectionProcess(), InspectionProcess()])
+        self._warming: asyncio.Task[None] | None = None
+        self._validating_large = Lanes([InspectionProcess()])
+        self._planning = Lanes([InspectionProcess(_threads_of_a_job(settings))])
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
         for left in self._folder.iterdir():  # by a process that was killed
@@ -166,19 +178,21 @@ class Inspector:
     async def inspect(
         self,
         work: Work,
+        owner: str,
         inputs: Sequence[Mapping[str, Any]],
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show = lambda now: None,
     ) -> dict[str, Any]:
-        """What `service.inspection.process` finds in a job's inputs.
+        """Return what `service.inspection.process` finds in a job's inputs.
 
         Args:
             work: "plan" for what has been validated.
+            owner: Owner of the job; of those who wait, owners take turns.
             inputs: `role`, `name`, `sha256` and `size` of each file.
-            rows: the files by digest.
-            parameters: of the job.
-            show: told `step`, `total`, `fraction` and `eta_s` of a plan; its steps are views.
+            rows: Files by digest.
+            parameters: Parameters of the job.
+            show: Receives `step`, `total`, `fraction` and `eta_s` of a plan; its steps are views.
 
         Raises:
             RefusedInputError: they cannot be used.
@@ -187,26 +201,32 @@ class Inspector:
         recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
         if recalled is not None:
             return recalled
-        answer = await self._ask_process(work, inputs, rows, parameters, show)
+        if self._settings.keys_required and self._warming is None:  # without keys there is one owner
+            self._warming = asyncio.create_task(self._validating.places[1].warm())
+        async with self._lanes(work, inputs).turn(owner) as process:
+            answer = await self._ask_process(process, work, inputs, rows, parameters, show)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
         if not passing:  # another day it may be otherwise
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return found_or_refused(answer)
 
+    def _lanes(self, work: Work, inputs: Sequence[Mapping[str, Any]]) -> Lanes[InspectionProcess]:
+        """Return the processes for a piece of work."""
+        if work == "plan":
+            return self._planning
+        return self._validating_large if _size(inputs) > _LARGE_BYTES else self._validating
+
     async def _ask_process(
         self,
+        process: InspectionProcess,
         work: Work,
         inputs: Sequence[Mapping[str, Any]],
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show,
     ) -> dict[str, Any]:
-        size = sum(entry["size"] for entry in inputs)
-        process = (
-            self._planning if work == "plan" else self._validating_large if size > _LARGE_BYTES else self._validating
-        )
-        seconds = await asyncio.to_thread(self._seconds, work, size, inputs, parameters)
+        seconds = await asyncio.to_thread(self._seconds, work, _size(inputs), inputs, parameters)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             paths = await asyncio.to_thread(self._blobs.bring, rows, Path(folder))
             staged = await asyncio.to_thread(stage, Path(folder), inputs, paths)
@@ -248,8 +268,13 @@ class Inspector:
 
     async def close(self) -> None:
         """End all processes."""
-        for process in (self._validating, self._validating_large, self._planning):
-            await process.close()
+        for lanes in (self._validating, self._validating_large, self._planning):
+            for process in lanes.places:
+                await process.close()
+
+
+def _size(inputs: Sequence[Mapping[str, Any]]) -> int:
+    return sum(entry["size"] for entry in inputs)
 
 
 def _threads_of_a_job(settings: ServiceSettings) -> int:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import delete, insert
+from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
 from service.store.clocks import kept_until
 from service.store.database import count, new_id
 from service.store.states import JobStatus, Transition, next_status
-from service.store.tables import Base, BlobUseRow, DeliveryRow, EventRow, JobRow
+from service.store.tables import Base, BlobRow, BlobUseRow, DeliveryRow, EventRow, JobRow
 
 _EVENTS = Base.metadata.tables[EventRow.__tablename__]
 
@@ -65,12 +65,33 @@ def release_inputs(session: Session, job_id: str) -> None:
     session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job_id)))
 
 
+def release_blobs(session: Session, holder: str) -> list[str]:
+    """Let go of a holder's blobs, and delete the rows of those that nobody else holds.
+
+    Returns:
+        Locations of the deleted ones: their files are the caller's to remove once the transaction is committed.
+    """
+    held = select(BlobUseRow.sha256).where(BlobUseRow.holder == holder)
+    # locked in one order, and before the uses go: of two holders that let go at once, the second sees that it is last
+    rows = session.scalars(
+        select(BlobRow).where(BlobRow.sha256.in_(held)).order_by(BlobRow.sha256).with_for_update()
+    ).all()
+    session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder))
+    digests = [row.sha256 for row in rows]
+    used = set(session.scalars(select(BlobUseRow.sha256).where(BlobUseRow.sha256.in_(digests))))
+    unused = [row for row in rows if row.sha256 not in used]
+    for row in unused:
+        session.delete(row)
+    return [row.location for row in unused]
+
+
 def holder_name(job_id: str) -> str:
     """The name under which a job holds its inputs."""
     return f"job:{job_id}"
 
 
-def forget(session: Session, job: JobRow) -> None:
-    """Remove a job's rows."""
-    release_inputs(session, job.id)
+def forget(session: Session, job: JobRow) -> list[str]:
+    """Delete a job's rows; return the locations of inputs that nobody needs any more, as `release_blobs`."""
+    unused = release_blobs(session, holder_name(job.id))
     session.delete(job)  # its attempts, events and artifacts go with it
+    return unused

@@ -6,17 +6,21 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import bindparam, delete, exists, select, update
+from sqlalchemy import bindparam, delete, exists, func, select, update
+from sqlalchemy.orm import Session
 
 from service.errors import ConflictError, NotFoundError
+from service.store.changes import release_blobs
 from service.store.database import Database, idempotency_row, new_id, upsert
-from service.store.quotas import NO_QUOTAS, Quotas, check_bytes
+from service.store.quotas import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
 #: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
 GRACE_SECONDS = 3600.0
 #: Of that time: what was touched since is not touched again.
 _HOLD_SHARE = 0.1
+#: Unfinished uploads of one key.
+MAX_OPEN_UPLOADS = 1000
 #: What checking an input found is kept for so long.
 _INSPECTION_SECONDS = 30 * 86_400.0
 
@@ -42,13 +46,40 @@ class Inputs:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def add_blob(self, sha256: str, location: str, size: int) -> str:
-        """Register a file's content; returns the location to use, an older one where the content was there already."""
+    def add_blob(self, sha256: str, location: str, size: int, upload_id: str | None = None) -> str:
+        """Register a file's content; return the location to use, an older one if the content was there already.
+
+        Args:
+            sha256: SHA-256 of the content.
+            location: Name of its file among the blobs.
+            size: Bytes of the content.
+            upload_id: Upload or receipt that brought it, and holds it from now on.
+
+        Raises:
+            NotFoundError: that upload is gone.
+        """
         now = self._database.clock()
         with self._database.writing() as session:
+            if upload_id is not None:
+                _lock_upload(session, upload_id)
             insert = upsert(session)(BlobRow).values(sha256=sha256, location=location, size=size, touched_at=now)
             session.execute(insert.on_conflict_do_update(index_elements=["sha256"], set_={"touched_at": now}))
+            if upload_id is not None:
+                _hold_for_upload(session, upload_id, sha256, size)
             return session.get_one(BlobRow, sha256, populate_existing=True).location
+
+    def hold_known(self, sha256: str, size: int, upload_id: str | None) -> str | None:
+        """Hold a content for an upload or receipt, and return its location; None if it is not there yet."""
+        with self._database.writing() as session:
+            if upload_id is not None:
+                _lock_upload(session, upload_id)
+            row = session.get(BlobRow, sha256, with_for_update=True)
+            if row is None:
+                return None
+            row.touched_at = self._database.clock()
+            if upload_id is not None:
+                _hold_for_upload(session, upload_id, sha256, size)
+            return row.location
 
     def hold(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Blobs by their digest, which all stay for a while from now on.
@@ -64,6 +95,8 @@ class Inputs:
                 now = self._database.clock()
                 for start in range(0, len(digests), 500):
                     mine = BlobRow.sha256.in_(digests[start : start + 500])
+                    # locked in the order of `release_blobs`
+                    session.execute(select(BlobRow.sha256).where(mine).order_by(BlobRow.sha256).with_for_update())
                     session.execute(update(BlobRow).where(mine).values(touched_at=now))
             found = self.blobs(digests)
         missing = next((sha256 for sha256 in digests if sha256 not in found), None)
@@ -114,15 +147,18 @@ class Inputs:
         seconds: float,
         idempotency_key: str | None = None,
         quotas: Quotas = NO_QUOTAS,
+        most: int = MAX_OPEN_UPLOADS,
     ) -> UploadRow:
         """Begin an upload that expires when nothing has been heard of it for so many seconds.
 
         Raises:
+            ConflictError: the owner has `most` unfinished uploads.
             IdempotencyError: the key was used for another upload.
             QuotaError: its bytes would be too many for its owner.
         """
         now = self._database.clock()
         with self._database.writing() as session:
+            lock_owner(session, owner)
             used_key = None
             if idempotency_key is not None:
                 used_key = idempotency_row(
@@ -135,6 +171,8 @@ class Inputs:
                 known = session.get(UploadRow, used_key.created_id) if used_key.created_id else None
                 if known is not None:
                     return known
+            if _count_open_uploads(session, owner) >= most:
+                raise ConflictError(f"There are {most} unfinished uploads of this key. Finish or delete some.")
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
             session.add(row)
@@ -214,14 +252,67 @@ class Inputs:
             use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
             session.execute(use.on_conflict_do_nothing())
 
-    def delete_upload(self, upload_id: str, owner: str) -> None:
-        """Forget an upload; a blob that it has become stays for the jobs that use it."""
+    def delete_upload(self, upload_id: str, owner: str) -> list[str]:
+        """Delete an upload; a blob that it has become stays for the jobs that use it.
+
+        Returns:
+            Locations of blobs that nobody needs any more, for `Blobs.remove`.
+        """
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None or row.owner != owner:
                 raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
-            session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{upload_id}"))
             session.delete(row)
+            return release_blobs(session, f"upload:{upload_id}")
+
+    # --- receipts: what requests bring themselves is charged to their owner until it is a job's, or gone ------------
+
+    def open_receipt(self, owner: str, size: int, quotas: Quotas) -> str:
+        """Charge an owner for the bytes of a request that is coming in; return the receipt's id.
+
+        The receipt holds the blobs that the request's files become. It expires as an upload does, unless it is renewed.
+
+        Raises:
+            QuotaError: there would be too many bytes.
+        """
+        now = self._database.clock()
+        row = UploadRow(id=new_id(RECEIPT, now), owner=owner, length=size, offset=0, filename="", metadata_header="")
+        row.created_at, row.expires_at = now, now + GRACE_SECONDS
+        with self._database.writing() as session:
+            lock_owner(session, owner)
+            session.add(row)
+            session.flush()
+            check_bytes(session, owner, quotas)
+        return row.id
+
+    def grow_receipt(self, receipt: str, size: int, owner: str, quotas: Quotas) -> None:
+        """Charge more bytes, for a request that did not declare how many would come.
+
+        Raises:
+            QuotaError: there would be too many.
+            NotFoundError: the receipt has expired.
+        """
+        with self._database.writing() as session:
+            lock_owner(session, owner)
+            _lock_upload(session, receipt).length += size
+            session.flush()
+            check_bytes(session, owner, quotas)
+
+    def renew_receipts(self, receipts: Sequence[str]) -> None:
+        """Keep the receipts of requests that are still at work from expiring."""
+        with self._database.writing() as session:
+            expires = self._database.clock() + GRACE_SECONDS
+            session.execute(update(UploadRow).where(UploadRow.id.in_(receipts)).values(expires_at=expires))
+
+    def end_receipt(self, receipt: str) -> list[str]:
+        """Delete a receipt whose request has ended without a job.
+
+        Returns:
+            Locations of blobs that nobody needs any more, for `Blobs.remove`.
+        """
+        with self._database.writing() as session:
+            session.execute(delete(UploadRow).where(UploadRow.id == receipt))
+            return release_blobs(session, f"upload:{receipt}")
 
     def expire_uploads(self) -> list[str]:
         """Forget uploads whose time is over; returns their ids, for removing what has arrived of them."""
@@ -236,9 +327,8 @@ class Inputs:
 
     def open_uploads(self, owner: str) -> int:
         """How many unfinished uploads this owner has."""
-        query = select(UploadRow.id).where(UploadRow.owner == owner, UploadRow.sha256.is_(None))
         with self._database.reading() as session:
-            return len(session.scalars(query).all())
+            return _count_open_uploads(session, owner)
 
     def inspection(self, key: str) -> dict[str, Any] | None:
         """What an earlier check of the same content found."""
@@ -253,3 +343,30 @@ class Inputs:
             insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
             session.execute(insert.on_conflict_do_nothing())
             session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
+
+
+def hand_over(session: Session, receipt: str) -> None:
+    """Delete a receipt whose blobs a job of the same transaction holds by now."""
+    session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{receipt}"))
+    session.execute(delete(UploadRow).where(UploadRow.id == receipt))
+
+
+def _lock_upload(session: Session, upload_id: str) -> UploadRow:
+    """Return an upload's row, locked before any blob's."""
+    row = session.get(UploadRow, upload_id, with_for_update=True)
+    if row is None:
+        raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+    return row
+
+
+def _hold_for_upload(session: Session, upload_id: str, sha256: str, size: int) -> None:
+    """Hold a blob for an upload or receipt; a receipt's charge moves from the bytes on their way in to the blob."""
+    use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
+    session.execute(use.on_conflict_do_nothing())
+    mine = update(UploadRow).where(UploadRow.id == upload_id, IS_RECEIPT).values(length=UploadRow.length - size)
+    session.execute(mine.execution_options(synchronize_session=False))
+
+
+def _count_open_uploads(session: Session, owner: str) -> int:
+    mine = select(func.count()).select_from(UploadRow)
+    return session.scalar(mine.where(UploadRow.owner == owner, UploadRow.sha256.is_(None), ~IS_RECEIPT)) or 0

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Float, Select, String, bindparam, func, insert, select, tuple_
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.errors import ConflictError, NotFoundError, QueueFullError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
+from service.store.inputs import hand_over
 from service.store.leases import Published
-from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job
+from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
 from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
@@ -87,8 +89,16 @@ class Jobs:
         limit: int,
         quotas: Quotas = NO_QUOTAS,
         idempotency: Idempotency | None = None,
+        receipt: str | None = None,
     ) -> tuple[JobRow, bool]:
         """Queue a job; its blobs are held from now on.
+
+        Args:
+            new: Job to queue.
+            limit: Unfinished jobs that the owner may have.
+            quotas: Quotas of the owner.
+            idempotency: Idempotency-Key of the request; None for none.
+            receipt: Receipt of the files that the request brought; a new job takes them over. None for no files.
 
         Returns:
             The job, and whether it is new: with an Idempotency-Key that was used before it is the job of that time.
@@ -97,9 +107,11 @@ class Jobs:
             IdempotencyError: the key was used for another request.
             QueueFullError: the owner has `limit` unfinished jobs.
             QuotaError: it would exceed one of the owner's quotas.
+            NotFoundError: an input was deleted meanwhile.
         """
         now = self._database.clock()
         with self._database.writing() as session:
+            lock_owner(session, new.owner)
             used_key = None
             if idempotency is not None:
                 used_key = idempotency_row(session, new.owner, idempotency.key, idempotency.fingerprint, now)
@@ -107,11 +119,7 @@ class Jobs:
                 known = session.get(JobRow, used_key.created_id)
                 if known is not None:
                     return known, False
-            if session.execute(_UNFINISHED_OF, {"owner": new.owner}).scalar_one() >= limit:
-                raise QueueFullError(
-                    f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.",
-                    limit=limit,
-                )
+            _check_queue(session, new.owner, limit)
             count_job(session, new.owner, quotas, now)
             values = _row_of_new_job(new, now)
             session.execute(insert(_JOBS), values)
@@ -120,7 +128,12 @@ class Jobs:
                 used_key.created_id = job.id
             digests = sorted({entry["sha256"] for entry in new.inputs})
             uses = [{"holder": holder_name(job.id), "sha256": sha256} for sha256 in digests]
-            session.execute(insert(_BLOB_USES), uses)
+            try:
+                session.execute(insert(_BLOB_USES), uses)
+            except IntegrityError as error:
+                raise NotFoundError("An input was deleted while it was being checked. Upload it again.") from error
+            if receipt is not None:
+                hand_over(session, receipt)
             check_bytes(session, new.owner, quotas)
             add_status_event(session, job, now)
             count(session, "sgsst_jobs_submitted_total")
@@ -190,30 +203,38 @@ class Jobs:
                 move(session, job, Transition.CANCEL, now)
         return job
 
-    def retry(self, job_id: str, owner: str | None, *, limit: int) -> JobRow:
-        """Queue a job again that failed or was canceled; it goes on from its last checkpoint, where it has one.
+    def retry(self, job_id: str, owner: str | None, *, limit: int, quotas: Quotas = NO_QUOTAS) -> JobRow:
+        """Queue a failed or canceled job again; it continues from its last checkpoint, if it has one.
+
+        A retry counts as one of the day's jobs.
 
         Raises:
             ConflictError: it is in another state.
             QueueFullError: the owner has `limit` unfinished jobs.
+            QuotaError: it would exceed one of the owner's quotas.
         """
         now = self._database.clock()
         with self._database.writing() as session:
+            lock_owner(session, _job_of_owner(session, job_id, owner).owner)
             job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.RETRY):
                 raise ConflictError(
                     f"The job has status {job.status}; only one that failed or was canceled can be tried again.",
                     job_status=job.status,
                 )
-            if session.execute(_UNFINISHED_OF, {"owner": job.owner}).scalar_one() >= limit:
-                raise QueueFullError(f"There are {limit} unfinished jobs of this key already.", limit=limit)
+            _check_queue(session, job.owner, limit)
+            count_job(session, job.owner, quotas, now)
+            check_bytes(session, job.owner, quotas)
             job.queued_at, job.not_before, job.failures, job.swept = now, now, 0, False
             job.finished_at = job.expires_at = job.error = job.progress = None
             move(session, job, Transition.RETRY, now)
         return job
 
-    def delete(self, job_id: str, owner: str | None) -> None:
-        """Forget a job that has ended, and let go of its inputs. Its files are the caller's to remove, afterwards.
+    def delete(self, job_id: str, owner: str | None) -> list[str]:
+        """Delete a job that has ended, and let go of its inputs. Its results are the caller's to remove, afterwards.
+
+        Returns:
+            Locations of inputs that nobody needs any more, for `Blobs.remove`.
 
         Raises:
             ConflictError: it has not ended.
@@ -225,7 +246,7 @@ class Jobs:
                 raise ConflictError(
                     f"The job has status {job.status}. {first}; delete it once it has ended.", job_status=job.status
                 )
-            forget(session, job)
+            return forget(session, job)
 
     def artifacts(self, job_id: str) -> list[ArtifactRow]:
         """The published files of a job, by name; those for the service alone start with a dot."""
@@ -299,8 +320,16 @@ def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
     }
 
 
+def _check_queue(session: Session, owner: str, limit: int) -> None:
+    """Raise QueueFullError if an owner has `limit` unfinished jobs."""
+    if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
+        raise QueueFullError(
+            f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=limit
+        )
+
+
 def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
-    job = session.get(JobRow, job_id, with_for_update=lock)
+    job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
     if job is None or (owner is not None and job.owner != owner):
         raise NotFoundError(f"There is no job {job_id}.")
     return job

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
-from sqlalchemy import BindParameter, String, bindparam, func, select, union
+from sqlalchemy import BindParameter, String, bindparam, func, or_, select, text, union
 from sqlalchemy.orm import Session
 
 from service.errors import QuotaError
@@ -19,6 +19,9 @@ _DAY = 86_400
 _BYTES_AGAIN = 3600
 
 _USAGE = Base.metadata.tables[UsageRow.__tablename__]
+#: Whether an upload is a receipt: the charge for the files that one request brings (`service.store.inputs`).
+RECEIPT = "rcp"
+IS_RECEIPT = UploadRow.id.startswith(f"{RECEIPT}_", autoescape=True)
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,8 @@ class Quotas:
     Attributes:
         jobs_a_day: that are accepted.
         gpu_seconds_a_day: of attempts, after which no more jobs are accepted; those that run go on.
-        stored_bytes: of unfinished uploads, inputs and results together; an input that several jobs use counts once.
+        stored_bytes: of unfinished uploads, of what requests bring, inputs and results together; an input that several
+            jobs use counts once.
         requests_a_second: to each process of the API, on average over some seconds.
     """
 
@@ -88,6 +92,16 @@ def day_of(now: float) -> int:
     return int(now // _DAY)
 
 
+def lock_owner(session: Session, owner: str) -> None:
+    """Make other transactions that check the same owner's limits wait for the end of this one.
+
+    Take this lock before any other, and before the check: two transactions that do not see each other's rows would both
+    pass. On SQLite a writing transaction is alone anyway.
+    """
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(_LOCK_OWNER, {"owner": f"sgsst-owner:{owner}"})
+
+
 def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
     """Count a job that is being accepted, within its transaction.
 
@@ -138,13 +152,19 @@ def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
 
 
 def stored_bytes(session: Session, owner: str) -> int:
-    """Bytes of unfinished uploads, of inputs (each content once) and of results."""
+    """Return the bytes of unfinished uploads and requests, of inputs (each content once), and of results."""
     return sum(int(session.scalar(query, {"owner": owner}) or 0) for query in _STORED)
 
 
+_LOCK_OWNER = text("SELECT pg_advisory_xact_lock(hashtextextended(:owner, 0))")
 _OWNER: BindParameter[str] = bindparam("owner", type_=String)
 _OF_JOBS = select(BlobUseRow.sha256).join(JobRow, BlobUseRow.holder == "job:" + JobRow.id).where(JobRow.owner == _OWNER)
-_OF_UPLOADS = select(UploadRow.sha256).where(UploadRow.owner == _OWNER, UploadRow.sha256.is_not(None))
+# an unfinished upload counts by its length, and its blob only once it is finished
+_OF_UPLOADS = (
+    select(BlobUseRow.sha256)
+    .join(UploadRow, BlobUseRow.holder == "upload:" + UploadRow.id)
+    .where(UploadRow.owner == _OWNER, or_(UploadRow.sha256.is_not(None), IS_RECEIPT))
+)
 _STORED = (
     select(func.sum(UploadRow.length)).where(UploadRow.owner == _OWNER, UploadRow.sha256.is_(None)),
     select(func.sum(BlobRow.size)).where(BlobRow.sha256.in_(union(_OF_JOBS, _OF_UPLOADS))),

@@ -6,8 +6,8 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
@@ -17,6 +17,7 @@ from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import Received, check_file, parse_json, read_json, receive
 from api.http.numbers import Digits
 from api.http.planning import DRY_RUN, answer_plan
+from api.http.receipts import Receipt
 from api.http.schemas import (
     JOB_ID,
     MOST_POINTS,
@@ -32,8 +33,16 @@ from api.http.schemas import (
 )
 from api.http.sending import IfNoneMatch
 from api.http.submission import BODY, REFUSALS, JobFromUploads
-from service.errors import ConflictError, DamagedWeightsError, NotFoundError, QueueFullError, RefusedInputError
+from service.errors import (
+    ConflictError,
+    DamagedWeightsError,
+    NotFoundError,
+    QueueFullError,
+    QuotaError,
+    RefusedInputError,
+)
 from service.files.staging import check_roles, clean_name, region_styles
+from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
@@ -99,15 +108,23 @@ async def create_job(
     ] = False,
 ) -> Response:
     """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    parts = await (_from_json(request, context) if kind == "application/json" else _from_form(request, context))
-    wanted = await asyncio.to_thread(_find_files, context, caller, parts)
-    if not wanted.checked:
-        await context.inspector.inspect("validate", wanted.inputs, wanted.rows, wanted.parameters)
-    if dry_run:
-        plan = partial(context.inspector.inspect, "plan", wanted.inputs, wanted.rows, wanted.parameters)
-        return await answer_plan(request, plan, wanted.parameters.workers)
-    return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key)
+    async with AsyncExitStack() as stack:
+        receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        reading = _from_json(request, context) if kind == "application/json" else _from_form(request, context, receipt)
+        wanted = await context.threads.run(caller.owner, _find_files, context, caller, await reading)
+        if not wanted.checked:
+            await context.inspector.inspect("validate", caller.owner, wanted.inputs, wanted.rows, wanted.parameters)
+        if not dry_run:
+            return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key, receipt)
+        stack.pop_all()  # the plan needs the files longer than this function runs
+
+    async def plan(show: Show) -> dict[str, Any]:
+        async with receipt:
+            inspect = context.inspector.inspect
+            return await inspect("plan", caller.owner, wanted.inputs, wanted.rows, wanted.parameters, show)
+
+    return await answer_plan(request, plan, wanted.parameters.workers)
 
 
 @dataclass(frozen=True)
@@ -147,7 +164,9 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     return _JobRequest(inputs, rows, parameters, webhook, checked)
 
 
-def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None) -> Response:
+def _queue_job(
+    context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None, receipt: Receipt
+) -> Response:
     """Queue a job that has been checked, and answer."""
     parameters, webhook = wanted.parameters, wanted.webhook
     idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
@@ -155,8 +174,14 @@ def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotenc
     new = NewJob(caller.owner, parameters.name, caller.priority, values, wanted.inputs, webhook or None)
     jobs = context.store.jobs
     job, created = jobs.create(
-        new, limit=context.settings.max_jobs_per_key, quotas=caller.quotas, idempotency=idempotency
+        new,
+        limit=context.settings.max_jobs_per_key,
+        quotas=caller.quotas,
+        idempotency=idempotency,
+        receipt=receipt.id,
     )
+    if created:
+        receipt.hand_over()
     sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
     if not created:
         sent["Idempotency-Replayed"] = "true"
@@ -165,8 +190,8 @@ def _queue_job(context: Context, caller: Caller, wanted: _JobRequest, idempotenc
     return Response(body, 202, sent, media_type="application/json")
 
 
-async def _from_form(request: Request, context: Context) -> Parts:
-    received = await receive(request, context.blobs, context.settings)
+async def _from_form(request: Request, context: Context, receipt: Receipt) -> Parts:
+    received = await receive(request, context.blobs, context.settings, receipt, context.threads)
     text = received.texts.get("parameters", "").strip() or "{}"
     values = parse_json(text, "parameters")
     if not isinstance(values, dict):
@@ -334,7 +359,15 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
                 "The job has status running; only one that failed or was canceled can be tried again.",
                 job_status="running",
             ),
-            QueueFullError("There are 100 unfinished jobs of this key already.", limit=100),
+            QueueFullError(
+                "There are 100 unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=100
+            ),
+            QuotaError(
+                "This key may submit 1,000 jobs a day, and has. Come back tomorrow (UTC).",
+                quota="jobs-a-day",
+                limit=1000,
+                retry_after=30_000,
+            ),
             RefusedInputError(
                 "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by a version of the service "
                 "that took this. Submit it anew without.",
@@ -349,7 +382,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
     stored_parameters(find(context, caller, job_id).parameters)
     check_weights()
-    context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key)
+    context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key, quotas=caller.quotas)
     return _job_response(context, caller, job_id, status=202)
 
 
@@ -370,8 +403,9 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
 def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
     """Remove a job that has ended, with its results."""
     find(context, caller, job_id)
-    context.store.jobs.delete(job_id, caller.owner)
+    unused = context.store.jobs.delete(job_id, caller.owner)
     context.artifacts.remove_job(job_id)
+    context.blobs.remove(unused)
 
 
 def find(context: Context, caller: Caller, job_id: str) -> JobRow:

@@ -29,15 +29,13 @@ from service.errors import (
     TooLargeError,
 )
 from service.files.staging import clean_name
-from service.store.inputs import check_offset
+from service.store.inputs import MAX_OPEN_UPLOADS, check_offset
 from service.store.tables import UploadRow
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
 VERSION = "1.0.0"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
-#: Unfinished uploads of one key.
-_MAX_OPEN = 1000
 
 
 class WrongVersionError(ServiceError):
@@ -130,7 +128,7 @@ def describe_uploads(context: ContextDep) -> Response:
         },
         **problems(
             BadRequestError("The file is empty. Give its size as Upload-Length."),
-            ConflictError(f"There are {_MAX_OPEN} unfinished uploads of this key. Finish or delete some."),
+            ConflictError(f"There are {MAX_OPEN_UPLOADS} unfinished uploads of this key. Finish or delete some."),
             _wrong_version("0.2.2"),
             TooLargeError("The file has 20,000,000,000 bytes; 16,000,000,000 may be.", limit=16_000_000_000),
             invalid("header.Upload-Length", "Field required"),
@@ -168,8 +166,6 @@ def create_upload(
     if not length:
         raise BadRequestError("The file is empty. Give its size as Upload-Length.")
     context.blobs.ensure_room(length)
-    if context.store.inputs.open_uploads(caller.owner) >= _MAX_OPEN:
-        raise ConflictError(f"There are {_MAX_OPEN} unfinished uploads of this key. Finish or delete some.")
     name = clean_name("photos", _file_name(metadata), 0)[-200:]
     seconds = context.settings.upload_hours * 3600
     row = context.store.inputs.create_upload(
@@ -313,8 +309,9 @@ async def append_upload(
 def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Give an upload up, or let go of a finished one; jobs that use it keep their file."""
     _find_upload(context, caller.owner, upload_id)
-    context.store.inputs.delete_upload(upload_id, caller.owner)
+    unused = context.store.inputs.delete_upload(upload_id, caller.owner)
     context.blobs.forget_upload(upload_id)
+    context.blobs.remove(unused)
     return Response(status_code=204, headers=_HEADERS)
 
 

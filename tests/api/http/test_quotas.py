@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import os
 import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -13,9 +17,10 @@ from api.http.rates import Rates
 from service.errors import RateLimitError
 from service.settings import ServiceSettings
 from service.store import open_store
-from service.store.quotas import Quotas
+from service.store.quotas import NO_QUOTAS, Quotas
 from tests.api.http.test_api import TUS, form, refused
-from tests.api.service import Service, wait_for
+from tests.api.service import PATIENCE, Service, wait_for
+from tests.postgres import fresh_database, is_installed, server
 from tests.small_scenes import wall, write_files
 
 
@@ -72,16 +77,38 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield running
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
+
+
 def key(service: Service, quotas: Quotas) -> str:
-    store = open_store(ServiceSettings(data=service.data))
-    text = store.keys.create("someone", quotas=quotas)[1]
+    return owner_and_key(service, quotas)[1]
+
+
+def owner_and_key(service: Service, quotas: Quotas) -> tuple[str, str]:
+    store = open_store(ServiceSettings(data=service.data, database=service.environment.get("SGSST_DATABASE")))
+    row, text = store.keys.create("someone", quotas=quotas)
     store.close()
-    return text
+    return row.id, text
 
 
-def test_jobs_bytes_and_requests(service: Service, tmp_path: Path) -> None:
-    ply, cameras, style = write_files(tmp_path, wall())
-    files = {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
+def on_disk(service: Service) -> int:
+    """Bytes of all inputs that the service keeps or receives, whoever they belong to."""
+    found = {}
+    for folder in ("blobs", "incoming", "uploads", "inspections"):
+        for path in (service.data / folder).rglob("*"):
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                continue
+            if path.is_file():
+                found[status.st_ino] = status.st_size
+    return sum(found.values())
+
+
+def test_jobs_bytes_and_requests(service: Service, files: dict[str, bytes]) -> None:
     with service.client(key(service, Quotas(stored_bytes=1_000_000))) as client:
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
         answer = client.post("/v1/jobs", files=form(files))
@@ -111,3 +138,174 @@ def test_connections_are_bounded(service: Service) -> None:
         for each in held:
             each.close()
     wait_for(lambda: httpx.get(f"{service.url}/livez").status_code == 200, "room for a connection", service.said)
+
+
+# --- bytes that nobody is charged for ------------------------------------------------------------------------------
+
+MB = 1_000_000
+
+
+def body_of(scene: int) -> tuple[bytes, dict[str, str]]:
+    """A multipart body with a scene of so many bytes that no other request has, and its headers."""
+    content = b"ply\n" + os.urandom(32) + bytes(scene)
+    request = httpx.Request("POST", "http://x", files={"scene": ("scene.ply", content)})
+    return request.read(), {"Content-Type": request.headers["content-type"]}
+
+
+def test_refused_requests_leave_nothing(service: Service, files: dict[str, bytes]) -> None:
+    """Each request fits into the quota; what they bring together is ten times as much."""
+    before = on_disk(service)
+    with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
+        for number in range(12):
+            broken = os.urandom(4 * MB)
+            answer = client.post("/v1/jobs", files=form({**files, "style": broken}))
+            refused(answer, 422, "invalid-image")
+            assert on_disk(service) <= before, f"request {number} has left its files"
+
+
+def test_dry_runs_and_full_queues_leave_nothing(tmp_path: Path, files: dict[str, bytes]) -> None:
+    quick = {"parameters": json.dumps({"preset": "preview", "backbone": "vgg16", "resolution": 128})}
+    with (
+        Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true", SGSST_MAX_JOBS_PER_KEY="1") as service,
+        service.client(key(service, NO_QUOTAS)) as client,
+    ):
+        for accept in ("*/*", "text/event-stream"):
+            answer = client.post(
+                "/v1/jobs?dry_run=true", files=form(files), data=quick, headers={"Accept": accept}, timeout=PATIENCE
+            )
+            assert answer.status_code == 200
+            assert "estimated_seconds" in answer.text
+            assert on_disk(service) == 0, accept
+        assert client.post("/v1/jobs", files=form(files)).status_code == 202
+        kept = on_disk(service)
+        assert kept == sum(len(content) for content in files.values())
+        refused(client.post("/v1/jobs", files=form(files)), 429, "queue-full")
+        assert on_disk(service) == kept, "the job still needs the same files"
+        other = {**files, "cameras": files["cameras"] + b"\n"}
+        refused(client.post("/v1/jobs", files=form(other)), 429, "queue-full")
+        assert on_disk(service) == kept
+        job_id = client.get("/v1/jobs").json()["jobs"][0]["id"]
+        client.post(f"/v1/jobs/{job_id}/cancel")
+        assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
+        assert on_disk(service) == 0
+
+
+def test_too_many_bytes_are_refused_before_they_come(service: Service) -> None:
+    before = on_disk(service)
+    host, port = service.url.removeprefix("http://").split(":")
+    owner, text = owner_and_key(service, Quotas(stored_bytes=5 * MB))
+    head = (
+        f"POST /v1/jobs HTTP/1.1\r\nHost: {host}:{port}\r\nAuthorization: Bearer {text}\r\n"
+        f"Content-Type: multipart/form-data; boundary=x\r\nContent-Length: {6 * MB}\r\n\r\n"
+    )
+    with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
+        connection.sendall(head.encode())
+        assert connection.recv(4096).startswith(b"HTTP/1.1 429 "), "no byte of the body was sent"
+    assert on_disk(service) == before
+    assert stored_bytes(service, owner) == 0
+
+
+def test_bytes_that_were_not_declared_are_charged_as_they_come(service: Service) -> None:
+    before, most = on_disk(service), 0
+    body, headers = body_of(20 * MB)
+
+    def pieces() -> Iterator[bytes]:
+        nonlocal most
+        for start in range(0, len(body), MB // 4):
+            yield body[start : start + MB // 4]
+            most = max(most, on_disk(service))
+
+    with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
+        refused(client.post("/v1/jobs", content=pieces(), headers=headers), 429, "quota-exceeded")
+    assert most - before <= 5 * MB
+    assert on_disk(service) == before
+
+
+def test_deleted_uploads_leave_nothing(service: Service) -> None:
+    before = on_disk(service)
+    with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
+        for _ in range(3):
+            content = os.urandom(4 * MB)
+            where = client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(len(content))}).headers["location"]
+            sent = TUS | {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+            assert client.patch(where, content=content, headers=sent).status_code == 204
+            assert client.delete(where).status_code == 204
+            assert on_disk(service) == before
+
+
+def stored_bytes(service: Service, owner: str) -> int:
+    store = open_store(ServiceSettings(data=service.data, database=service.environment.get("SGSST_DATABASE")))
+    try:
+        return store.usage.of(owner).stored_bytes
+    finally:
+        store.close()
+
+
+# --- one key beside another ----------------------------------------------------------------------------------------
+
+
+def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: dict[str, bytes]) -> None:
+    """The process that checks the hostile key's files stands still; so do further files of this key, and no others."""
+    with (
+        Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service,
+        service.client(key(service, NO_QUOTAS)) as hostile,
+        service.client(key(service, NO_QUOTAS)) as other,
+        ThreadPoolExecutor(3) as pool,
+    ):
+        assert hostile.post("/v1/jobs", files=form(files), timeout=PATIENCE).status_code == 202
+        # the spare process is started before the one that gets the first files, whose child has to end
+        wait_for(lambda: len(service.processes("service.inspection.process")) == 2, "the child to end", service.said)
+        both = service.processes("service.inspection.process")
+        checking = max(both, key=lambda process: (process.create_time(), process.pid))
+        checking.suspend()
+        try:
+            new = [form({**files, "cameras": files["cameras"] + b" " * count}) for count in (1, 2, 3)]
+            waiting = [pool.submit(hostile.post, "/v1/jobs", files=each, timeout=PATIENCE) for each in new]
+            wait_for(lambda: any((service.data / "inspections").iterdir()), "the first file to be checked")
+            mine = form({**files, "cameras": files["cameras"] + b"\n"})
+            assert other.post("/v1/jobs", files=mine, timeout=PATIENCE).status_code == 202
+            assert not any(each.done() for each in waiting)
+        finally:
+            checking.resume()
+        assert [each.result().status_code for each in waiting] == [202] * 3
+
+
+# --- many requests at once -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not is_installed(), reason="PostgreSQL's server is not installed")
+def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files: dict[str, bytes]) -> None:
+    """On PostgreSQL, where transactions run side by side and do not see each other's rows."""
+    limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_PER_KEY": "7"}
+    with (
+        server(durable=True) as url,
+        Service(tmp_path / "data", alone=True, SGSST_DATABASE=fresh_database(url), **limits) as service,
+        service.client(key(service, NO_QUOTAS)) as client,
+    ):
+        assert client.post("/v1/jobs", files=form(files)).status_code == 202  # inspected once for all
+        size = sum(len(content) for content in files.values())
+
+        _, many = owner_and_key(service, NO_QUOTAS)
+        assert at_once(service, many, "/v1/jobs", files=form(files)) == {202: 7, 429: 93}
+
+        _, daily = owner_and_key(service, Quotas(jobs_a_day=5))
+        assert at_once(service, daily, "/v1/jobs", files=form(files)) == {202: 5, 429: 95}
+
+        owner, uploads = owner_and_key(service, Quotas(stored_bytes=10 * MB))
+        begin = TUS | {"Upload-Length": str(3 * MB)}
+        assert at_once(service, uploads, "/v1/uploads", headers=begin) == {201: 3, 429: 97}
+        assert stored_bytes(service, owner) == 9 * MB
+
+        owner, requests = owner_and_key(service, Quotas(stored_bytes=3 * size))
+        answers = at_once(service, requests, "/v1/jobs", files=form(files))
+        assert answers.keys() == {202, 429}
+        assert 1 <= answers[202] <= 7
+        assert stored_bytes(service, owner) == size
+        assert on_disk(service) == size, "all jobs have the same files"
+
+
+def at_once(service: Service, text: str, path: str, **request: Any) -> dict[int, int]:
+    """Send a request a hundred times at the same moment; return how often each status was answered."""
+    with service.client(text) as client, ThreadPoolExecutor(100) as pool:
+        answers = list(pool.map(lambda _: client.post(path, timeout=PATIENCE, **request).status_code, range(100)))
+    return {status: answers.count(status) for status in set(answers)}

@@ -36,7 +36,7 @@ def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, An
         inspector = Inspector(settings, store, blobs)
         try:
             rows = store.inputs.blobs(sorted(digests.values()))
-            return await inspector.inspect("validate", inputs, rows, JobParameters(backbone="auto"))
+            return await inspector.inspect("validate", "local", inputs, rows, JobParameters(backbone="auto"))
         finally:
             await inspector.close()
 

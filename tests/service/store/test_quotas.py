@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+
 import pytest
 
-from service.errors import QuotaError
+from service.errors import ConflictError, NotFoundError, QueueFullError, QuotaError, ServiceError
 from service.settings import ServiceSettings
 from service.store import Store
+from service.store.inputs import GRACE_SECONDS
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, Used
 from tests.service.store.helpers import LEASE, SHA, Clock, lease, new_job, queue
@@ -104,6 +108,153 @@ def test_an_upload_that_has_become_an_input_counts_once(store: Store) -> None:
     store.inputs.finish_upload(row.id, SHA, 1000)
     queue(store)
     assert store.usage.of("local").stored_bytes == 3
+
+
+def test_retry_is_bounded_like_a_new_job(store: Store, clock: Clock) -> None:
+    quotas = Quotas(jobs_a_day=2)
+    job_id = submit(store, quotas)
+    store.jobs.cancel(job_id, "local")
+    store.jobs.retry(job_id, "local", limit=10, quotas=quotas)
+    store.jobs.cancel(job_id, "local")
+    for bound, quota in ((quotas, "jobs-a-day"), (Quotas(stored_bytes=2), "stored-bytes")):
+        with pytest.raises(QuotaError) as caught:
+            store.jobs.retry(job_id, "local", limit=10, quotas=bound)
+        assert caught.value.extra["quota"] == quota
+    assert store.jobs.get(job_id, "local").status == "canceled"
+    assert store.usage.of("local").jobs == 2
+    clock.now += DAY
+    store.jobs.retry(job_id, "local", limit=10, quotas=quotas)
+
+
+def test_retry_is_refused_once_the_gpu_seconds_are_used_up(store: Store, clock: Clock) -> None:
+    quotas = Quotas(gpu_seconds_a_day=10)
+    submit(store, quotas)
+    held = lease(store)
+    store.leases.hold_gpus(held, 8)
+    clock.now += 5
+    store.leases.fail(held, {"code": "x", "message": "x"}, permanent=True)
+    with pytest.raises(QuotaError) as caught:
+        store.jobs.retry(held.job_id, "local", limit=10, quotas=quotas)
+    assert caught.value.extra["quota"] == "gpu-seconds-a-day"
+
+
+def at_once(work: Callable[[], object], times: int) -> int:
+    """Call `work` in so many threads at the same moment; return how many calls were not refused."""
+    ready, passed, broken = threading.Barrier(times), [], []
+
+    def one() -> None:
+        ready.wait()
+        try:
+            passed.append(work())
+        except ServiceError:
+            return
+        except BaseException as error:
+            broken.append(error)
+
+    threads = [threading.Thread(target=one) for _ in range(times)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not broken, broken
+    return len(passed)
+
+
+def test_no_limit_is_passed_by_requests_at_once(store: Store) -> None:
+    """On PostgreSQL transactions do not see each other's rows: without a lock, all of these would pass."""
+    bytes_of_two = Quotas(stored_bytes=10)
+    assert at_once(lambda: store.jobs.create(new_job("a"), limit=5), 30) == 5
+    assert at_once(lambda: submit(store, Quotas(jobs_a_day=5), "b"), 30) == 5
+    assert at_once(lambda: store.inputs.create_upload("c", 4, "x", "", 1000, quotas=bytes_of_two), 30) == 2
+    assert at_once(lambda: store.inputs.open_receipt("d", 4, bytes_of_two), 30) == 2
+    assert at_once(lambda: store.inputs.create_upload("e", 4, "x", "", 1000, most=3), 30) == 3
+    receipt = store.inputs.open_receipt("f", 0, bytes_of_two)
+    assert at_once(lambda: store.inputs.grow_receipt(receipt, 4, "f", bytes_of_two), 30) == 2
+    canceled = [queue(store, "g") for _ in range(8)]
+    for job_id in canceled:
+        store.jobs.cancel(job_id, "g")
+    assert at_once(lambda: store.jobs.retry(canceled.pop(), "g", limit=3), 8) == 3
+    for owner, kept in (("c", 8), ("d", 8), ("f", 8)):
+        assert store.usage.of(owner).stored_bytes == kept
+
+
+def test_limits_name_what_is_too_much(store: Store) -> None:
+    store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
+    with pytest.raises(ConflictError, match="1 unfinished uploads"):
+        store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
+    job_id = queue(store)
+    store.jobs.cancel(job_id, "local")
+    with pytest.raises(QueueFullError):
+        store.jobs.retry(job_id, "local", limit=0)
+
+
+# --- receipts ------------------------------------------------------------------------------------------------------
+
+OTHER = "b" * 64
+
+
+def test_receipt_charges_until_a_job_takes_its_files_over(store: Store) -> None:
+    quotas = Quotas(stored_bytes=100)
+    receipt = store.inputs.open_receipt("me", 90, quotas)
+    assert store.usage.of("me").stored_bytes == 90
+    store.inputs.add_blob(SHA, "aa/again", 60, receipt)
+    assert store.usage.of("me").stored_bytes == 33, "30 bytes are still to come, and the blob was there, with 3"
+    job = store.jobs.create(new_job("me"), limit=10, quotas=quotas, receipt=receipt)[0]
+    assert store.usage.of("me").stored_bytes == 3
+    assert store.inputs.end_receipt(receipt) == []
+    assert store.jobs.delete(store.jobs.cancel(job.id, "me").id, "me") == ["aa/blob"]
+    assert store.usage.of("me").stored_bytes == 0
+
+
+def test_files_of_an_ended_request_go_unless_others_use_them(store: Store) -> None:
+    mine, others = store.inputs.open_receipt("me", 10, NO_QUOTAS), store.inputs.open_receipt("other", 10, NO_QUOTAS)
+    store.inputs.add_blob(OTHER, "bb/blob", 5, mine)
+    store.inputs.add_blob(SHA, "aa/again", 3, mine)
+    store.inputs.add_blob(SHA, "aa/again", 3, others)
+    assert store.inputs.end_receipt(mine) == ["bb/blob"]
+    assert store.usage.of("me").stored_bytes == 0
+    job = store.jobs.create(new_job("other"), limit=10, receipt=others)[0]
+    assert store.inputs.end_receipt(others) == []
+    assert store.inputs.blobs([SHA, OTHER]).keys() == {SHA}
+    with pytest.raises(NotFoundError):
+        store.inputs.add_blob(OTHER, "bb/late", 5, mine)
+    assert store.jobs.get(job.id, "other").status == "queued"
+
+
+def test_last_of_many_that_let_go_at_once_deletes(store: Store) -> None:
+    for _ in range(5):
+        digests = [f"{number:064x}" for number in range(10)]
+        receipts = [store.inputs.open_receipt("me", 100, NO_QUOTAS) for _ in range(6)]
+        for number, receipt in enumerate(receipts):
+            for digest in digests[:: 1 if number % 2 else -1]:
+                store.inputs.add_blob(digest, f"aa/{digest}", 10, receipt)
+        gone: list[str] = []
+        at_once(lambda: gone.extend(store.inputs.end_receipt(receipts.pop())), 6)  # noqa: B023
+        assert sorted(gone) == [f"aa/{digest}" for digest in digests]
+        assert store.inputs.blobs(digests) == {}
+
+
+def test_receipt_of_a_dead_process_expires(store: Store, clock: Clock) -> None:
+    quotas = Quotas(stored_bytes=10)
+    lost, alive = store.inputs.open_receipt("me", 5, quotas), store.inputs.open_receipt("me", 5, quotas)
+    store.inputs.add_blob(OTHER, "bb/blob", 5, lost)
+    clock.now += GRACE_SECONDS / 2
+    store.inputs.renew_receipts([alive])
+    clock.now += GRACE_SECONDS / 2 + 1
+    assert store.inputs.expire_uploads() == [lost]
+    assert "bb/blob" in store.inputs.collect()
+    assert store.usage.of("me").stored_bytes == 5
+    assert store.inputs.open_uploads("me") == 0, "a receipt is no upload of the user's"
+
+
+def test_job_whose_input_was_deleted_meanwhile_is_refused(store: Store) -> None:
+    row = store.inputs.create_upload("local", 3, "scene.ply", "", 1000)
+    store.inputs.finish_upload(row.id, SHA, 1000)
+    store.inputs.hold([SHA])
+    assert store.inputs.delete_upload(row.id, "local") == ["aa/blob"]
+    with pytest.raises(NotFoundError, match="deleted"):
+        queue(store)
+    assert store.jobs.page("local") == []
 
 
 def test_a_keys_own_quotas_go_before_the_services() -> None:

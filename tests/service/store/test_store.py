@@ -451,8 +451,8 @@ def test_blobs_go_when_nothing_needs_them(store: Store, clock: Clock) -> None:
     clock.now += 2 * GRACE_SECONDS
     assert store.inputs.collect() == []
     store.jobs.cancel(job_id, "local")
-    store.jobs.delete(job_id, "local")
-    assert store.inputs.collect() == ["aa/blob"]
+    assert store.jobs.delete(job_id, "local") == ["aa/blob"]
+    assert store.inputs.collect() == []
     assert store.inputs.add_blob(SHA, "aa/other", 3) == "aa/other"
     assert store.inputs.add_blob(SHA, "aa/third", 3) == "aa/other"
     assert store.inputs.collect() == []  # just touched
@@ -538,6 +538,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.clock.now += (
             1e-3  # ids sort by time and then by chance, which would make a run one that cannot be repeated
         )
+        self.store.inputs.add_blob(SHA, "aa/blob", 3)  # it goes with the last job
         job_id = queue(self.store, owner, priority)
         self.status[job_id] = "queued"
 

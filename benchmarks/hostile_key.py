@@ -1,0 +1,200 @@
+"""How long one key's small submissions take while another key does its worst.
+
+python -m benchmarks.hostile_key [--parallel 16] [--seconds 60] [--result NAME]
+
+One key sends costly requests, 16 at a time: files that take long to check, dry runs, large bodies that are refused, and
+uploads that are created and deleted. Meanwhile another key submits small jobs one after the other, each with files that
+the service has not seen. The aim is a 99th percentile below 2 s. Client and service share the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+
+from benchmarks.machine import write_result
+from benchmarks.service_load import spread
+from service.settings import ServiceSettings
+from service.store import open_store
+from sgsst_core.files.ply import write_scene
+from tests.api.service import Service
+from tests.small_scenes import cameras, wall, write_files
+
+_SETTINGS = {
+    "SGSST_REQUIRE_KEYS": "true",
+    "SGSST_MAX_JOBS_PER_KEY": "1000000",
+    "SGSST_MIN_FREE_BYTES": "1000000000",
+}
+_TUS = {"Tus-Resumable": "1.0.0"}
+_QUICK = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
+#: Bytes of a body that is refused at its end.
+_LARGE = 60_000_000
+#: Seconds for which the hostile key waits for an answer, and the other one.
+_PATIENCE, _SHORT_PATIENCE = 600.0, 60.0
+
+Files = dict[str, bytes]
+Costly = Callable[[httpx.AsyncClient, Files, int], Awaitable[httpx.Response]]
+
+
+def costly_files(folder: Path) -> Files:
+    """A scene behind all of its 2,000 cameras: each of them is tried before the answer."""
+    scene = wall(500, 400)
+    scene.means[:, 2] = -3
+    write_scene(folder / "behind.ply", scene)
+    views = [{**view, "id": number, "img_name": f"v{number}"} for number, view in enumerate(_views(2000))]
+    return {"scene": (folder / "behind.ply").read_bytes(), "cameras": json.dumps(views).encode()}
+
+
+def _views(count: int) -> list[dict[str, Any]]:
+    return [
+        {
+            "width": camera.width,
+            "height": camera.height,
+            "position": [0.1 * math.sin(number), 0, 0],
+            "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+            "fx": camera.width,
+            "fy": camera.width,
+        }
+        for number in range(count)
+        for camera in cameras(1)
+    ]
+
+
+def form(files: Files, number: int) -> dict[str, Any]:
+    """A form whose files are new to the service: a number of spaces and line ends makes the cameras' content differ."""
+    new = files["cameras"] + f"{number:064b}".replace("0", " ").replace("1", "\n").encode()
+    names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
+    parts = [(role, (names[role], content)) for role, content in {**files, "cameras": new}.items()]
+    return {"files": parts, "data": {"parameters": json.dumps(_QUICK)}}
+
+
+async def _inspection(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+    costly = {**files, "scene": files["costly scene"], "cameras": files["costly cameras"]}
+    return await client.post("/v1/jobs", **form({role: costly[role] for role in ("scene", "cameras", "style")}, number))
+
+
+async def _dry_run(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+    request = form({role: files[role] for role in ("scene", "cameras", "style")}, number)
+    return await client.post("/v1/jobs", params={"dry_run": True}, **request | {"data": {}})
+
+
+async def _large_body(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+    large = {"scene": files["scene"], "cameras": files["cameras"], "style": number.to_bytes(16, "big") + bytes(_LARGE)}
+    return await client.post("/v1/jobs", **form(large, number))
+
+
+async def _uploads(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+    answer = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": "1000"})
+    if answer.status_code == 201:
+        await client.delete(answer.headers["location"])
+    return answer
+
+
+ATTACKS: dict[str, Costly] = {
+    "uploads": _uploads,
+    "large_bodies": _large_body,
+    "dry_runs": _dry_run,
+    "inspections": _inspection,
+}
+
+
+def attack(url: str, key: str, name: str, files: Files, parallel: int, statuses: Any) -> None:
+    """Send requests of one kind until the process is ended; count their answers."""
+
+    async def one(client: httpx.AsyncClient, numbers: itertools.count[int]) -> None:
+        while True:
+            try:
+                status = str((await ATTACKS[name](client, files, next(numbers))).status_code)
+            except httpx.TransportError as error:
+                status = type(error).__name__
+            statuses[status] = statuses.get(status, 0) + 1
+
+    async def all_of_them() -> None:
+        numbers = itertools.count(int(time.time() * 1000) << 20)
+        limits = httpx.Limits(max_connections=parallel)
+        headers = {"Authorization": f"Bearer {key}"}
+        async with httpx.AsyncClient(base_url=url, headers=headers, timeout=_PATIENCE, limits=limits) as client:
+            await asyncio.gather(*(one(client, numbers) for _ in range(parallel)))
+
+    asyncio.run(all_of_them())
+
+
+def submissions(url: str, key: str, files: Files, seconds: float) -> dict[str, Any]:
+    """Small jobs one after the other, and how long each took to be accepted."""
+    took: list[float] = []
+    statuses: Counter[str] = Counter()
+    small = {role: files[role] for role in ("scene", "cameras", "style")}
+    first = int(time.time() * 1000) << 20
+    end = time.perf_counter() + seconds
+    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=_SHORT_PATIENCE) as client:
+        while time.perf_counter() < end:
+            started = time.perf_counter()
+            try:
+                status = str(client.post("/v1/jobs", **form(small, first + len(took))).status_code)
+            except httpx.TransportError as error:
+                status = type(error).__name__
+            took.append(time.perf_counter() - started)
+            statuses[status] += 1
+    return {"statuses": dict(statuses), "submissions": len(took), "most_ms": round(1000 * max(took), 1), **spread(took)}
+
+
+def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
+    """Percentiles of the small submissions: alone, and beside each attack."""
+    (folder / "inputs").mkdir()
+    ply, views, style = write_files(folder / "inputs", wall())
+    files = {"scene": ply.read_bytes(), "cameras": views.read_bytes(), "style": style.read_bytes()}
+    files |= {f"costly {role}": content for role, content in costly_files(folder).items()}
+    figures: dict[str, Any] = {}
+    with Service(folder / "data", alone=True, **_SETTINGS) as service:
+        store = open_store(ServiceSettings(data=service.data))
+        hostile, other = (store.keys.create(name)[1] for name in ("hostile", "other"))
+        store.close()
+        submissions(service.url, other, files, 1)  # what is loaded once
+        figures["alone"] = submissions(service.url, other, files, seconds / 4)
+        print("alone", figures["alone"], flush=True)
+        context = multiprocessing.get_context("spawn")
+        with context.Manager() as manager:
+            for name in ATTACKS:
+                statuses = manager.dict()
+                arguments = (service.url, hostile, name, files, parallel, statuses)
+                process = context.Process(target=attack, args=arguments, daemon=True)
+                process.start()
+                time.sleep(10)  # until its requests wait for one another
+                figures[name] = submissions(service.url, other, files, seconds)
+                process.kill()
+                process.join()
+                figures[name]["hostile_answers"] = dict(statuses)
+                print(name, figures[name], flush=True)
+    return figures
+
+
+def main() -> None:
+    """Measure, print and store."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--parallel", type=int, default=16)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--result", default="hostile_key", help="name of the result's file")
+    arguments = parser.parse_args()
+    load = [round(value, 2) for value in psutil.getloadavg()]  # of what else the machine does
+    with tempfile.TemporaryDirectory(prefix="sgsst-hostile-") as folder:
+        figures = measure(Path(folder), arguments.parallel, arguments.seconds)
+    measured = {"processors": os.cpu_count(), "load_average_at_start": load, "parallel": arguments.parallel, **figures}
+    print(write_result(arguments.result, measured))
+
+
+if __name__ == "__main__":
+    main()

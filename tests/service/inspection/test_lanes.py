@@ -1,0 +1,129 @@
+"""Turns of owners: nobody waits behind more than one request of another owner."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections import Counter
+
+import pytest
+
+from service.errors import BusyError
+from service.inspection.lanes import MAX_WAITING, Lanes
+
+
+class Work:
+    """Requests that end when they are told to; `order` is that in which they had their turn."""
+
+    def __init__(self, lanes: Lanes[str]) -> None:
+        self.lanes = lanes
+        self.order: list[str] = []
+        self.at_work: dict[str, asyncio.Event] = {}
+
+    async def ask(self, name: str) -> None:
+        """Have a turn for the owner who is the first letter."""
+        async with self.lanes.turn(name[0]):
+            self.order.append(name)
+            self.at_work[name] = asyncio.Event()
+            await self.at_work[name].wait()
+            del self.at_work[name]
+
+    async def end(self, name: str) -> None:
+        """End a request, and let those who wait for its place begin."""
+        self.at_work[name].set()
+        await settle()
+
+
+async def settle() -> None:
+    """Let every task run until it waits."""
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+async def start(work: Work, *names: str) -> list[asyncio.Task[None]]:
+    tasks = [asyncio.create_task(work.ask(name)) for name in names]
+    await settle()
+    return tasks
+
+
+def test_owners_take_turns_at_one_place() -> None:
+    async def run() -> list[str]:
+        work = Work(Lanes(["place"]))
+        tasks = await start(work, "a1", "a2", "a3", "b1", "b2", "c1")
+        while work.at_work:
+            await work.end(next(iter(work.at_work)))
+        await asyncio.gather(*tasks)
+        return work.order
+
+    assert asyncio.run(run()) == ["a1", "b1", "c1", "a2", "b2", "a3"]
+
+
+def test_one_owner_never_has_both_places() -> None:
+    async def run() -> None:
+        work = Work(Lanes(["one", "two"]))
+        tasks = await start(work, *(f"a{number}" for number in range(5)))
+        assert list(work.at_work) == ["a0"], "the other place stays free for others"
+        tasks += await start(work, "b0", "c0")
+        assert sorted(work.at_work) == ["a0", "b0"]
+        await work.end("b0")
+        assert sorted(work.at_work) == ["a0", "c0"]
+        await work.end("a0")
+        assert sorted(work.at_work) == ["a1", "c0"]
+        while work.at_work:
+            await work.end(next(iter(work.at_work)))
+        await asyncio.gather(*tasks)
+
+    asyncio.run(run())
+
+
+def test_a_full_waiting_room_is_the_owners_own() -> None:
+    async def run() -> None:
+        work = Work(Lanes(["one", "two"]))
+        tasks = await start(work, *(f"a{number}" for number in range(1 + MAX_WAITING)))
+        with pytest.raises(BusyError):
+            await work.ask("a-more")
+        tasks += await start(work, "b0")
+        assert sorted(work.at_work) == ["a0", "b0"]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        work.at_work.clear()
+        again = await start(work, "a-again")
+        assert list(work.at_work) == ["a-again"], "those who gave up wait no more"
+        await work.end("a-again")
+        await asyncio.gather(*again)
+
+    asyncio.run(run())
+
+
+def test_every_place_comes_back_whoever_gives_up() -> None:
+    """Any order of requests, ends and cancelations: at most one place an owner, none lost, none had twice."""
+
+    async def run(seed: int) -> None:
+        chance = random.Random(seed)
+        lanes, had = Lanes(["one", "two", "three"]), Counter[str]()
+
+        async def ask(owner: str) -> None:
+            async with lanes.turn(owner) as place:
+                had.update([owner, place])
+                assert had[place] == had[owner] == 1
+                try:
+                    for _ in range(chance.randrange(4)):
+                        await asyncio.sleep(0)
+                finally:
+                    had.subtract([owner, place])
+
+        tasks: list[asyncio.Task[None]] = []
+        for _ in range(80):
+            tasks.append(asyncio.create_task(ask(chance.choice("abcd"))))
+            if not chance.randrange(3):
+                chance.choice(tasks).cancel()
+            for _ in range(chance.randrange(3)):
+                await asyncio.sleep(0)
+        ended = await asyncio.gather(*tasks, return_exceptions=True)
+        assert not [each for each in ended if each and not isinstance(each, asyncio.CancelledError)]
+        async with lanes.turn("x") as first, lanes.turn("y") as second, lanes.turn("z") as third:
+            assert {first, second, third} == {"one", "two", "three"}
+
+    for seed in range(50):
+        asyncio.run(run(seed))
