@@ -259,20 +259,32 @@ def write_scene(path: Path, scene: Scene) -> None:
 
 
 def write_packed(path: Path, scene: Scene, form: PackedForm) -> None:
-    """Write a scene in a packed form, without bands of spherical harmonics that are 0 in all Gaussians.
-
-    The file appears whole or not at all. Rows may come in another order than the scene's.
+    """Write a scene in a packed form to a file, which appears whole or not at all; see `pack_scene`.
 
     Raises:
         OutputError: the file cannot be written, or the form cannot hold the scene.
     """
+    with atomic_path(path) as temporary, temporary.open("wb") as output:
+        pack_scene(output, scene, form, path)
+
+
+def pack_scene(output: BinaryIO, scene: Scene, form: PackedForm, target: Path) -> None:
+    """Write a scene in a packed form, without bands of spherical harmonics that are 0 in all Gaussians.
+
+    Rows may come in another order than the scene's.
+
+    Args:
+        target: Name of the output, for messages.
+
+    Raises:
+        OutputError: The form cannot hold the scene.
+    """
     scene = scene.without_zero_bands()
     arrays = {field.name: held(getattr(scene, field.name)).detach().cpu().float().numpy() for field in fields(scene)}
-    with atomic_path(path) as temporary, temporary.open("wb") as output:
-        if form == "spz":
-            write_spz(output, arrays, path)
-        else:
-            write_compressed_ply(output, arrays)
+    if form == "spz":
+        write_spz(output, arrays, target)
+    else:
+        write_compressed_ply(output, arrays)
 
 
 def _check_properties(path: Path, header: PlyHeader) -> int:
