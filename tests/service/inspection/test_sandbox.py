@@ -106,9 +106,7 @@ def test_without_seccomp_files_and_signals_are_out_of_reach(
     assert allowed(found["files"]) == {"read own scene"}, found["files"]
     refused = {"trace the parent", "trace the API", "memory that is a file"}
     refused |= {"connect"} if sandbox._landlock_version() >= 4 else set()
-    refused |= (
-        {"signal the parent", "signal the API", "signal the group"} if sandbox._landlock_version() >= 6 else set()
-    )
+    refused |= {"signal the parent", "signal the API"} if sandbox._landlock_version() >= 6 else set()
     assert not allowed(found["calls"]) & refused, found["calls"]
     assert "secret" not in found["environment"].values()
 
