@@ -38,7 +38,7 @@ def keep_in_memory(report: Callable[[], None]) -> None:
     Args:
         report: Called for each kernel that the folders lack.
     """
-    numba.core.caching.Cache.save_overload = lambda self, sig, data: report()
+    numba.core.caching.Cache.save_overload = lambda self, sig, data: report()  # type: ignore[method-assign]
 
 
 @functools.cache

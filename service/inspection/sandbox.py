@@ -218,9 +218,10 @@ def seccomp_program(machine: str, process: int) -> bytes:
             (_RETURN, 0, 0, refuse),
             (_RETURN, 0, 0, _ALLOW),
         ]
-    for numbers in _REFUSED.values():
-        if numbers[column] is not None:
-            code += [(_EQUAL, 0, 1, numbers[column]), (_RETURN, 0, 0, refuse)]
+    for refused in _REFUSED.values():
+        number = refused[column]
+        if number is not None:
+            code += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, refuse)]
     code.append((_RETURN, 0, 0, _ALLOW))
     return b"".join(struct.pack("=HBBI", *instruction) for instruction in code)
 
