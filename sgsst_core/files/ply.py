@@ -403,8 +403,8 @@ class _Columns:
             self.flaws.append(self._flaws_of(start, count, rows))
 
     def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
-        unrotated = ~self.arrays["quats"][start : start + count].any(axis=1)
-        valid, counts = ~unrotated, {}
+        unrotated: NDArray[np.bool_] = np.logical_not(self.arrays["quats"][start : start + count].any(axis=1))
+        valid, counts = np.logical_not(unrotated), {}
         columns = {name: target[start : start + count] for name, target in self._targets.items()}
         if self._stored is not None and rows is not None:
             columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
