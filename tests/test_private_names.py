@@ -57,7 +57,7 @@ def test_numba_keeps_kernels_by_a_method_that_can_be_replaced() -> None:
     import numba.core.caching
 
     assert list(inspect.signature(numba.core.caching.Cache.save_overload).parameters) == ["self", "sig", "data"], (
-        "Numba saves kernels by another method now. Find it, and replace it in keep_in_memory of sgsst_core/compiled.py: "
+        "Numba saves kernels by another method now. Find it, and replace it in sgsst_core/compiled.py: "
         "a confined process cannot write them, and every dry run that has to compile one would break."
     )
 
