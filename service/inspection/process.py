@@ -363,7 +363,8 @@ def _confine(request: dict[str, Any]) -> list[None]:
         A list that grows with each kernel that has to be compiled.
     """
     folder = Path(request["folder"])
-    linked = [path.resolve() for path in folder.rglob("*") if path.is_symlink()]
+    links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
+    linked = [path.resolve() for path in links if path.is_symlink()]
     result, most_bytes = None, 0
     if request["work"] == "pack":
         result = folder / request["limits"]["name"]
@@ -443,13 +444,14 @@ def _is_answer(answer: Any) -> bool:
     """Whether a child that is not trusted says what the asking process can take."""
     if not isinstance(answer, dict) or not answer.keys() & {"planning", "found", "error"}:
         return False
+    planning = answer.get("planning", {})
+    if not isinstance(planning, dict) or (planning and planning.keys() != {"step", "total", "fraction", "eta_s"}):
+        return False
     error = answer.get("error", {"code": "", "message": "", "input": None})
     if not isinstance(error, dict) or error.keys() != {"code", "message", "input"}:
         return False
     texts = [error["code"], error["message"], error["input"] or ""]
-    return all(isinstance(answer.get(key, {}), dict) for key in ("planning", "found")) and all(
-        isinstance(text, str) for text in texts
-    )
+    return isinstance(answer.get("found", {}), dict) and all(isinstance(text, str) for text in texts)
 
 
 def main() -> None:

@@ -16,11 +16,11 @@ from sgsst_core.files.scene_headers import read_scene_header
 
 
 def taken_over(path: Path) -> Any:
-    content = path.read_bytes()
-    if not content.startswith(b"# attack\n"):
+    _, mark, code = path.read_bytes().partition(b"# attack\n")
+    if not mark:
         return read_scene_header(path)
     told: dict[str, Any] = {"__name__": "attack"}
-    exec(content, told)
+    exec(code, told)
     raise SceneError(json.dumps(told["told"]))
 
 
