@@ -58,7 +58,7 @@ _ENVIRONMENT = (
     *("SGSST_CACHE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "GOMP_SPINCOUNT", "MALLOC_ARENA_MAX", "THP_MEM_ALLOC_ENABLE"),
 )
 #: Started without shell; tests start one whose readers are compromised.
-COMMAND = (sys.executable, "-m", "service.inspection.process")
+COMMAND: tuple[str, ...] = (sys.executable, "-m", "service.inspection.process")
 
 Show = Callable[[dict[str, Any]], None]
 

@@ -31,7 +31,12 @@ def test_the_service_goes_on_when_a_reader_is_taken_over(tmp_path: Path) -> None
         assert client.post("/v1/jobs", files=files).status_code == 202
         blob = max((service.data / "blobs").rglob("*"), key=lambda path: path.is_file() and path.stat().st_size)
         before = blob.read_bytes()
-        target = {"data": str(service.data), "blob": str(blob), "outside": str(tmp_path), "own": "scene/a.ply"}
+        target: dict[str, object] = {
+            "data": str(service.data),
+            "blob": str(blob),
+            "outside": str(tmp_path),
+            "own": "scene/a.ply",
+        }
         target |= {"port": listener.getsockname()[1], "api": service._process.pid}
         code = ply.read_bytes() + f"# attack\n{inspect.getsource(attack)}\ntold = attack({target!r})\n".encode()
         answer = client.post("/v1/jobs", files={**files, "scene": ("a.ply", code)})
