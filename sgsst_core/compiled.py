@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numba.core.caching
 import torch
 
 #: Numba's `workqueue` threading layer, the only one that is always available, aborts the process if two Python threads
@@ -20,6 +21,24 @@ _TURN = threading.RLock()
 
 #: Sources of this package that are compiled into kernels of other modules.
 _COMPILED_IN = ("constants.py", "rasterizer/vectors.py", "rasterizer/kernels.py")
+
+
+#: Folders of the machine code of all kernels.
+_folders: set[Path] = set()
+
+
+def kernel_folders() -> set[Path]:
+    """Return the folders that machine code is kept in."""
+    return set(_folders)
+
+
+def keep_in_memory(report: Callable[[], None]) -> None:
+    """Keep kernels that are compiled from now on in memory: this process may read the folders, not write to them.
+
+    Args:
+        report: Called for each kernel that the folders lack.
+    """
+    numba.core.caching.Cache.save_overload = lambda self, sig, data: report()  # type: ignore[method-assign]
 
 
 @functools.cache
@@ -42,8 +61,10 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         function.__qualname__ = f"{function.__qualname__}_{_digest()}"
         try:
-            return numba.njit(cache=True, **settings)(function)
-        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache is writable
+            kernel = numba.njit(cache=True, **settings)(function)
+            _folders.add(Path(kernel.stats.cache_path))
+            return kernel
+        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache can be written
             return numba.njit(**settings)(function)
 
     return decorate

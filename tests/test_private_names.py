@@ -53,6 +53,15 @@ def test_ray_starts_in_a_folder_and_on_an_address_of_our_own(option: str) -> Non
     )
 
 
+def test_numba_keeps_kernels_by_a_method_that_can_be_replaced() -> None:
+    import numba.core.caching
+
+    assert list(inspect.signature(numba.core.caching.Cache.save_overload).parameters) == ["self", "sig", "data"], (
+        "Numba saves kernels by another method now. Find it, and replace it in sgsst_core/compiled.py: "
+        "a confined process cannot write them, and every dry run that has to compile one would break."
+    )
+
+
 def test_a_process_group_forgets_its_device() -> None:
     import torch.distributed as dist
 

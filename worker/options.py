@@ -54,7 +54,9 @@ class ViewOptions(BaseModel):
     )
     resolution: Resolution = None
     near: Near = NEAR
-    drop_invalid: bool = Field(False, description="Leave Gaussians with NaN or infinite values out.")
+    drop_invalid: bool = Field(
+        False, description="Leave Gaussians with NaN or infinite values, or without a rotation, out."
+    )
 
 
 def _settings_to_choose() -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tokenize
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -92,7 +93,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     rows = len(file.scene) if file.kept is None else len(file.kept)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # the last of headers with open brackets
         raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
         raise SceneError(f"{path}: holds no array of flags or numbers. Write it with numpy.save.")

@@ -112,7 +112,7 @@ REFUSALS: tuple[ServiceError, ...] = (
         input="scene",
     ),
     RefusedInputError(
-        "style.jpg: is not an image that Pillow can read. Give a PNG or JPEG.", "invalid-image", input="style"
+        "style.jpg: is not an image that can be read. Give a PNG or JPEG.", "invalid-image", input="style"
     ),
     RefusedInputError("cameras.json: holds no cameras. Export them again.", "invalid-cameras", input="cameras"),
     RefusedInputError("The files cannot be read.", "invalid-input", input="scene"),

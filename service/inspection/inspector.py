@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hashlib
 import json
+import logging
 import os
 import shutil
 import sys
@@ -21,10 +22,13 @@ from service.errors import BusyError, RefusedInputError
 from service.files.blobs import Blobs
 from service.files.staging import stage
 from service.inspection.lanes import Lanes
+from service.inspection.sandbox import missing
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import BlobRow
+
+_log = logging.getLogger(__name__)
 
 #: What is wanted of the inspecting process: prove that a job's inputs can be used, or plan the job as well.
 Work = Literal["validate", "plan"]
@@ -48,6 +52,14 @@ _PLAN_SECONDS_PER_GAUSSIAN = 5e-6
 _PLAN_SECONDS_PER_PIXEL = 5e-6
 #: Jobs with more bytes of files are checked by a process of their own: small ones do not wait for them.
 _LARGE_BYTES = 64 << 20
+
+#: Variables that the inspecting process is given: where code, weights and kernels are, and how memory is allocated.
+_ENVIRONMENT = (
+    *("HOME", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PYTHONDONTWRITEBYTECODE", "PYTHONHOME", "PYTHONPATH"),
+    *("SGSST_CACHE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "GOMP_SPINCOUNT", "MALLOC_ARENA_MAX", "THP_MEM_ALLOC_ENABLE"),
+)
+#: Started without shell; tests start one whose readers are compromised.
+COMMAND: tuple[str, ...] = (sys.executable, "-m", "service.inspection.process")
 
 Show = Callable[[dict[str, Any]], None]
 
@@ -93,9 +105,7 @@ class InspectionProcess:
     async def _started(self) -> asyncio.subprocess.Process:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-m",
-                "service.inspection.process",
+                *COMMAND,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=_MAX_ANSWER,
@@ -128,9 +138,13 @@ class InspectionProcess:
                 await self.close()
 
     def _environment(self) -> dict[str, str]:
-        """Of the process: libraries that start threads as they are imported must not, since it forks."""
+        """Return what the process needs, and no secret: it reads hostile files.
+
+        Libraries that start threads as they are imported must not, since it forks.
+        """
+        kept = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self._threads))
-        return {**os.environ, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+        return {**kept, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 
     async def close(self) -> None:
         """End the process, and with it the child that reads."""
@@ -154,6 +168,8 @@ class Inspector:
         self._planning = Lanes([InspectionProcess(_threads_of_a_job(settings))])
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
+        for lack in missing():
+            _log.warning("files are read without %s", lack)
         for left in self._folder.iterdir():  # by a process that was killed
             if time.time() - left.stat().st_mtime > LEFT_SECONDS:
                 shutil.rmtree(left, ignore_errors=True)

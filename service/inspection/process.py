@@ -1,19 +1,22 @@
 """The process that looks into users' files, and packs results: `python -m service.inspection.process`.
 
 It imports what takes long once, then forks for each request a child with limits on time and memory, which reads the
-files and dies. So a hostile file can break nothing but the answer to its own request. Requests and answers are lines of
+files and dies. The child is confined (`service.inspection.sandbox`): a hostile file that takes it over can falsify the
+answer to its own request, and nothing else. Requests and answers are lines of
 JSON on stdin and stdout, one at a time; before the answer to a plan come lines of how far it is, `{"planning": ...}`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import resource
 import select
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,19 +27,23 @@ import psutil
 import torch
 
 from service.files.staging import Staged
+from service.inspection.sandbox import confine, installation
 from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
+from sgsst_core.compiled import keep_in_memory, kernel_folders
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
+from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.images import check_photos, image_size, load_image
-from sgsst_core.files.ply import read_scene, write_packed
+from sgsst_core.files.ply import pack_scene, read_scene, write_scene
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
@@ -187,7 +194,8 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
     """
     source, settings = scene_request(staged, parameters), parameters.settings()
     scene = read_scene(source.scene).scene
-    write_packed(Path(name), scene, "spz" if form_of_name(name) == "spz" else "compressed.ply")
+    with Path(name).open("wb") as output:
+        pack_scene(output, scene, "spz" if form_of_name(name) == "spz" else "compressed.ply", Path(name))
     cameras = fit_cameras(read_cameras_of(source, scene)[0], settings)
     return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 
@@ -262,8 +270,8 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     except Exception as error:  # a reader that broke on it is the file's fault until shown otherwise
         if "memory" in str(error).lower():
             return _refusal("inspection-limit", "Reading it takes more memory than allowed.", None)
-        print(f"inspection: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        return _refusal("invalid-input", "The files cannot be read.", getattr(error, "part", None))
+        refusal = _refusal("invalid-input", "The files cannot be read.", getattr(error, "part", None))
+        return {**refusal, "log": f"{type(error).__name__}: {error}"}
 
 
 def _refusal(code: str, message: str, part: str | None) -> dict[str, Any]:
@@ -275,11 +283,10 @@ def _limit_resources(seconds: float, size: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (own + size, own + size))
     cpu = max(1, int(seconds))
     resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
-    """Fork, limit, answer; the lines that the child has to say come through a pipe.
+    """Fork, confine, answer: yield the lines that the child sends through a pipe.
 
     A child that ends without an answer hit a limit, of which it has three: processor time of each thread, memory, and
     twice that time on the clock.
@@ -290,19 +297,25 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
         os.close(reading)
         _be_child(request, writing)
     os.close(writing)
-    answered = False
+    answer = None
     try:
         for line in _lines(reading, time.monotonic() + 2 * request["seconds"]):
-            answered = "planning" not in json.loads(line)
-            yield line
-            if answered:
+            if "planning" not in line:
+                answer = line
                 break
+            yield json.dumps(line).encode()
     finally:
         os.close(reading)
         os.kill(child, signal.SIGKILL)  # a child that has said everything may be gone, but is not forgotten yet
-        os.waitpid(child, 0)
-    if not answered:
-        yield json.dumps(_refusal("inspection-limit", _limit_text(request), None)).encode()
+        _, status = os.waitpid(child, 0)
+    # only now, when nothing can change the files behind the answer any more
+    if answer is None:
+        answer = {**_refusal("inspection-limit", _limit_text(request), None), "log": f"wait status {status}, no answer"}
+    if answer.pop("compiled", False):
+        _compile_kernels()
+    if "log" in answer:
+        print(f"inspection: {str(answer.pop('log'))[:500]!r}", file=sys.stderr, flush=True)
+    yield json.dumps(answer).encode()
 
 
 def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
@@ -310,6 +323,7 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         die_with_parent()  # a fork does not take that over
+        _close_descriptors(writing)
         if request["threads"] > 1:  # no thread has been started yet, so that none is missing here
             torch.set_num_threads(request["threads"])
         _die_first()
@@ -321,7 +335,66 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
                 told = {"step": now.done, "total": now.total, "fraction": now.fraction, "eta_s": now.seconds_left}
                 print(json.dumps({"planning": told}), file=file, flush=True)
 
-            print(json.dumps(_inspect(request, show)), file=file)
+            try:
+                missed = _confine(request)
+            except OSError as error:
+                refusal = _refusal("inspection-limit", "The files cannot be checked at the moment.", None)
+                print(json.dumps({**refusal, "log": f"cannot be confined: {error}"}), file=file)
+            else:
+                answer = _inspect(request, show)
+                print(json.dumps({**answer, "compiled": bool(missed)}), file=file)
+    finally:
+        os._exit(0)
+
+
+def _close_descriptors(kept: int = 2) -> None:
+    """Close all but one: answers to other requests and the log go through those that a fork takes over."""
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for descriptor in range(3):
+        os.dup2(nothing, descriptor)
+    os.closerange(3, kept)
+    os.closerange(max(3, kept + 1), resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+
+
+def _confine(request: dict[str, Any]) -> list[None]:
+    """Let this child read its job's files and the installation, and write the packed result that it was asked for.
+
+    Returns:
+        A list that grows with each kernel that has to be compiled.
+    """
+    folder = Path(request["folder"])
+    links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
+    linked = [path.resolve() for path in links if path.is_symlink()]
+    result, most_bytes = None, 0
+    if request["work"] == "pack":
+        result = folder / request["limits"]["name"]
+        result.touch()
+        most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a packed scene is smaller
+    missed: list[None] = []
+    keep_in_memory(lambda: missed.append(None))
+    confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)
+    return missed
+
+
+@functools.cache
+def _compile_kernels() -> None:
+    """Start to plan a small scene of our own in a child that keeps its kernels on disk: confined ones cannot.
+
+    Once: a child that is not trusted asks for it. Nothing waits for it, and it dies with this process.
+    """
+    if os.fork():
+        return
+    try:
+        die_with_parent()
+        _close_descriptors()
+        with tempfile.TemporaryDirectory() as folder:
+            os.chdir(folder)
+            count, scene = 64, Path("scene.ply")
+            shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh_dc": (3,), "sh_rest": (15, 3)}
+            write_scene(scene, Scene(**{name: torch.rand(count, *shape) for name, shape in shapes.items()}))
+            limits = dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40)
+            parameters = JobParameters(orbit="3", resolution=96)
+            plan(Staged(scene, (STARRY_NIGHT,), None, None), parameters, limits, lambda now: None)
     finally:
         os._exit(0)
 
@@ -347,8 +420,8 @@ def _limit_text(request: dict[str, Any]) -> str:
     return text if request["work"] != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."
 
 
-def _lines(descriptor: int, deadline: float) -> Iterator[bytes]:
-    """Whole lines of JSON that come until the other end closes, says what is none, or the deadline is over."""
+def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
+    """Yield answers until the other end closes, sends what is no answer, or the deadline is over."""
     begun = b""
     while (left := deadline - time.monotonic()) > 0 and len(begun) < MAX_ANSWER:
         if not select.select([descriptor], [], [], left)[0]:
@@ -359,11 +432,26 @@ def _lines(descriptor: int, deadline: float) -> Iterator[bytes]:
         *whole, begun = (begun + part).split(b"\n")
         for line in whole:
             try:
-                if not isinstance(json.loads(line), dict):
-                    return
-            except ValueError:
+                answer = json.loads(line)
+            except (ValueError, RecursionError):
                 return
-            yield line
+            if not _is_answer(answer):
+                return
+            yield answer
+
+
+def _is_answer(answer: Any) -> bool:
+    """Whether a child that is not trusted says what the asking process can take."""
+    if not isinstance(answer, dict) or not answer.keys() & {"planning", "found", "error"}:
+        return False
+    planning = answer.get("planning", {})
+    if not isinstance(planning, dict) or (planning and planning.keys() != {"step", "total", "fraction", "eta_s"}):
+        return False
+    error = answer.get("error", {"code": "", "message": "", "input": None})
+    if not isinstance(error, dict) or error.keys() != {"code", "message", "input"}:
+        return False
+    texts = [error["code"], error["message"], error["input"] or ""]
+    return isinstance(answer.get("found", {}), dict) and all(isinstance(text, str) for text in texts)
 
 
 def main() -> None:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import struct
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,21 +17,18 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
+from sgsst_core.files.colmap_model import UNDISTORT, read_model
 from sgsst_core.files.images import image_size
 from sgsst_core.scene.camera import Camera
 
 #: Largest entry of R R^T - 1 that passes for a rotation written with few digits; it is then made exact.
 ROTATION_TOLERANCE = 1e-3
+#: Largest distance of a quaternion's length from 1 that passes for one written with few digits.
+QUATERNION_TOLERANCE = 0.01
 
 _FORMS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
 #: Camera's axes in OpenGL (x right, y up, z backward) to ours.
 _OPENGL = np.diag([1.0, -1.0, -1.0])
-#: COLMAP's numbers of the models without distortion, and how many parameters they have.
-_COLMAP_PINHOLES = {0: 3, 1: 4}
-_UNDISTORT = (
-    "Undistort the photos with `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT` "
-    "and give OUT/sparse"
-)
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: Models of transforms.json that are pinholes once their coefficients are 0.
 _PINHOLE_NAMES = (None, "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -133,7 +128,7 @@ def _refuse_distortion(where: str, values: Mapping[str, Any]) -> None:
     bent = [key for key in _DISTORTION if values.get(key) and _number(where, values, key) != 0]
     if model not in _PINHOLE_NAMES or values.get("is_fisheye") or bent:
         what = f"distortion {', '.join(bent)}" if bent else f"camera model {model or 'fisheye'}"
-        raise CameraError(f"{where}: has {what}, but only pinhole cameras are handled. {_UNDISTORT}.")
+        raise CameraError(f"{where}: has {what}, but only pinhole cameras are handled. {UNDISTORT}.")
 
 
 def _transforms_size(where: str, image: Path, values: Mapping[str, Any]) -> tuple[int, int]:
@@ -202,62 +197,38 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
 
 
 def _read_colmap(folder: Path) -> list[Camera]:
-    import pycolmap  # loads a large library that the JSON forms do not need
-
-    if (folder / "cameras.bin").is_file():
-        _check_binary_model(folder)
-    try:
-        model = pycolmap.Reconstruction(os.fspath(folder))
-    except Exception as error:  # pycolmap passes on whatever its C++ side throws
-        raise CameraError(f"{folder}: cannot be read as COLMAP model: {error}. Export it again.") from error
+    lenses, images = read_model(folder)
     cameras = []
-    for image_id in model.reg_image_ids():
-        image = model.images[image_id]
+    for image in images:
         where = f"{folder}: image {image.name!r}"
-        lens = model.cameras[image.camera_id]
-        values = [float(value) for value in lens.params]
-        if lens.model.name == "SIMPLE_PINHOLE":
-            values.insert(0, values[0])
-        elif lens.model.name != "PINHOLE":
-            raise CameraError(f"{where}: has camera model {lens.model.name}, which is distorted. {_UNDISTORT}.")
-        pose = image.cam_from_world
+        lens = lenses.get(image.camera)
+        if lens is None:
+            raise CameraError(f"{where}: has camera {image.camera}, which the model lacks. Export the model again.")
+        if lens.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
+            raise CameraError(f"{where}: has camera model {lens.model}, which is distorted. {UNDISTORT}.")
+        fx, fy, cx, cy = lens.parameters if lens.model == "PINHOLE" else (lens.parameters[0], *lens.parameters)
         matrix = np.eye(4)
-        matrix[:3] = (pose() if callable(pose) else pose).matrix()  # a property before pycolmap 3.12
-        size = (int(lens.width), int(lens.height))
-        cameras.append(_camera(where, image.name, size, (values[0], values[1], values[2], values[3]), matrix))
+        matrix[:3, :3] = _rotation_matrix(where, image.rotation)
+        matrix[:3, 3] = image.translation
+        cameras.append(_camera(where, image.name, (lens.width, lens.height), (fx, fy, cx, cy), matrix))
     if not cameras:
         raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.")
     return sorted(cameras, key=lambda camera: camera.name)
 
 
-def _check_binary_model(folder: Path) -> None:
-    """Step through cameras.bin and images.bin: pycolmap takes whatever memory holds for what a short file lacks."""
-    for name, step in (("cameras.bin", _after_camera), ("images.bin", _after_image)):
-        try:
-            data = (folder / name).read_bytes()
-            position = 8
-            for _ in range(struct.unpack_from("<Q", data)[0]):
-                position = step(data, position)
-                if position > len(data):
-                    raise EOFError
-        except OSError as error:
-            raise CameraError(f"{folder / name}: cannot be read: {error.strerror}. Copy the model again.") from error
-        except (struct.error, EOFError, ValueError) as error:
-            raise CameraError(f"{folder / name}: is truncated or corrupt. Copy the model again.") from error
-        except KeyError:
-            return  # another lens model: pycolmap knows its name
-
-
-def _after_camera(data: bytes, position: int) -> int:
-    """Fields: camera (uint32), model (int32), width and height (uint64), parameters (float64)."""
-    return position + 24 + 8 * _COLMAP_PINHOLES[struct.unpack_from("<Ii", data, position)[1]]
-
-
-def _after_image(data: bytes, position: int) -> int:
-    """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, 24 bytes each)."""
-    end_of_name = data.index(b"\0", position + 64)
-    points: int = struct.unpack_from("<Q", data, end_of_name + 1)[0]
-    return end_of_name + 9 + 24 * points
+def _rotation_matrix(where: str, quaternion: tuple[float, float, float, float]) -> NDArray[Any]:
+    """Convert a unit quaternion wxyz to a matrix [3, 3], rounded as COLMAP rounds it."""
+    w, x, y, z = quaternion
+    if not abs(math.hypot(w, x, y, z) - 1) <= QUATERNION_TOLERANCE:  # that of length 0 would become the identity
+        raise CameraError(f"{where}: its quaternion has length {math.hypot(w, x, y, z):.3g}, not 1. Export it again.")
+    x2, y2, z2 = 2 * x, 2 * y, 2 * z
+    return np.array(
+        [
+            [1 - (y2 * y + z2 * z), y2 * x - z2 * w, z2 * x + y2 * w],
+            [y2 * x + z2 * w, 1 - (x2 * x + z2 * z), z2 * y - x2 * w],
+            [z2 * x - y2 * w, z2 * y + x2 * w, 1 - (x2 * x + y2 * y)],
+        ]
+    )
 
 
 def _camera(
@@ -309,11 +280,18 @@ def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
 
 
 def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:
+    if key not in values:
+        raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.")
+    nested = [values[key]]
+    while nested:  # NumPy would take text for numbers, `1_0` too, and room for the longest text in every place
+        entry = nested.pop()
+        if isinstance(entry, list):
+            nested += entry
+        elif isinstance(entry, bool) or not isinstance(entry, (int, float)):
+            raise CameraError(f"{where}: {key!r} is not an array of numbers. Export the cameras again.")
     try:
         array = np.array(values[key], dtype=np.float64)
-    except KeyError:
-        raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.") from None
-    except (TypeError, ValueError, OverflowError) as error:
+    except (ValueError, OverflowError) as error:
         raise CameraError(f"{where}: {key!r} is not an array of numbers. Export the cameras again.") from error
     if array.shape not in shapes:
         raise CameraError(f"{where}: {key!r} has shape {array.shape}, not {' or '.join(map(str, shapes))}.")

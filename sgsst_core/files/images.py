@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,16 +21,25 @@ from sgsst_core.scene.camera import Camera
 #: Pillow's own bound against decompression bombs (twice its warning level of 2^30 / 4 / 3 pixels): 179 megapixels, more
 #: than the largest camera backs have, and 2 GB as float32.
 MAX_PIXELS = 2 * ((1 << 30) // 4 // 3)
+#: Formats whose decoding time is bounded by the pixels and bytes of a file. Others of Pillow's are not read: some have
+#: decoders in Python, or start other programs.
+FORMATS = ("JPEG", "PNG", "GIF", "BMP", "WEBP", "TIFF", "AVIF")
+#: Each scan of a progressive JPEG goes over all of its pixels again, for a few bytes. Encoders write about 10.
+MAX_JPEG_SCANS = 100
 #: How far the aspect of a photo may be off its camera's before it must be another photo, or a cropped one.
 ASPECT_TOLERANCE = 0.01
 
 _JPEG_QUALITY = 95
 _EXIF_ORIENTATION = 0x0112
+_JPEG_MARKER = re.compile(rb"\xff([\x01-\xfe])")
+_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+#: Markers that no segment follows: TEM, restarts and the start of the image.
+_BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
 _SHOWN = 10
 
 
 def load_image(path: Path) -> Tensor:
-    """Read any image that Pillow reads; of an animated one the first frame.
+    """Read an image in one of `FORMATS`; of an animated one, the first frame.
 
     EXIF orientation is applied, transparency composited on white; palettes, gray, 16 bit and CMYK become RGB.
 
@@ -37,9 +47,12 @@ def load_image(path: Path) -> Tensor:
         [H, W, 3] float32 in 0..1, sRGB values as stored (no linearization, no color profile).
 
     Raises:
-        ImageError: missing, not an image, truncated, or more than MAX_PIXELS; the size is checked before decoding.
+        ImageError: missing, not an image, truncated, more than MAX_PIXELS, or a JPEG of more than MAX_JPEG_SCANS; size
+            and scans are checked before decoding.
     """
     with _opened(path) as image:
+        if image.format in ("JPEG", "MPO"):
+            _check_scans(path)
         image.load()
         return torch.from_numpy(_to_rgb(path, ImageOps.exif_transpose(image)))
 
@@ -154,7 +167,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the bound below is ours
-            opened = Image.open(path)
+            opened = Image.open(path, formats=FORMATS)
         with opened as image:
             if image.width * image.height > MAX_PIXELS:
                 raise Image.DecompressionBombError
@@ -166,11 +179,24 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             f"{path}: has more than {MAX_PIXELS // 10**6} megapixels; refused before decoding. Scale it down first."
         ) from error
     except UnidentifiedImageError as error:
-        raise ImageError(f"{path}: is not an image that Pillow can read. Give a PNG or JPEG.") from error
+        raise ImageError(f"{path}: is not an image that can be read. Give a PNG or JPEG.") from error
     except Exception as error:  # Pillow's decoders raise whatever their format's parser runs into
         if isinstance(error, OSError) and error.strerror:
             raise ImageError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
         raise ImageError(f"{path}: is truncated or corrupt ({error}). Give another copy.") from error
+
+
+def _check_scans(path: Path) -> None:
+    """Count the scans of a JPEG file; entropy-coded data holds no markers but restarts."""
+    data = path.read_bytes()
+    scans = position = 0
+    while (found := _JPEG_MARKER.search(data, position)) and found[1][0] != _END_OF_IMAGE:
+        position = found.end()
+        if found[1][0] not in _BARE_MARKERS:
+            scans += found[1][0] == _START_OF_SCAN
+            position += max(2, int.from_bytes(data[position : position + 2], "big"))
+        if scans > MAX_JPEG_SCANS:
+            raise ImageError(f"{path}: is a progressive JPEG of more than {MAX_JPEG_SCANS} scans. Save it as PNG.")
 
 
 def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:

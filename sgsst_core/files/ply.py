@@ -115,13 +115,14 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
 
     Args:
         path: the file.
-        drop_invalid: leave Gaussians with NaN or infinite values out, of the scene and later of the stylized file,
-            instead of refusing the file. Properties that 3DGS does not use are not looked at.
+        drop_invalid: Whether Gaussians with NaN or infinite values, or a quaternion of length 0, are left out, of the
+            scene and later of the stylized file, instead of refusing the file. Properties that 3DGS does not use are
+            not looked at.
         held_bytes: spherical harmonics above degree 0 that take more stay in the file (`StoredHarmonics`), where it
             has them as trainers write them: `stays_in_file`. None is `HELD_BYTES`.
 
     Raises:
-        SceneError: missing, truncated or lying file, not a 3DGS scene, no Gaussians, non-finite values, or the file was
+        SceneError: missing, truncated or lying file, not a 3DGS scene, no Gaussians, invalid values, or the file was
             changed while it was read.
     """
     declared = read_scene_header(path)
@@ -142,7 +143,7 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
     else:
         _read_binary(file, header, offset, into)
     file.check_unchanged(stamp)
-    kept = _finite_rows(path, header.vertex.count, into.flaws, drop_invalid)
+    kept = _valid_rows(path, header.vertex.count, into.flaws, drop_invalid)
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in into.arrays.items()}
     if stored:
         arrays["sh_rest"] = StoredHarmonics(stored, file=file)
@@ -165,7 +166,7 @@ def _read_packed(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFi
     file.check_unchanged(stamp)
     for start in range(0, header.count, BLOCK_ROWS):
         into.check(start, min(BLOCK_ROWS, header.count - start))
-    kept = _finite_rows(path, header.count, into.flaws, drop_invalid)
+    kept = _valid_rows(path, header.count, into.flaws, drop_invalid)
     scene = Scene(**{name: torch.from_numpy(array) for name, array in into.arrays.items()})
     if kept is not None:
         scene = scene.subset(torch.from_numpy(kept))
@@ -258,20 +259,32 @@ def write_scene(path: Path, scene: Scene) -> None:
 
 
 def write_packed(path: Path, scene: Scene, form: PackedForm) -> None:
-    """Write a scene in a packed form, without bands of spherical harmonics that are 0 in all Gaussians.
-
-    The file appears whole or not at all. Rows may come in another order than the scene's.
+    """Write a scene in a packed form to a file, which appears whole or not at all; see `pack_scene`.
 
     Raises:
         OutputError: the file cannot be written, or the form cannot hold the scene.
     """
+    with atomic_path(path) as temporary, temporary.open("wb") as output:
+        pack_scene(output, scene, form, path)
+
+
+def pack_scene(output: BinaryIO, scene: Scene, form: PackedForm, target: Path) -> None:
+    """Write a scene in a packed form, without bands of spherical harmonics that are 0 in all Gaussians.
+
+    Rows may come in another order than the scene's.
+
+    Args:
+        target: Name of the output, for messages.
+
+    Raises:
+        OutputError: The form cannot hold the scene.
+    """
     scene = scene.without_zero_bands()
     arrays = {field.name: held(getattr(scene, field.name)).detach().cpu().float().numpy() for field in fields(scene)}
-    with atomic_path(path) as temporary, temporary.open("wb") as output:
-        if form == "spz":
-            write_spz(output, arrays, path)
-        else:
-            write_compressed_ply(output, arrays)
+    if form == "spz":
+        write_spz(output, arrays, target)
+    else:
+        write_compressed_ply(output, arrays)
 
 
 def _check_properties(path: Path, header: PlyHeader) -> int:
@@ -328,17 +341,19 @@ def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: i
 
 @dataclass(frozen=True)
 class _Flaws:
-    """Values that are no numbers in a block of rows.
+    """Invalid values in a block of rows.
 
     Attributes:
-        start: the block's first row.
-        finite: [n] bool, rows without any.
-        counts: by property that has some: how many are NaN, and how many are infinite.
+        start: First row of the block.
+        valid: [n] bool, rows without invalid values.
+        counts: Numbers of NaN and of infinite values, by property that has some.
+        unrotated: [n] bool, rows whose quaternion has length 0, which is no rotation.
     """
 
     start: int
-    finite: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     counts: dict[str, tuple[int, int]]
+    unrotated: NDArray[np.bool_]
 
 
 class _Columns:
@@ -376,28 +391,30 @@ class _Columns:
         self.check(start, len(rows), rows)
 
     def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
-        """Note values that are no numbers in so many rows, which are given where columns stay in the file."""
+        """Note invalid values in so many rows, which are given where columns stay in the file."""
         part = slice(start, start + count)
         blocks = [array[part] for array in self.arrays.values()]
         if self._stored is not None and rows is not None:
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             first = self._stored.column // 4
             blocks.append(table[:, first : first + 3 * self._stored.coefficients])
-        if not all(bool(np.isfinite(block).all()) for block in blocks):
+        rotated = self.arrays["quats"][part].any(axis=1)
+        if not (rotated.all() and all(bool(np.isfinite(block).all()) for block in blocks)):
             self.flaws.append(self._flaws_of(start, count, rows))
 
     def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
-        finite, counts = np.ones(count, np.bool_), {}
+        unrotated: NDArray[np.bool_] = np.logical_not(self.arrays["quats"][start : start + count].any(axis=1))
+        valid, counts = np.logical_not(unrotated), {}
         columns = {name: target[start : start + count] for name, target in self._targets.items()}
         if self._stored is not None and rows is not None:
             columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
         for name, column in columns.items():
             good = np.isfinite(column)
-            finite &= good
+            valid &= good
             nans = int(np.isnan(column).sum())
             if not good.all():
                 counts[name] = nans, int((~good).sum()) - nans
-        return _Flaws(start, finite, counts)
+        return _Flaws(start, valid, counts, unrotated)
 
 
 def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: _Columns) -> None:
@@ -434,7 +451,13 @@ class _AsciiHeader(io.BufferedReader):
 
 
 def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
-    """[rows] structured array of element vertex of a text file."""
+    """Read element vertex of a text file: [rows] structured array."""
+    with path.open("rb") as file:
+        file.seek(len(header.raw))
+        if any(b"_" in block for block in iter(lambda: file.read(READ_BYTES), b"")):  # Python reads 1_0 as 10
+            raise SceneError(
+                f"{path}: cannot be read as PLY: there is a '_' among its numbers. Export the scene again."
+            )
     try:
         with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list in text
@@ -444,14 +467,15 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
         raise SceneError(f"{path}: cannot be read as PLY: {error}. Export the scene again.") from error
 
 
-def _finite_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool) -> NDArray[np.bool_] | None:
+def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool) -> NDArray[np.bool_] | None:
     """Which of so many rows to keep, None for all; raises unless the others may be dropped."""
     if not flaws:
         return None
     kept = np.ones(count, dtype=np.bool_)
     totals: dict[str, list[int]] = {}
+    unrotated = np.concatenate([flaw.start + np.flatnonzero(flaw.unrotated) for flaw in flaws])
     for flaw in flaws:
-        kept[flaw.start : flaw.start + len(flaw.finite)] = flaw.finite
+        kept[flaw.start : flaw.start + len(flaw.valid)] = flaw.valid
         for name, (nans, infinite) in flaw.counts.items():
             total = totals.setdefault(name, [0, 0])
             total[0] += nans
@@ -462,7 +486,12 @@ def _finite_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool
         counts = dict(zip(("NaN", "infinite"), totals[name], strict=True))
         found.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
     bad = int((~kept).sum())
-    summary = f"{path}: {bad} of {len(kept)} Gaussians hold NaN or infinite values: {', '.join(found)}"
+    flawed = [f"hold NaN or infinite values: {', '.join(found)}"] if found else []
+    if len(unrotated):
+        flawed += [
+            f"have a quaternion of length 0, which is no rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
+        ]
+    summary = f"{path}: {bad} of {len(kept)} Gaussians {', or '.join(flawed)}"
     if bad == len(kept):
         raise SceneError(f"{summary}. None is left: train or export the scene again.")
     if not drop_invalid:

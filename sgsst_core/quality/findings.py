@@ -159,7 +159,14 @@ class _Scene:
         first = int(np.flatnonzero(~kept)[0])
         done = "stylize refuses the scene; with --drop-invalid they are left out, of the stylized scene too"
         return [
-            Finding("scene", "NaN or infinite values", self.file.dropped, len(kept), f"first: Gaussian {first}", done)
+            Finding(
+                "scene",
+                "NaN or infinite values, or no rotation",
+                self.file.dropped,
+                len(kept),
+                f"first: Gaussian {first}",
+                done,
+            )
         ]
 
     def rotations(self) -> list[Finding]:
@@ -167,12 +174,11 @@ class _Scene:
 
         def look(part: slice) -> list[tuple[Tensor, Tensor]]:
             length = self.scene.quats[part].double().norm(dim=1)
-            return [(length == 0, length), ((length > 0) & (length < low), length), (length > high, length)]
+            return [(length < low, length), (length > high, length)]
 
         normalized = "normalized in float64, as all are"
         return self.ask(
             look,
-            _Question("quaternion of length 0", "never drawn: it is no rotation"),
             _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
             _Question(f"quaternion longer than {high:g}", normalized),
         )

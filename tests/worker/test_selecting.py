@@ -113,6 +113,7 @@ def test_rows_that_were_dropped_are_dropped_of_masks_and_properties_too(tmp_path
         (np.array(["a"] * 24), "no array of flags or numbers"),
         (np.array([None] * 24), "cannot be read as .npy"),
         (b"no npy at all", "cannot be read as .npy"),
+        (b"\x93NUMPY\x01\x00\x02\x00{\n", "cannot be read as .npy"),
         (None, "cannot be read as .npy"),
     ],
 )

@@ -245,6 +245,8 @@ SCENES: list[tuple[str, Make]] = [
         lambda f: before_vertices(f["scene"], "element face 1\nproperty list char int v\n", b"\xff"),
     ),
     ("lists that end early", lambda f: with_faces(f["scene"], LIST, b"\x01\0\0\0\0" * 150)),
+    ("a quaternion of length 0", lambda f: f["scene"][:-16] + bytes(16)),
+    ("text with 1_0", lambda f: text_scene(f["scene"], "1_0")),
     ("infinite scale", lambda f: f["scene"][:-20] + struct.pack("<f", float("inf")) + f["scene"][-16:]),
     ("header only", lambda f: f["scene"][: f["scene"].index(b"end_header\n") + 11]),
     ("half a header", lambda f: f["scene"][:200]),
@@ -369,6 +371,14 @@ def jpeg(width: int, height: int) -> bytes:
     return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
 
 
+def jpeg_of_scans(count: int) -> bytes:
+    """A progressive JPEG of 20 megapixels, whose last scan is repeated."""
+    file = io.BytesIO()
+    Image.new("L", (5000, 4000), 128).save(file, "JPEG", progressive=True)
+    data = file.getvalue()
+    return data[:-2] + data[data.rindex(b"\xff\xda") : -2] * count + data[-2:]
+
+
 def picture(format_: str, width: int, height: int) -> bytes:
     file = io.BytesIO()
     Image.new("L", (width, height)).save(file, format_)
@@ -407,6 +417,9 @@ IMAGES: list[tuple[str, Make]] = [
             struct.pack("<HHII", 256, 4, 1, 8), struct.pack("<HHII", 256, 4, 1, 2**31)
         )[:200],
     ),
+    ("JPEG of 400 scans", lambda f: jpeg_of_scans(400)),
+    ("PPM of endless comments", lambda f: b"P3 10 10 255\n" + b"#\n" * 2 * MB + b"1 " * 300),
+    ("JPEG 2000", lambda f: picture("JPEG2000", 64, 64)),
     ("WebP cut off", lambda f: picture("WEBP", 64, 64)[:20]),
     (
         "PostScript",
@@ -473,6 +486,8 @@ CAMERAS: list[tuple[str, str, Make]] = [
     ("COLMAP of 2^60 cameras", "cameras.bin", lambda f: struct.pack("<Q", 2**60) + bytes(100)),
     ("COLMAP cut off", "cameras.bin", lambda f: struct.pack("<QIiQQ", 1, 1, 1, 64, 48)),
     ("COLMAP without images", "cameras.bin", lambda f: struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 64, 64, 32, 24)),
+    ("COLMAP of 1_0", "cameras.txt", lambda f: b"1 PINHOLE 6_4 48 64 64 32 24\n"),
+    ("rotation of text", "cameras.json", lambda f: changed_cameras(f, rotation=[["1_0", "0", "0"]] * 3)),
     ("COLMAP of words", "cameras.txt", lambda f: b"1 PINHOLE wide high 1 1 1 1\n"),
     ("a name of another kind", "cameras.json.exe", lambda f: f["cameras"]),
 ]
@@ -485,6 +500,20 @@ def test_cameras_that_lie(client: httpx.Client, store: Store, files: Files, name
     problem = refused(answer, 422, "invalid-cameras", "too-many-views", "too-many-pixels", "inspection-limit")
     assert problem.get("input", "cameras") == "cameras"
     assert count_jobs(store) == before
+
+
+MODEL: list[tuple[str, bytes]] = [
+    ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 64, 64, 32, 24)),
+    ("images.bin", struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 4, 1) + b"a.png\0" + struct.pack("<Q", 0)),
+]
+
+
+@pytest.mark.parametrize("name", ["points3D.bin", "rigs.bin", "frames.bin"])
+def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: str) -> None:
+    """Eight bytes that declare 2^60 entries: nobody reads them."""
+    model = [*MODEL, (name, struct.pack("<Q", 2**60))]
+    answer = client.post("/v1/jobs", files=[*form(files, cameras=None), *(("cameras", file) for file in model)])
+    assert answer.status_code == 202 or answer.json()["detail"].startswith("None of the 1 cameras sees"), answer.text
 
 
 def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, files: Files, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import struct
 from collections.abc import Callable
@@ -17,7 +18,9 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import CameraError
-from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files import colmap_model
+from sgsst_core.files.camera_files import _rotation_matrix, read_cameras
+from sgsst_core.files.colmap_model import read_model
 from sgsst_core.scene.camera import Camera, look_at
 
 WIDTH, HEIGHT = 640, 480
@@ -207,7 +210,7 @@ def test_every_truncation_of_a_binary_model_is_noticed(tmp_path: Path, name: str
 def test_colmap_models_that_cannot_be_read(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "model", views(), text=True)
     (folder / "images.txt").unlink()
-    with pytest.raises(CameraError, match="cannot be read as COLMAP model"):
+    with pytest.raises(CameraError, match=r"images\.txt: cannot be read: No such file"):
         read_cameras(folder)
     empty = colmap(tmp_path / "empty", [], text=False)
     with pytest.raises(CameraError, match="no registered image"):
@@ -215,6 +218,112 @@ def test_colmap_models_that_cannot_be_read(tmp_path: Path) -> None:
     (empty / "images.bin").unlink()
     with pytest.raises(CameraError, match=r"images\.bin: cannot be read: No such file"):
         read_cameras(empty)
+
+
+def test_poses_are_those_of_pycolmap_to_the_last_bit(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "model", views(200), text=False)
+    model = pycolmap.Reconstruction(folder)
+    expected = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    _, images = read_model(folder)
+    assert len(images) == 200
+    for image in images:
+        assert (_rotation_matrix("", image.rotation) == expected[image.name][:, :3]).all()
+        assert (np.array(image.translation) == expected[image.name][:, 3]).all()
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_images_hold_the_poses_of_rigs(tmp_path: Path, text: bool) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 3, 4
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.PINHOLE, [500.0, 510.0, 320.0, 240.0]
+    options.sensor_from_rig_translation_stddev, options.sensor_from_rig_rotation_stddev = 0.3, 10.0
+    made = pycolmap.synthesize_dataset(options)
+    (made.write_text if text else made.write_binary)(tmp_path)
+    assert {path.stem for path in tmp_path.iterdir()} == {"cameras", "images", "points3D", "rigs", "frames"}
+    expected = {image.name: image.cam_from_world().matrix() for image in made.images.values()}
+    found = read_cameras(tmp_path)
+    assert len(found) == len(expected) == 24
+    for view in found:
+        assert np.allclose(view.world_to_camera.numpy()[:3], expected[view.name], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_files_that_no_view_needs_are_never_opened(tmp_path: Path, text: bool) -> None:
+    """Eight bytes of any of them could declare 2^64 entries."""
+    folder = colmap(tmp_path / "model", views(), text=text)
+    for name in ("points3D", "rigs", "frames"):
+        path = folder / f"{name}{'.txt' if text else '.bin'}"
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)  # whoever opens it waits for ever
+    assert_same(read_cameras(folder), views())
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+@pytest.mark.parametrize("count", [4, 2**28, 2**64 - 1])
+def test_counts_of_binary_models_are_not_believed(tmp_path: Path, name: str, count: int) -> None:
+    folder = colmap(tmp_path / "model", views(), text=False)
+    data = (folder / name).read_bytes()
+    (folder / name).write_bytes(struct.pack("<Q", count) + data[8:])
+    with pytest.raises(CameraError, match=f"{name}: is truncated"):
+        read_cameras(folder)
+
+
+def test_camera_models_are_those_of_pycolmap(tmp_path: Path) -> None:
+    known = {
+        int(number.value): number for number in pycolmap.CameraModelId.__members__.values() if int(number.value) >= 0
+    }
+    for model, number in known.items():
+        parameters = pycolmap.Camera.create_from_model_id(1, number, 500.0, WIDTH, HEIGHT).params
+        assert colmap_model._MODELS[model] == (number.name, len(parameters))
+    folder = colmap(tmp_path / "model", views(), text=False)
+    data = (folder / "cameras.bin").read_bytes()
+    (folder / "cameras.bin").write_bytes(data[:12] + struct.pack("<i", 99) + data[16:])
+    with pytest.raises(CameraError, match=r"unknown COLMAP camera model, number 99.*image_undistorter"):
+        read_cameras(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("cameras.txt", "500.0", "5_00.0", "line 2: '5_00.0' is not a number"),
+        ("cameras.txt", "500.0", "nan", "line 2: 'nan' is not a number"),
+        ("cameras.txt", "500.0", "٥", "line 2: '٥' is not a number"),
+        ("cameras.txt", "640", "6_40", "line 2: '6_40' is not a whole number"),
+        ("cameras.txt", "640", "6" * 5000, "is not a whole number"),
+        ("cameras.txt", "PINHOLE", "PINHOL", "line 2: expected id, COLMAP camera model"),
+        ("cameras.txt", "500.0", "", "line 2: expected id, COLMAP camera model"),
+        ("cameras.txt", "1 P", "2 P", "has camera 1, which the model lacks"),
+        ("images.txt", "# images", "3 1 0 0 0 0 0 0 1 twice.png", "has id 3 twice"),
+        (
+            "images.txt",
+            "# images",
+            "9 0 0 0 0 0 0 0 1 still.png",
+            "image 'still.png': its quaternion has length 0, not 1",
+        ),
+        ("images.txt", "# images", "9 1e-9 0 0 0 0 0 0 1 still.png", "its quaternion has length 1e-09, not 1"),
+        ("images.txt", "# images", "9 1_0 0 0 0 0 0 0 1 still.png", "line 1: '1_0' is not a number"),
+        ("images.txt", "# images", "9 1 0 0 0 0 0 0 1", "line 1: expected id, 7 numbers"),
+    ],
+)
+def test_wrong_lines_of_colmap_text_are_named(tmp_path: Path, name: str, old: str, new: str, message: str) -> None:
+    folder = colmap(tmp_path / "model", views(), text=True)
+    content = (folder / name).read_text()
+    assert old in content
+    (folder / name).write_text(content.replace(old, new + "\n" * (name == "images.txt"), 1))
+    with pytest.raises(CameraError, match=message):
+        read_cameras(folder)
+
+
+def test_names_with_spaces_and_windows_line_ends(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "model", views(), text=True)
+    for file in ("cameras.txt", "images.txt"):
+        content = (folder / file).read_text().replace("img_1", "my img_1")
+        (folder / file).write_text(content.replace("\n", "\r\n"), newline="")
+    assert_same(
+        sorted(read_cameras(folder), key=lambda view: view.name[-5]),
+        views(),
+        {"img_0.png": "img_0.png", "img_1.png": "my img_1.png", "img_2.png": "img_2.png"}.__getitem__,
+    )
 
 
 def change(content: Any, key: str, value: Any) -> Any:
@@ -237,6 +346,9 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
         ("rotation", None, "has no 'rotation'"),
         ("rotation", [[1, 0], [0, 1]], r"'rotation' has shape \(2, 2\), not \(3, 3\)"),
         ("rotation", "right", "'rotation' is not an array of numbers"),
+        ("rotation", [["1_0", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]], "'rotation' is not an array of numbers"),
+        ("rotation", [[True, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
+        ("position", [0, 0, "1_0"], "'position' is not an array of numbers"),
         ("rotation", [[1, 0, 0], [0, 10**400, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
         ("rotation", (2 * np.eye(3)).tolist(), "is 3 off a rotation"),
         ("rotation", [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]], "is 0.01 off a rotation"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zlib
@@ -15,7 +16,17 @@ from PIL import Image
 
 from sgsst_core.errors import ImageError, OutputError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.images import MAX_PIXELS, check_photos, image_size, load_image, load_photo, save_jpg, save_png
+from sgsst_core.files.images import (
+    FORMATS,
+    MAX_JPEG_SCANS,
+    MAX_PIXELS,
+    check_photos,
+    image_size,
+    load_image,
+    load_photo,
+    save_jpg,
+    save_png,
+)
 from sgsst_core.scene.camera import Camera, resized
 
 
@@ -158,6 +169,44 @@ def test_truncated_images_are_refused(tmp_path: Path, name: str) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(ImageError, match=rf"{name}: is (truncated|not an image)"):
         load_image(path)
+
+
+def with_scans(path: Path, count: int) -> Path:
+    """A progressive JPEG whose last scan is repeated."""
+    file = io.BytesIO()
+    Image.new("L", (64, 64), 128).save(file, "JPEG", progressive=True)
+    data = file.getvalue()
+    path.write_bytes(data[:-2] + data[data.rindex(b"\xff\xda") : -2] * (count - data.count(b"\xff\xda")) + data[-2:])
+    return path
+
+
+def test_progressive_jpegs_of_many_scans_are_refused(tmp_path: Path) -> None:
+    assert load_image(with_scans(tmp_path / "some.jpg", MAX_JPEG_SCANS)).shape == (64, 64, 3)
+    with pytest.raises(ImageError, match=r"many\.jpg: is a progressive JPEG of more than 100 scans"):
+        load_image(with_scans(tmp_path / "many.jpg", MAX_JPEG_SCANS + 1))
+
+
+def test_scans_of_thumbnails_and_of_what_follows_do_not_count(tmp_path: Path) -> None:
+    path = with_scans(tmp_path / "a.jpg", 50)
+    scan = b"\xff\xda\x00\x02"
+    thumbnail = b"\xff\xe5" + (2 + 2000 * len(scan)).to_bytes(2, "big") + scan * 2000
+    path.write_bytes(path.read_bytes()[:2] + thumbnail + path.read_bytes()[2:] + scan * 2000)
+    assert load_image(path).shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize("format_", ["PPM", "TGA", "JPEG2000", "PCX", "EPS", "ICO"])
+def test_formats_whose_time_nobody_has_bounded_are_refused(tmp_path: Path, format_: str) -> None:
+    path = tmp_path / "style.png"
+    Image.new("RGB", (32, 32)).save(path, format_)
+    with pytest.raises(ImageError, match=r"style\.png: is not an image that can be read\. Give a PNG or JPEG"):
+        load_image(path)
+
+
+@pytest.mark.parametrize("format_", FORMATS)
+def test_formats_are_read(tmp_path: Path, format_: str) -> None:
+    path = tmp_path / "style"
+    Image.new("RGB", (32, 32), "red").save(path, format_)
+    assert load_image(path)[16, 16, 0] > 0.9
 
 
 def test_what_is_no_image_is_refused(tmp_path: Path) -> None:

@@ -136,7 +136,7 @@ def files(draw: st.DrawFn) -> File:
             return draw(st.floats(-(2.0**99), 2.0**99))
         return draw(st.integers(*ranges.get(CODES[kind], (0, 2**31 - 1))))
 
-    seed = {name: value(kinds.get(name, "float")) for name in order}
+    seed = {name: value(kinds.get(name, "float")) for name in order} | {"rot_0": 1.0}
     fresh = ["x", "f_dc_0", "f_dc_2", *extra]
     rows = [seed | {name: value(kinds.get(name, "float")) for name in fresh} for _ in range(draw(st.integers(1, 3)))]
     vertex = ("vertex", [(kinds.get(name, "float"), name) for name in order], rows)
@@ -316,6 +316,28 @@ def test_a_scene_without_any_finite_gaussian_is_refused(tmp_path: Path) -> None:
         read_scene(save(tmp_path, simple(x=float("nan"))), drop_invalid=True)
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_a_quaternion_of_length_0_is_refused_by_its_row_and_may_be_dropped(tmp_path: Path, form: str) -> None:
+    file = simple(5, form=form)
+    rotation = [f"rot_{i}" for i in range(4)]
+    file.elements[0][1][:] = [("double" if name in rotation else kind, name) for kind, name in file.elements[0][1]]
+    file.elements[0][2][2] |= dict.fromkeys(rotation, 0.0)
+    file.elements[0][2][4] |= dict.fromkeys(rotation, 1e-60)  # nothing in float32
+    path = save(tmp_path, file)
+    with pytest.raises(
+        SceneError, match=r"2 of 5 Gaussians have a quaternion of length 0.*first: Gaussian 2.*--drop-i"
+    ):
+        read_scene(path)
+    file.elements[0][2][1]["x"] = float("nan")
+    with pytest.raises(
+        SceneError, match=r"3 of 5 Gaussians hold NaN .*x \(1 NaN\), or have .* \(2, first: Gaussian 2\)"
+    ):
+        read_scene(save(tmp_path, file))
+    source = read_scene(path, drop_invalid=True)
+    assert source.scene.means[:, 1].tolist() == [f32(0.01), f32(3.01)]
+    assert bool(source.scene.quats.any(dim=1).all())
+
+
 def test_a_double_beyond_float32_counts_as_infinite(tmp_path: Path) -> None:
     file = simple(2)
     file.elements[0][1][0] = ("double", "x")
@@ -447,7 +469,9 @@ def test_every_truncation_is_noticed(tmp_path: Path, form: str) -> None:
             read_scene(save(tmp_path, data[:stop]))
 
 
-@pytest.mark.parametrize(("old", "new"), [(b"0.03", b"wrong"), (b"0.03", b"0.03 1.5"), (b"0.03", b"\xff")])
+@pytest.mark.parametrize(
+    ("old", "new"), [(b"0.03", b"wrong"), (b"0.03", b"0.03 1.5"), (b"0.03", b"\xff"), (b"0.03", b"1_0")]
+)
 def test_text_that_is_no_number_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
     with pytest.raises(SceneError, match="cannot be read as PLY"):
         read_scene(save(tmp_path, simple(form="ascii").to_bytes().replace(old, new)))

@@ -77,7 +77,6 @@ def test_nothing_extreme_is_found_in_an_ordinary_scene(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("column", "rows", "value", "what", "worst"),
     [
-        ("quats", [4, 9], 0.0, "quaternion of length 0", "Gaussian 4: 0"),
         ("quats", [3], 1e-20, "quaternion shorter than 0.001", "Gaussian 3: 2e-20"),
         ("quats", [3], 1e20, "quaternion longer than 1000", "Gaussian 3: 2e+20"),
         ("scales", [5, 6], 200.0, "size that overflows", "Gaussian 5: 200"),
@@ -138,11 +137,12 @@ def test_invalid_rows_are_told_and_indices_are_those_of_the_file(tmp_path: Path)
     scene.means[2, 1] = math.nan
     scene.sh_dc[5, 0] = math.inf
     scene.quats[20] = 0
+    scene.scales[21, 1] = 5.0
     found = found_in(tmp_path, scene)
     invalid = the(found, "NaN or infinite")
-    assert (invalid.count, invalid.total, invalid.worst) == (2, len(scene), "first: Gaussian 2")
+    assert (invalid.count, invalid.total, invalid.worst) == (3, len(scene), "first: Gaussian 2")
     assert "--drop-invalid" in invalid.done
-    assert the(found, "length 0").worst == "Gaussian 20: 0"
+    assert the(found, "longer than the scene's extent").worst.startswith("Gaussian 21: ")
 
 
 def test_a_world_far_from_its_origin_is_told_with_what_is_lost(tmp_path: Path) -> None:

@@ -1,0 +1,190 @@
+"""Cameras and poses of COLMAP sparse models, binary or text, as COLMAP's "Output Format" page defines them.
+
+Only `cameras` and `images` are read. They hold everything a view needs: COLMAP writes each image's pose into `images`
+even where `rigs` and `frames` are there to derive it from. `points3D`, `rigs` and `frames` are never opened.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from sgsst_core.errors import CameraError
+
+T = TypeVar("T")
+
+UNDISTORT = (
+    "Undistort the photos with `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT` "
+    "and give OUT/sparse"
+)
+_AGAIN = "Export the model again."
+
+#: COLMAP's camera models by number: name and count of parameters.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
+}
+_PARAMETERS = dict(_MODELS.values())
+#: Stricter than `int` and `float`, which take `1_0` and digits of other scripts.
+_WHOLE = re.compile("[0-9]{1,18}")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """Intrinsics: the model's name, the size in pixels, and the parameters in the model's order."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """A registered image.
+
+    Attributes:
+        name: Path of the image, relative to COLMAP's image folder.
+        camera: Id of its camera.
+        rotation: Quaternion wxyz, world to camera, as stored.
+        translation: World to camera.
+    """
+
+    name: str
+    camera: int
+    rotation: tuple[float, float, float, float]
+    translation: tuple[float, float, float]
+
+
+def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
+    """Read the cameras by id, and the registered images in the file's order. Binary files win over text, as in COLMAP.
+
+    Raises:
+        CameraError: A file is missing, truncated, or holds a value that is not allowed; names the file.
+    """
+    if (folder / "cameras.bin").is_file():
+        cameras = _by_id(folder / "cameras.bin", _binary(folder / "cameras.bin", _binary_camera))
+        images = _by_id(folder / "images.bin", _binary(folder / "images.bin", _binary_image))
+    else:
+        cameras = _by_id(folder / "cameras.txt", _text_cameras(folder / "cameras.txt"))
+        images = _by_id(folder / "images.txt", _text_images(folder / "images.txt"))
+    return cameras, list(images.values())
+
+
+def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
+    found: dict[int, T] = {}
+    try:
+        for number, entry in entries:
+            if number in found:
+                raise CameraError(f"{path}: has id {number} twice. Export the model again.")
+            found[number] = entry
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read: {error.strerror}. Copy the model again.") from error
+    except KeyError as error:
+        raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {UNDISTORT}.") from error
+    except (struct.error, EOFError, ValueError) as error:
+        raise CameraError(f"{path}: is truncated or corrupt. Copy the model again.") from error
+    return found
+
+
+def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]]) -> Iterator[tuple[int, T]]:
+    """Yield as many entries as the file declares, each read only once the file is known to hold it."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        position = 8
+        for _ in range(struct.unpack_from("<Q", data)[0]):
+            number, entry, position = read(data, position)
+            if position > len(data):
+                raise EOFError
+            yield number, entry
+
+
+def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, int]:
+    """Fields: camera (uint32), model (int32), width and height (uint64), parameters (float64)."""
+    number, model, width, height = struct.unpack_from("<IiQQ", data, position)
+    name, count = _MODELS[model]
+    parameters = struct.unpack_from(f"<{count}d", data, position + 24)
+    return number, ColmapCamera(name, width, height, parameters), position + 24 + 8 * count
+
+
+def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int]:
+    """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, 24 bytes each)."""
+    number, *pose, camera = struct.unpack_from("<I7dI", data, position)
+    end_of_name = data.find(b"\0", position + 64)
+    if end_of_name < 0:
+        raise EOFError
+    name = data[position + 64 : end_of_name].decode()
+    points: int = struct.unpack_from("<Q", data, end_of_name + 1)[0]
+    return number, _image(name, camera, pose), end_of_name + 9 + 24 * points
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    """Lines: id, model's name, width, height, parameters."""
+    for where, line in _lines(path):
+        words = line.split()
+        model = words[1] if len(words) > 1 else ""
+        if model not in _PARAMETERS or len(words) != 4 + _PARAMETERS[model]:
+            raise CameraError(f"{where}: expected id, COLMAP camera model, width, height and its parameters. {_AGAIN}")
+        number, width, height = (_whole(where, word) for word in (words[0], *words[2:4]))
+        yield number, ColmapCamera(model, width, height, tuple(_number(where, word) for word in words[4:]))
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
+    """Two lines each: id, quaternion, translation, camera's id and name; then points, which may be none."""
+    lines = _lines(path, points_follow=True)
+    for where, line in lines:
+        words = line.split(maxsplit=9)
+        if len(words) != 10:
+            raise CameraError(f"{where}: expected id, 7 numbers of the pose, camera id and name. {_AGAIN}")
+        pose = [_number(where, word) for word in words[1:8]]
+        yield _whole(where, words[0]), _image(words[9], _whole(where, words[8]), pose)
+
+
+def _lines(path: Path, *, points_follow: bool = False) -> Iterator[tuple[str, str]]:
+    """Yield where each line is, for messages, and the line; skip blank lines, comments and, on request, points."""
+    with path.open("rb") as file:
+        numbered = enumerate(file, start=1)
+        for number, data in numbered:
+            line = data.decode().strip()
+            if line and not line.startswith("#"):
+                yield f"{path}: line {number}", line
+                if points_follow:
+                    next(numbered, None)
+
+
+def _image(name: str, camera: int, pose: Sequence[float]) -> ColmapImage:
+    w, x, y, z, *translation = pose
+    return ColmapImage(name, camera, (w, x, y, z), (translation[0], translation[1], translation[2]))
+
+
+def _whole(where: str, word: str) -> int:
+    if not _WHOLE.fullmatch(word):
+        raise CameraError(f"{where}: {word[:40]!r} is not a whole number. {_AGAIN}")
+    return int(word)
+
+
+def _number(where: str, word: str) -> float:
+    if not _NUMBER.fullmatch(word):
+        raise CameraError(f"{where}: {word[:40]!r} is not a number. {_AGAIN}")
+    return float(word)

@@ -1,0 +1,214 @@
+"""A reader that has been taken over: what it tries fails, and the files of others are checked as before."""
+
+from __future__ import annotations
+
+import errno
+import inspect as source
+import json
+import os
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.errors import RefusedInputError
+from service.files.blobs import BlobFolder
+from service.inspection import inspector, sandbox
+from service.inspection.inspector import Inspector
+from service.settings import ServiceSettings
+from service.store import open_store
+from tests.service.inspection import attack
+from tests.service.inspection.test_limits import inspect
+from tests.small_scenes import wall, write_files
+
+COMPROMISED = Path(__file__).with_name("compromised.py")
+#: Set for the libraries; LC_CTYPE is of Python's own making where there is no locale.
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+ADDED = {*THREADS, "CUDA_VISIBLE_DEVICES", "LC_CTYPE"}
+pytestmark = pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lacks {sandbox.missing()}")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    scene, cameras, style = write_files(tmp_path, wall())
+    return {"scene": scene, "cameras": cameras, "style": style}
+
+
+@pytest.fixture
+def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+    """What an attacker is after. The listener is on loopback, and would take a connection."""
+    for name in ("PGPASSWORD", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN"):
+        monkeypatch.setenv(name, "secret")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "there").write_text("there")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        yield {
+            "data": str(tmp_path / "data"),
+            "blob": str(outside / "there"),
+            "outside": str(outside),
+            "port": listener.getsockname()[1],
+            "api": os.getpid(),
+            "own": "scene/scene.ply",
+        }
+
+
+def attacked(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, files: dict[str, Path], target: dict[str, Any], *lacking: str
+) -> dict[str, Any]:
+    """What an attack reports of itself."""
+    monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED), *lacking))
+    code = f"# attack\n{source.getsource(attack)}\ntold = attack({target!r})\n".encode()
+    scene = folder / "attack" / "scene.ply"
+    scene.parent.mkdir()
+    scene.write_bytes(code)
+    with pytest.raises(RefusedInputError) as caught:
+        inspect(folder, {**files, "scene": scene})
+    found: dict[str, Any] = json.loads(str(caught.value))
+    assert scene.read_bytes() == code
+    assert "landlock" in lacking or (Path(target["outside"]) / "there").read_text() == "there"
+    assert inspect(folder, files)["gaussians"] == 616, "others' files are checked as before"
+    return found
+
+
+def allowed(outcomes: dict[str, str]) -> set[str]:
+    return {name for name, outcome in outcomes.items() if outcome == "done"}
+
+
+def test_a_reader_that_is_taken_over_reaches_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
+) -> None:
+    found = attacked(monkeypatch, tmp_path, files, target)
+    assert allowed(found["files"]) == {"read own scene"}, found["files"]
+    assert allowed(found["calls"]) == set(), found["calls"]
+    assert set(found["files"].values()) | set(found["calls"].values()) <= {"done", "EACCES", "EPERM", "EXDEV"}
+    assert "secret" not in found["environment"].values()
+    assert found["environment"].keys() <= {*inspector._ENVIRONMENT, *ADDED}
+    assert found["log"] == "/dev/null"
+    assert len(found["descriptors"]) == 4, "nothing, thrice, and the pipe that its answer goes through"
+    assert sorted(path.name for path in Path(target["outside"]).iterdir()) == ["there"]
+
+
+def test_without_landlock_network_and_processes_are_out_of_reach(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
+) -> None:
+    target["data"] = target["outside"]  # what can be written to is at most one byte of nobody's
+    found = attacked(monkeypatch, tmp_path, files, target, "landlock")
+    assert allowed(found["calls"]) == set(), found["calls"]
+    for name in ("write a huge file", "write outside", "write to own scene"):
+        assert found["files"][name] == "EFBIG", found["files"]
+    assert "secret" not in found["environment"].values()
+
+
+def test_without_seccomp_files_and_signals_are_out_of_reach(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
+) -> None:
+    found = attacked(monkeypatch, tmp_path, files, target, "seccomp")
+    assert allowed(found["files"]) == {"read own scene"}, found["files"]
+    refused = {"trace the parent", "trace the API", "memory that is a file"}
+    refused |= {"connect"} if sandbox._landlock_version() >= 4 else set()
+    refused |= {"signal the parent", "signal the API"} if sandbox._landlock_version() >= 6 else set()
+    assert not allowed(found["calls"]) & refused, found["calls"]
+    assert "secret" not in found["environment"].values()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "x" * 10_000,
+        "[" * 100_000,
+        "[]",
+        "{}",
+        '{"error": {}}',
+        '{"error": {"code": 1, "message": [], "input": {}}}',
+        '{"found": 7}',
+        '{"found": {}}\n{"found": {"gaussians": 7}}',
+    ],
+)
+def test_forged_answers_reach_nobody_else(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], answer: str
+) -> None:
+    monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED)))
+    scene = tmp_path / "attack" / "scene.ply"
+    scene.parent.mkdir()
+    write = f"os.write(descriptor, {answer.encode()!r} + bytes([10]))"
+    code = f"import os\nfor descriptor in range(16):\n    try: {write}\n    except OSError: pass\nos._exit(0)\n"
+    scene.write_text(f"# attack\n{code}")
+    if answer.startswith('{"found": {}}'):  # about its own files it may say what it likes
+        assert inspect(tmp_path, {**files, "scene": scene}) == {}
+    else:
+        with pytest.raises(RefusedInputError, match="breaks their reader"):
+            inspect(tmp_path, {**files, "scene": scene})
+    assert inspect(tmp_path, files)["gaussians"] == 616
+
+
+def test_what_the_kernel_lacks_is_logged_at_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = ServiceSettings(data=tmp_path)
+    store = open_store(settings)
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
+    try:
+        Inspector(settings, store, blobs)
+        assert not caplog.records
+        monkeypatch.setattr(sandbox, "_landlock_version", lambda: 0)
+        monkeypatch.setattr(sandbox, "_has_seccomp", lambda: False)
+        Inspector(settings, store, blobs)
+    finally:
+        store.close()
+    first, second = (record.getMessage() for record in caplog.records)
+    assert "without Landlock (Linux 5.13)" in first
+    assert "without seccomp" in second
+
+
+def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -> int:
+    """What a filter answers to a system call: classic BPF, as the kernel runs it."""
+    call = {0: number, 4: architecture, 16: argument}
+    code = list(struct.iter_unpack("=HBBI", program))
+    at = value = 0
+    while True:
+        operation, true, false, operand = code[at]
+        match operation:
+            case 0x06:
+                return operand
+            case 0x20:
+                value, jump = call[operand], 0
+            case 0x15:
+                jump = true if value == operand else false
+            case 0x25:
+                jump = true if value > operand else false
+            case 0x45:
+                jump = true if value & operand else false
+        at += 1 + jump
+
+
+@pytest.mark.parametrize(
+    ("machine", "architecture", "numbers"),
+    [
+        ("x86_64", 0xC000003E, {"read": 0, "socket": 41, "execve": 59, "clone": 56, "kill": 62, "prlimit64": 302}),
+        (
+            "aarch64",
+            0xC00000B7,
+            {"read": 63, "socket": 198, "execve": 221, "clone": 220, "kill": 129, "prlimit64": 261},
+        ),
+    ],
+)
+def test_the_filter_of_each_architecture(machine: str, architecture: int, numbers: dict[str, int]) -> None:
+    program, own, other = sandbox.seccomp_program(machine, 4711), 4711, 4712
+    allow, refuse, absent = 0x7FFF0000, 0x50000 | errno.EPERM, 0x50000 | errno.ENOSYS
+
+    def ask(name: str, argument: int = 0) -> int:
+        return verdict(program, architecture, numbers[name], argument)
+
+    assert (
+        ask("read") == ask("clone", 0x10F00) == ask("kill", own) == ask("prlimit64", own) == ask("prlimit64") == allow
+    )
+    assert ask("socket") == ask("execve") == ask("clone", 17) == ask("kill", other) == ask("kill") == refuse
+    assert ask("kill", 2**32 - 1) == ask("prlimit64", other) == refuse
+    assert verdict(program, architecture, 435) == verdict(program, architecture, 463) == absent
+    assert verdict(program, architecture, 0x40000000 + numbers["socket"]) == absent
+    assert verdict(program, 0x40000003, numbers["read"]) == refuse
