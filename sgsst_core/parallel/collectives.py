@@ -72,7 +72,10 @@ class Collectives(Protocol):
         ...
 
     def all_gather(self, value: T) -> list[T]:
-        """Every rank's value, by rank: the same on every rank. Values must be picklable and small."""
+        """Every rank's value, by rank: the same on every rank.
+
+        Values are small: plain ones, lists, tuples, dicts, paths, arrays, tensors, and dataclasses and errors of ours.
+        """
         ...
 
     def broadcast(self, make: Callable[[], T]) -> T:

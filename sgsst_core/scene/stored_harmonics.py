@@ -141,9 +141,13 @@ class StoredHarmonics:
         count = layout.rows if chosen is None else len(chosen)
         self.shape = torch.Size((count, layout.coefficients if coefficients is None else coefficients, 3))
 
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """Arguments with which another process makes the same: it opens the file itself."""
+        return self.layout, self._chosen, self.shape[1], None, self._factor
+
     def __reduce__(self) -> tuple[Any, ...]:
-        """Another process opens the file itself."""
-        return StoredHarmonics, (self.layout, self._chosen, self.shape[1], None, self._factor)
+        return StoredHarmonics, self.arguments
 
     def __len__(self) -> int:
         return self.shape[0]
