@@ -73,8 +73,8 @@ def test_the_store_of_ranks_takes_a_socket() -> None:
 
     assert "master_listen_fd" in (dist.TCPStore.__init__.__doc__ or ""), (
         "PyTorch's store no longer takes a socket that listens already. Find how it can be bound to one address, and "
-        "change `_meet` in worker/ranks/process_group.py; else it listens on every interface, and asks nobody who they "
-        "are."
+        "change `_meet` in worker/ranks/process_group.py; else it listens on every interface, without "
+        "authentication."
     )
 
 

@@ -91,5 +91,5 @@ def split_address(address: str) -> tuple[str, int]:
 
 
 def listen(host: str, port: int = 0) -> socket.socket:
-    """Return a socket that listens on one address of this machine, at a free port by default."""
+    """Return a socket that listens on one address of this machine only; port 0 chooses a free port."""
     return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)

@@ -143,7 +143,7 @@ class StoredHarmonics:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """Arguments with which another process makes the same: it opens the file itself."""
+        """Constructor arguments with which another process opens the same coefficients."""
         return self.layout, self._chosen, self.shape[1], None, self._factor
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -1,7 +1,7 @@
 """Values that ranks send each other, as JSON and tensors.
 
-Ranks do not authenticate each other, so a message is never unpickled: decoding one creates plain values, tensors, and
-dataclasses and errors of this project, and runs no code that the sender chooses.
+Ranks do not authenticate each other, so messages are never unpickled. Decoding a message creates plain values, tensors,
+and dataclasses and errors of this project; it runs no code that the sender chooses.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def decode(message: Tensor) -> Any:
     """Return the value of a message [n] uint8.
 
     Raises:
-        ValueError: It is not a message.
+        ValueError: The bytes are not a message.
     """
     try:
         tensors = load(message.numpy().tobytes())
@@ -52,7 +52,7 @@ def decode(message: Tensor) -> Any:
 
 
 def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Return JSON in which everything but plain values and lists is an object of one member, named after its kind."""
+    """Return JSON; values other than plain ones and lists become objects with one member, named after their kind."""
 
     def each(values: Any) -> list[Any]:
         return [_to_json(item, tensors) for item in values]
@@ -149,7 +149,7 @@ def _name_of(kind: type) -> str:
 
 
 def _class(name: str) -> type:
-    """Return the class of a "module:name" of this project."""
+    """Return the class that a "module:name" refers to; it must belong to this project."""
     module, _, own = name.partition(":")
     if module.partition(".")[0] not in _PACKAGES:
         raise TypeError(f"{name} is not a class of {' or '.join(_PACKAGES)}")

@@ -1,7 +1,7 @@
 """The exchanges of `sgsst_core.parallel.collectives` over torch.distributed: NCCL between GPUs, gloo between CPUs.
 
-Nothing of it authenticates the other side: it listens on one interface only, loopback for a job of one machine, and
-opens no pickles (`messages`).
+torch.distributed does not authenticate its peers. Ranks therefore listen on one interface only, which is loopback for a
+job of one machine, and never unpickle what they receive (see `messages`).
 
 Sums are made in an order that depends on the number of ranks and on the size of what is summed alone, so that a run can
 be repeated bit for bit, and every rank receives the same bits.
@@ -84,9 +84,9 @@ def process_group(
 
 
 def _stay_on_interface(address: str) -> None:
-    """Let gloo and NCCL listen on no other interface than the one toward rank 0's "host:port".
+    """Restrict gloo and NCCL to the interface that leads to rank 0's "host:port".
 
-    An operator may name another one by the libraries' own variables, but not for a job of one machine.
+    Operators can choose another interface by the libraries' own variables, except for a job of one machine.
     """
     host, _ = split_address(address)
     interface = interface_towards(host)
@@ -109,7 +109,7 @@ def _meet(
     of them must form it for the same back ends.
     """
     host, port = split_address(address)
-    # By itself, the store would listen on every interface.
+    # Without a socket of ours, the store listens on every interface.
     descriptor = (listener or listen(host, port)).detach() if rank == 0 else None
     store: Any = dist.TCPStore(  # type: ignore[attr-defined]  # public, but not listed
         host, port, size, rank == 0, timeout, master_listen_fd=descriptor

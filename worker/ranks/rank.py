@@ -154,7 +154,11 @@ class RankProcess:
         return RankPlace(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this(), gpus)
 
     def listen(self, host: str) -> int:
-        """Return the port at which this rank, as rank 0, accepts the others on an address of its machine."""
+        """Open the socket on which rank 0 accepts the other ranks, and return its port.
+
+        Args:
+            host: Address of this machine to bind it to.
+        """
         self._listener = listen(host)
         return int(self._listener.getsockname()[1])
 

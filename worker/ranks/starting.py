@@ -71,7 +71,7 @@ def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
 
 
 def _address(handles: list[RankHandle]) -> str:
-    """Let rank 0 listen; returns its "host:port"."""
+    """Make rank 0 listen, and return its "host:port"."""
     import ray
 
     alone = len({_place(rank).node for rank in handles}) == 1

@@ -1,4 +1,4 @@
-"""Messages between ranks: what goes in comes out, bit by bit, and nothing else can come out."""
+"""Messages between ranks: values are restored bit by bit, and hostile messages are refused."""
 
 from __future__ import annotations
 

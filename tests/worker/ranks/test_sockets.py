@@ -1,4 +1,4 @@
-"""What a job on ranks listens on: nothing that another machine can reach, unless its ranks are on several machines."""
+"""Sockets of a job on several ranks: on one machine, other machines can reach none of them."""
 
 from __future__ import annotations
 
