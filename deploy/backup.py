@@ -174,7 +174,7 @@ def _load(store: Store, folder: Path) -> None:
 def _run(program: str, *words: str, url: URL) -> None:
     """A program of PostgreSQL's; where the server is it reads from its environment, the password too."""
     where = {"PGHOST": url.host, "PGPORT": url.port, "PGUSER": url.username, "PGPASSWORD": url.password}
-    where |= {"PGDATABASE": url.database}
+    where |= {"PGDATABASE": url.database, "PGPASSFILE": url.query.get("passfile")}
     environment = {**os.environ, **{name: str(value) for name, value in where.items() if value is not None}}
     try:
         subprocess.run([program, *words], env=environment, check=True)

@@ -62,6 +62,31 @@ def test_numba_keeps_kernels_by_a_method_that_can_be_replaced() -> None:
     )
 
 
+def test_ray_binds_to_loopback_where_it_is_no_part_of_a_cluster() -> None:
+    spec = importlib.util.find_spec("ray")
+    assert spec is not None
+    assert spec.origin is not None
+    sources = [
+        (Path(spec.origin).parent / "_private" / name).read_text() for name in ("ray_constants.py", "services.py")
+    ]
+    found = '"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"' in sources[0] and "ENABLE_RAY_CLUSTER" in sources[1]
+    assert found, (
+        "Ray no longer reads RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER. Find what keeps it from replacing 127.0.0.1 by an "
+        "address that others reach, and change worker/ranks/cluster.py; tests/worker/ranks/test_sockets.py lists the "
+        "sockets."
+    )
+
+
+def test_the_store_of_ranks_takes_a_socket() -> None:
+    import torch.distributed as dist
+
+    assert "master_listen_fd" in (dist.TCPStore.__init__.__doc__ or ""), (
+        "PyTorch's store no longer takes a socket that listens already. Find how it can be bound to one address, and "
+        "change `_meet` in worker/ranks/process_group.py; else it listens on every interface, without "
+        "authentication."
+    )
+
+
 def test_a_process_group_forgets_its_device() -> None:
     import torch.distributed as dist
 

@@ -82,3 +82,14 @@ def interface_towards(address: str) -> str | None:
         if any(entry.address.partition("%")[0] == own for entry in addresses):
             return str(name)
     return None
+
+
+def split_address(address: str) -> tuple[str, int]:
+    """Return host and port of a "host:port"."""
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def listen(host: str, port: int = 0) -> socket.socket:
+    """Return a socket that listens on one address of this machine only; port 0 chooses a free port."""
+    return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)

@@ -75,7 +75,11 @@ class Collectives(Protocol):
         ...
 
     def all_gather(self, value: T) -> list[T]:
-        """Return every rank's value in rank order, identical on all ranks. Values must be picklable and small."""
+        """Return every rank's value in rank order, identical on all ranks.
+
+        Values are small: plain ones, lists, tuples, dicts, paths, arrays, tensors, and this project's dataclasses and
+        errors.
+        """
         ...
 
     def broadcast(self, make: Callable[[], T]) -> T:

@@ -7,8 +7,10 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
+from ipaddress import ip_address, ip_network
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +25,25 @@ FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "kubernetes"
 SCHEMA = Path(__file__).with_name("schemas") / "raycluster_v1.schema.json.gz"
 OVERLAYS = ("small", "gpu")
 each_overlay = pytest.mark.parametrize("overlay", OVERLAYS)
+#: Where Kubernetes' clients look for a token.
+TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"
 #: Secrets and their keys that the docs ask for.
 SECRETS = {"sgsst-database", "sgsst-store", "sgsst-ray", "sgsst-tls"}
 
 
 @cache
 def rendered(overlay: str) -> str:
+    return build(FOLDER / "overlays" / overlay)
+
+
+def build(folder: Path) -> str:
     if shutil.which("kubectl"):
         command = ["kubectl", "kustomize"]
     elif shutil.which("kustomize"):
         command = ["kustomize", "build"]
     else:
         pytest.skip("neither kubectl nor kustomize is installed")
-    ended = subprocess.run([*command, str(FOLDER / "overlays" / overlay)], capture_output=True, text=True)
+    ended = subprocess.run([*command, str(folder)], capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     assert "deprecated" not in ended.stderr
     return ended.stdout
@@ -102,8 +110,9 @@ def test_pods_have_no_rights_and_know_their_size(overlay: str) -> None:
         context = container["securityContext"]
         assert context["allowPrivilegeEscalation"] is False, container["name"]
         assert context["capabilities"] == {"drop": ["ALL"]}, container["name"]
-        # KubeRay writes to the root of the containers that it starts
-        assert context.get("readOnlyRootFilesystem") or container["name"].startswith("ray-"), container["name"]
+        assert context["readOnlyRootFilesystem"] is True, container["name"]
+        written = {mount["mountPath"] for mount in container["volumeMounts"]}
+        assert {"/data", "/tmp"} <= written, container["name"]
         assert {"cpu", "memory"} <= set(container["resources"]["requests"])
         assert "memory" in container["resources"]["limits"]
         mounted = {mount["name"] for mount in container["volumeMounts"]}
@@ -112,24 +121,135 @@ def test_pods_have_no_rights_and_know_their_size(overlay: str) -> None:
 
 
 @each_overlay
+def test_no_container_but_the_autoscaler_has_a_token_of_kubernetes(overlay: str) -> None:
+    accounts = of_kind(overlay, "ServiceAccount")
+    assert accounts
+    for account in accounts:
+        assert account["automountServiceAccountToken"] is False
+    names = {account["metadata"]["name"] for account in accounts}
+    for pod in pods(overlay):
+        assert pod["spec"]["automountServiceAccountToken"] is False
+        assert pod["spec"]["serviceAccountName"] in names
+    mounts = [mount["name"] for container in containers(overlay) for mount in container["volumeMounts"]]
+    assert "token" not in mounts
+    (cluster,) = of_kind(overlay, "RayCluster")
+    if cluster["spec"].get("enableInTreeAutoscaling"):
+        options, head = cluster["spec"]["autoscalerOptions"], cluster["spec"]["headGroupSpec"]["template"]["spec"]
+        assert {"name": "token", "mountPath": TOKEN, "readOnly": True} in options["volumeMounts"]
+        assert options["securityContext"] == containers(overlay)[0]["securityContext"]
+        assert {mount["name"] for mount in options["volumeMounts"]} <= {volume["name"] for volume in head["volumes"]}
+        assert head["serviceAccountName"] == "sgsst-autoscaler"
+
+
+def policies_of(overlay: str) -> dict[str, dict[str, Any]]:
+    return {each["metadata"]["name"]: each["spec"] for each in of_kind(overlay, "NetworkPolicy")}
+
+
+def selected(overlay: str, policy: str) -> set[str]:
+    """Names of the pods that a policy is for."""
+    selector = policies_of(overlay)[policy]["podSelector"]
+    found = set()
+    for labels in (pod["metadata"]["labels"] for pod in pods(overlay)):
+        wanted = selector.get("matchLabels", {}).items() <= labels.items()
+        for each in selector.get("matchExpressions", ()):
+            assert each["operator"] == "In"
+            wanted = wanted and labels.get(each["key"]) in each["values"]
+        if wanted:
+            found.add(labels["app.kubernetes.io/name"])
+    return found
+
+
+@each_overlay
 def test_only_the_api_can_be_reached(overlay: str) -> None:
-    policies = {each["metadata"]["name"]: each["spec"] for each in of_kind(overlay, "NetworkPolicy")}
-    labels = [pod["metadata"]["labels"] for pod in pods(overlay)]
-
-    def selected(policy: str) -> set[str]:
-        wanted = policies[policy]["podSelector"]["matchLabels"].items()
-        return {found["app.kubernetes.io/name"] for found in labels if wanted <= found.items()}
-
-    everything = {found["app.kubernetes.io/name"] for found in labels}
-    assert selected("sgsst-nobody") == everything
-    assert "ingress" not in policies["sgsst-nobody"]
-    assert selected("sgsst-api") == {"sgsst-api"}
-    assert selected("sgsst-ray") == everything - {"sgsst-api", "sgsst-prepare"}
+    policies = policies_of(overlay)
+    everything = {pod["metadata"]["labels"]["app.kubernetes.io/name"] for pod in pods(overlay)}
+    assert selected(overlay, "sgsst-nobody") == everything
+    assert policies["sgsst-nobody"]["policyTypes"] == ["Ingress", "Egress"]
+    assert not {"ingress", "egress"} & policies["sgsst-nobody"].keys()
+    assert {name for name, policy in policies.items() if "ingress" in policy} == {"sgsst-api", "sgsst-ray"}
+    assert selected(overlay, "sgsst-api") == {"sgsst-api"}
+    assert selected(overlay, "sgsst-ray") == everything - {"sgsst-api", "sgsst-prepare"}
     (way,) = policies["sgsst-ray"]["ingress"]
     assert way["from"] == [{"podSelector": policies["sgsst-ray"]["podSelector"]}]
     assert policies["sgsst-api"]["ingress"] == [{"ports": [{"protocol": "TCP", "port": 8000}]}]
     for service in of_kind(overlay, "Service"):
         assert service["spec"].get("type", "ClusterIP") == "ClusterIP"
+
+
+@each_overlay
+def test_pods_reach_what_they_need_alone(overlay: str) -> None:
+    """Names, the database, the store, Ray's other pods; the API server of Kubernetes, if there is an autoscaler."""
+    policies = {name: spec for name, spec in policies_of(overlay).items() if "egress" in spec}
+    (cluster,) = of_kind(overlay, "RayCluster")
+    scales = bool(cluster["spec"].get("enableInTreeAutoscaling"))
+    expected = {
+        "sgsst-names": {53},
+        "sgsst-database": {5432},
+        "sgsst-store": {443},
+        "sgsst-ray": set(),
+        **({"sgsst-autoscaler": {443, 6443}} if scales else {}),
+    }
+    reached = {name: {port["port"] for port in spec["egress"][0].get("ports", ())} for name, spec in policies.items()}
+    assert reached == expected
+    assert policies["sgsst-ray"]["egress"] == [{"to": [{"podSelector": policies["sgsst-ray"]["podSelector"]}]}]
+    assert selected(overlay, "sgsst-database") == {"sgsst-prepare", "sgsst-api", "sgsst-dispatcher"}
+    assert selected(overlay, "sgsst-store") == selected(overlay, "sgsst-database") | {"sgsst-ray-worker"}
+    if scales:
+        assert selected(overlay, "sgsst-autoscaler") == {"sgsst-ray-head"}
+    for spec in policies.values():
+        (way,) = spec["egress"]
+        for block in (each["ipBlock"] for each in way["to"] if "ipBlock" in each):
+            credentials_of_the_cloud = "169.254.0.0/16" if "." in block["cidr"] else "fd00:ec2::/32"
+            assert credentials_of_the_cloud in block["except"]
+
+
+def test_webhooks_are_a_choice(tmp_path: Path) -> None:
+    """The component turns them on, and lets dispatchers reach every port of public addresses, and no private one."""
+    for overlay in OVERLAYS:
+        assert "SGSST_WEBHOOKS" not in rendered(overlay)
+    found = changed(tmp_path, lambda overlay: overlay["components"].append("../../components/webhooks"))
+    (settings,) = [each for each in found if each["kind"] == "ConfigMap"]
+    assert settings["data"]["SGSST_WEBHOOKS"] == "true"
+    (policy,) = [each for each in found if each["metadata"]["name"] == "sgsst-webhooks"]
+    assert policy["spec"]["podSelector"]["matchLabels"] == {"app.kubernetes.io/name": "sgsst-dispatcher"}
+    (way,) = policy["spec"]["egress"]
+    blocks = [each["ipBlock"] for each in way["to"]]
+    for address in ("10.1.2.3", "172.16.0.1", "192.168.1.1", "169.254.169.254", "127.0.0.1", "100.64.0.1", "fd00::1"):
+        assert not any(_holds(block, address) for block in blocks), address
+    for address in ("93.184.216.34", "2606:2800:220:1::1"):
+        assert any(_holds(block, address) for block in blocks), address
+    validate = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is missing: see the extra [dev]")
+    validate.validate(policy, validate.latest_version(), strict=True)
+
+
+def _holds(block: dict[str, Any], address: str) -> bool:
+    found = ip_address(address)
+    networks = [ip_network(block["cidr"]), *map(ip_network, block.get("except", ()))]
+    return found in networks[0] and not any(found in network for network in networks[1:])
+
+
+def test_images_can_be_named_by_their_digests(tmp_path: Path) -> None:
+    digest = "sha256:" + 64 * "a"
+
+    def pin(overlay: dict[str, Any]) -> None:
+        for image in overlay["images"]:
+            del image["newTag"]
+            image["digest"] = digest
+
+    found = changed(tmp_path, pin)
+    images = re.findall(r"image: (\S+)", yaml.safe_dump_all(found))
+    assert len(images) >= 8
+    assert {image.partition("@")[2] for image in images} == {digest}
+
+
+def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
+    """Objects of the overlay `gpu`, whose kustomization an operator has changed."""
+    shutil.copytree(FOLDER, folder / "kubernetes")
+    overlay = folder / "kubernetes" / "overlays" / "gpu"
+    kustomization = yaml.safe_load((overlay / "kustomization.yaml").read_text())
+    change(kustomization)
+    (overlay / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
+    return [found for found in yaml.safe_load_all(build(overlay)) if found]
 
 
 @each_overlay

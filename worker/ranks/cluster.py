@@ -1,7 +1,7 @@
 """Ray for the time of some jobs: one of its own on this machine, or a cluster that is there already.
 
-A Ray of its own answers only those who know its secret (it listens on every interface, whatever it is told), and leaves
-nothing behind: neither when it is closed nor when the process that started it is killed.
+A Ray of its own listens on loopback, requires a secret token, and leaves nothing behind: neither when it is closed nor
+when the process that started it is killed.
 """
 
 from __future__ import annotations
@@ -97,6 +97,9 @@ class Cluster:
     def _start(self) -> None:
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN"] = _SECRET
+        # Makes Ray bind all its ports to 127.0.0.1. Without it, Ray on Linux replaces that address by one that other
+        # machines can reach. Ray reads the variable when it is imported.
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # ranks are the work itself, not something beside it
         import ray

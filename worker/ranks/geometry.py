@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import pickle
 import socket
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -49,7 +48,7 @@ class _Shared:
     size: int
     layout: _Layout
     file: SceneFile  # without its arrays
-    harmonics: bytes | None  # those that stay in the file, pickled: ranks of other machines must not look for it
+    harmonics: tuple[Any, ...] | None  # arguments of those that stay in the file: other machines must not open it
 
 
 def read_shared_scene(
@@ -125,7 +124,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
             data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
             memory[offset : offset + data.nbytes] = data.data
     empty = Scene(*(torch.empty(0) for _ in fields(Scene)))
-    in_file = None if stored is None else pickle.dumps(stored)
+    in_file = None if stored is None else stored.arguments
     shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, kept=None), in_file)
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
 
@@ -141,7 +140,7 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
     kept = arrays.pop("kept", None)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     if shared.harmonics is not None:
-        tensors["sh_rest"] = pickle.loads(shared.harmonics)
+        tensors["sh_rest"] = StoredHarmonics(*shared.harmonics)
     return replace(shared.file, scene=Scene(**tensors), kept=kept)
 
 

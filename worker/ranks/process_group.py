@@ -1,5 +1,8 @@
 """The exchanges of `sgsst_core.parallel.collectives` over torch.distributed: NCCL between GPUs, gloo between CPUs.
 
+torch.distributed does not authenticate its peers. Ranks therefore listen on one interface only, which is loopback for a
+job of one machine, and never unpickle what they receive (see `messages`).
+
 Sums are made in an order that depends on the number of ranks and on the size of what is summed alone, so that a run can
 be repeated bit for bit, and every rank receives the same bits.
 """
@@ -12,18 +15,20 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import timedelta
+from ipaddress import ip_address
 from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 from torch.distributed.distributed_c10d import _set_pg_timeout
-from torch.distributed.rendezvous import rendezvous
 
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Merged, Traffic
 from sgsst_core.rasterizer import Rows
+from worker.processes import interface_towards, listen, split_address
+from worker.ranks.messages import decode, encode
 
 T = TypeVar("T")
 
@@ -43,6 +48,7 @@ def process_group(
     *,
     device: torch.device | str = "cpu",
     timeout: timedelta = DEFAULT_TIMEOUT,
+    listener: socket.socket | None = None,
 ) -> Iterator[Collectives]:
     """Join the process group of a job, and leave it at the end of the block.
 
@@ -52,12 +58,14 @@ def process_group(
         address: "host:port" at which rank 0 listens.
         device: that this rank computes on; tensors of all exchanges lie there.
         timeout: of each exchange, once `Collectives.set_timeout_for` was called.
+        listener: Socket that rank 0 listens on; None to open one at the address.
     """
     if size == 1:
         yield ALONE
         return
     patience = max(timeout, PREPARING)
-    device, store = _meet(rank, size, address, with_index(device), patience)
+    _stay_on_interface(address)
+    device, store = _meet(rank, size, address, with_index(device), patience, listener)
     if device.type == "cuda":
         torch.cuda.set_device(device)
     dist.init_process_group(
@@ -75,13 +83,37 @@ def process_group(
         dist.destroy_process_group()
 
 
-def _meet(rank: int, size: int, address: str, device: torch.device, timeout: timedelta) -> tuple[torch.device, Any]:
-    """The device that this rank's tensors lie on, and the ranks' store: GPUs where every rank has one, else the CPU.
+def _stay_on_interface(address: str) -> None:
+    """Restrict gloo and NCCL to the interface that leads to rank 0's "host:port".
 
-    Ranks tell each other before they form a group, because they must all form it for the same back ends.
+    Operators can choose another interface by the libraries' own variables, except for a job of one machine.
     """
-    store, *_ = next(rendezvous(f"tcp://{address}", rank, size, timeout=timeout))
-    store.set_timeout(timeout)
+    host, _ = split_address(address)
+    interface = interface_towards(host)
+    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+        if interface and (ip_address(host).is_loopback or name not in os.environ):
+            os.environ[name] = interface
+
+
+def _meet(
+    rank: int,
+    size: int,
+    address: str,
+    device: torch.device,
+    timeout: timedelta,
+    listener: socket.socket | None = None,
+) -> tuple[torch.device, Any]:
+    """Return the device that this rank's tensors lie on, and the ranks' store.
+
+    The device is a GPU if every rank has one, else the CPU. Ranks exchange this before they form a group, because all
+    of them must form it for the same back ends.
+    """
+    host, port = split_address(address)
+    # Without a socket of ours, the store listens on every interface.
+    descriptor = (listener or listen(host, port)).detach() if rank == 0 else None
+    store: Any = dist.TCPStore(  # type: ignore[attr-defined]  # public, but not listed
+        host, port, size, rank == 0, timeout, master_listen_fd=descriptor
+    )
     store.set(f"device/{rank}", device.type)
     types = {store.get(f"device/{other}") for other in range(size)}
     return (device if len(types) == 1 else torch.device("cpu")), store
@@ -243,21 +275,30 @@ class ProcessGroupCollectives:
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""
-        values: list[Any] = [None] * self.size
-        dist.all_gather_object(values, value, group=self._group)
-        return values
+        message = encode(value)
+        sizes = [torch.empty(1, dtype=torch.int64) for _ in range(self.size)]
+        dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
+        padded = message.new_zeros(int(max(sizes)))
+        padded[: len(message)] = message
+        messages = [torch.empty_like(padded) for _ in range(self.size)]
+        dist.all_gather(messages, padded, group=self._group)
+        return [decode(each[: int(size)]) for each, size in zip(messages, sizes, strict=True)]
 
     def broadcast(self, make: Callable[[], T]) -> T:
         """See `Collectives`."""
-        message: list[Any] = [None]
+        message = torch.empty(0, dtype=torch.uint8)
         if self.rank == 0:
             try:
-                message = [(make(), None)]
+                message = encode((make(), None))
             except SgsstError as error:
-                message = [(None, error)]
-        dist.broadcast_object_list(message, group=self._group, group_src=0, device=torch.device("cpu"))
+                message = encode((None, error))
+        size = torch.tensor([len(message)])
+        dist.broadcast(size, group=self._group, group_src=0)
+        if self.rank != 0:
+            message = message.new_empty(int(size))
+        dist.broadcast(message, group=self._group, group_src=0)
         value: T
-        value, problem = message[0]
+        value, problem = decode(message)
         if problem is not None:
             raise problem
         return value

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from sgsst_core.errors import InfrastructureError
-from worker.processes import ProcessId, die_with_parent, interface_towards
+from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
@@ -142,6 +142,7 @@ class RankProcess:
         self._status = RankStatus()
         self._stop = threading.Event()
         self._lock = threading.Lock()
+        self._listener: socket.socket | None = None
         die_with_parent()  # of Ray's daemon: a stopped process would not notice that it is gone
 
     def place(self) -> RankPlace:
@@ -152,11 +153,14 @@ class RankProcess:
         gpus = tuple(str(name) for name in ray.get_gpu_ids())
         return RankPlace(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this(), gpus)
 
-    def free_port(self) -> int:
-        """A port on which nobody listens."""
-        with socket.socket() as trial:
-            trial.bind(("", 0))
-            return int(trial.getsockname()[1])
+    def listen(self, host: str) -> int:
+        """Open the socket on which rank 0 accepts the other ranks, and return its port.
+
+        Args:
+            host: Address of this machine to bind it to.
+        """
+        self._listener = listen(host)
+        return int(self._listener.getsockname()[1])
 
     def start(self, task: RankTask) -> None:
         """Begin."""
@@ -206,7 +210,9 @@ class RankProcess:
         torch.set_num_threads(task.threads)
         device = torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else "cpu"
         timeout = timedelta(seconds=task.timeout + _PATIENCE)
-        with process_group(task.rank, task.size, task.address, device=device, timeout=timeout) as collectives:
+        with process_group(
+            task.rank, task.size, task.address, device=device, timeout=timeout, listener=self._listener
+        ) as collectives:
             # The outcome is told inside the block: leaving the group may have to wait for ranks that are lost.
             try:
                 result = self._job(task, collectives)
@@ -271,16 +277,12 @@ class RankProcess:
 
 
 def _set_environment(task: RankTask) -> None:
-    """Threads, GPU, network and folder, before anything is imported that looks at them."""
+    """Set threads and GPU before anything is imported that reads them."""
     set_thread_variables(task.threads)
     import ray
 
     # A process that was given no GPU would see all of them.
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
-    interface = interface_towards(task.address.rpartition(":")[0].strip("[]"))
-    if interface:
-        for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
-            os.environ.setdefault(name, interface)
 
 
 def _enter_folder(task: RankTask) -> None:

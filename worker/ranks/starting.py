@@ -71,12 +71,12 @@ def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
 
 
 def _address(handles: list[RankHandle]) -> str:
-    """The "host:port" at which rank 0 will listen."""
+    """Make rank 0 listen, and return its "host:port"."""
     import ray
 
     alone = len({_place(rank).node for rank in handles}) == 1
     host = "127.0.0.1" if alone else _place(handles[0]).address
-    return f"{host}:{ray.get(handles[0].actor.free_port.remote(), timeout=START_SECONDS)}"
+    return f"{host}:{ray.get(handles[0].actor.listen.remote(host), timeout=START_SECONDS)}"
 
 
 def _place(rank: RankHandle) -> RankPlace:

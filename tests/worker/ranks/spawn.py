@@ -21,14 +21,19 @@ MOST_RANKS = 4
 
 
 def on_ranks(
-    size: int, function: Callable[..., Any], *arguments: Any, timeout: float = 60.0, device: str = "cpu"
+    size: int,
+    function: Callable[..., Any],
+    *arguments: Any,
+    timeout: float = 60.0,
+    device: str = "cpu",
+    host: str = "127.0.0.1",
 ) -> list[Any]:
     """What function(collectives, *arguments) returns on each rank; its first error is raised here.
 
     The function and its arguments must be picklable. Ranks give each other up after `timeout` seconds. On the device
-    "cuda" each rank has a pretend GPU.
+    "cuda" each rank has a pretend GPU. They meet at `host`.
     """
-    address = f"127.0.0.1:{free_port()}"
+    address = f"{host}:{free_port()}"
     futures = [_pool().submit(_run, rank, size, address, timeout, device, function, arguments) for rank in range(size)]
     return [_result(future) for future in futures]
 

@@ -1,0 +1,70 @@
+"""Write the packages of the images to deploy/requirements, with the digests of their files: pip installs no other file.
+
+Versions are those of constraints.txt. After a change of those, or of the dependencies, run this with uv
+(`pip install uv`):
+
+    python deploy/lock.py torch-2.13.0+cpu-cp311-cp311-manylinux_2_28_x86_64.whl
+
+The wheel of PyTorch without CUDA comes from https://download.pytorch.org/whl/cpu/torch/, because PyPI has none.
+
+`build.txt` has what builds the project, `common.txt` what both images need, `cpu.txt` and `cuda.txt` what one needs
+beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "deploy" / "requirements"
+#: Python of the images.
+PYTHON = "3.11"
+HEAD = "# Written by deploy/lock.py.\n"
+#: In constraints.txt, the line above the packages that only PyTorch with CUDA needs.
+CUDA_SECTION = "# What PyTorch's CUDA build for Linux adds."
+
+
+def main(wheels: list[Path]) -> None:
+    """Write all files.
+
+    Args:
+        wheels: PyTorch without CUDA, one for each kind of processor that images are built for.
+    """
+    pinned = _compile(str(ROOT / "pyproject.toml"), "--extra", "postgresql", "--extra", "s3")
+    cuda = {name for name in pinned if name in cuda_packages() or name == "torch"}
+    _write("common", {name: text for name, text in pinned.items() if name not in cuda})
+    _write("cuda", {name: pinned[name] for name in cuda})
+    (version,) = {wheel.name.split("-")[1] for wheel in wheels}
+    digests = [f"--hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}" for wheel in wheels]
+    _write("cpu", {"torch": " \\\n    ".join([f"torch=={version}", *digests]) + "\n"})
+    _write("build", _compile("-", given="setuptools\n"))
+
+
+def cuda_packages() -> set[str]:
+    """Return the names of the packages that PyTorch with CUDA adds."""
+    _, _, after = (ROOT / "constraints.txt").read_text().partition(CUDA_SECTION)
+    section, _, _ = after.strip().partition("\n\n")
+    return {line.partition("==")[0] for line in section.splitlines()}
+
+
+def _compile(source: str, *options: str, given: str | None = None) -> dict[str, str]:
+    """Return each package that is needed, by name, with the digests of its files."""
+    command = ["uv", "pip", "compile", source, *options, "--quiet", "--no-header", "--no-annotate"]
+    command += ["--constraint", str(ROOT / "constraints.txt"), "--generate-hashes"]
+    command += ["--python-version", PYTHON, "--python-platform", "x86_64-manylinux_2_28"]
+    text = subprocess.run(command, check=True, input=given, capture_output=True, text=True).stdout
+    packages = re.findall(r"^\S.*\n(?:\s.*\n)*", text, flags=re.MULTILINE)
+    return {package.partition("==")[0]: package for package in packages}
+
+
+def _write(name: str, packages: dict[str, str]) -> None:
+    FOLDER.mkdir(exist_ok=True)
+    (FOLDER / f"{name}.txt").write_text(HEAD + "".join(packages[each] for each in sorted(packages)))
+
+
+if __name__ == "__main__":
+    main([Path(word) for word in sys.argv[1:]])

@@ -1,0 +1,69 @@
+"""Write the passwords of the composed services into their volumes: each is generated at the first start, and kept.
+
+A password that the environment names is taken instead, also later. Runs as root in a container of its own, before all
+others (`secrets` in compose.yaml); every service mounts only what it needs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import sys
+from pathlib import Path
+
+#: User of the service's processes: libpq reads a password file only if nobody else can.
+SERVICE_USER = 10001
+HOST, USER = "database", "sgsst"
+
+
+def make_secrets(folder: Path, given: dict[str, str]) -> None:
+    """Write all files below a folder.
+
+    Args:
+        given: Environment; an empty or missing variable has a password generated.
+    """
+    password = _secret(folder / "database" / "password", given.get("SGSST_DATABASE_PASSWORD"))
+    escaped = password.replace("\\", "\\\\").replace(":", "\\:")
+    _write(folder / "database" / "pgpass", f"{HOST}:*:*:{USER}:{escaped}\n", private=True)
+
+    key = _secret(folder / "store" / "key", given.get("SGSST_STORE_KEY"))
+    secret = _secret(folder / "store" / "secret", given.get("SGSST_STORE_SECRET"))
+    _write(
+        folder / "store" / "credentials",
+        f"[default]\naws_access_key_id = {key}\naws_secret_access_key = {secret}\n",
+        private=True,
+    )
+    identity = {"name": USER, "credentials": [{"accessKey": key, "secretKey": secret}], "actions": ["Admin"]}
+    _write(folder / "store" / "s3.json", json.dumps({"identities": [identity]}))
+
+    _secret(folder / "grafana" / "password", given.get("SGSST_GRAFANA_PASSWORD"))
+
+
+def _secret(path: Path, given: str | None) -> str:
+    """Return the secret that is given, the one that a file holds, or a new one; the file holds it afterwards."""
+    secret = given or (path.read_text() if path.exists() else secrets.token_hex(32))
+    _write(path, secret)
+    return secret
+
+
+def _write(path: Path, text: str, *, private: bool = False) -> None:
+    """Write a file whole or not at all; a private one can be read by the service alone.
+
+    The other services run as users of their own images: what shields their files is who mounts the volume.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.unlink(missing_ok=True)
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(text)
+        if private:
+            os.fchown(descriptor, SERVICE_USER, SERVICE_USER)
+        else:
+            os.fchmod(descriptor, 0o444)
+    temporary.replace(path)
+
+
+if __name__ == "__main__":
+    make_secrets(Path(sys.argv[1]), dict(os.environ))

@@ -1,0 +1,121 @@
+"""Messages between ranks: values are restored bit by bit, and hostile messages are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from sgsst_core.errors import SceneError
+from sgsst_core.loss.terms import LossTerms
+from sgsst_core.planning.plan import Decision, Prediction
+from sgsst_core.scene.camera import Camera
+from worker.ranks.messages import decode, encode
+from worker.request import Outputs
+
+VALUES = [
+    None,
+    True,
+    -(2**70),
+    "",
+    "line\n\udcff \u2028",  # a file name that is not UTF-8 has such characters
+    0.1 + 0.2,
+    5e-324,
+    -0.0,
+    math.inf,
+    b"ply\r\n\x00\xff",
+    [1, (2, [3]), ()],
+    {3: "three", "4": 4, (5, 6): {"tuple": [1]}},
+    Path("inputs/scene.ply"),
+    LossTerms(gram=1 / 3, content=2.0),
+    Decision("ranks", "2", "measured", seconds=0.1),
+    Outputs(Path("out/s.ply")),
+    Prediction(1.0, 2.0, 3),
+]
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
+def test_values_come_out_as_they_went_in(value: Any) -> None:
+    found = decode(encode(value))
+    assert found == value
+    assert repr(found) == repr(value)  # tells -0.0 from 0.0, a tuple from a list, and True from 1
+
+
+def test_not_a_number_stays_one() -> None:
+    assert math.isnan(decode(encode(math.nan)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.int64, torch.uint8, torch.bool])
+@pytest.mark.parametrize("shape", [(), (0, 3), (5, 3)])
+def test_tensors_keep_their_bits(dtype: torch.dtype, shape: tuple[int, ...]) -> None:
+    tensor = (torch.randn(shape, generator=torch.Generator().manual_seed(0)) * 100).to(dtype)
+    found = decode(encode({"tensor": tensor, "part": tensor.expand(2, *shape)}))
+    for name, expected in (("tensor", tensor), ("part", tensor.expand(2, *shape))):
+        assert found[name].dtype == dtype
+        assert found[name].shape == expected.shape
+        assert torch.equal(found[name], expected)
+
+
+def test_arrays_and_dataclasses_of_tensors() -> None:
+    camera = Camera("a.jpg", 8, 6, 5.0, 5.0, 4.0, 3.0, torch.eye(4, dtype=torch.float64))
+    found, kept = decode(encode((camera, np.array([True, False]))))
+    assert isinstance(found, Camera)
+    assert torch.equal(found.world_to_camera, camera.world_to_camera)
+    assert kept.dtype == np.bool_
+    assert kept.tolist() == [True, False]
+
+
+def test_errors_keep_their_type() -> None:
+    found = decode(encode(SceneError("scene.ply: is empty.")))
+    assert type(found) is SceneError
+    assert found.args == ("scene.ply: is empty.",)
+
+
+@pytest.mark.parametrize("value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=repr)
+def test_what_no_message_can_hold_is_refused(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"A message between ranks cannot hold a|is not a class of"):
+        encode(value)
+
+
+def message(value: Any) -> Tensor:
+    """Any JSON as a message."""
+    text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+    return torch.frombuffer(bytearray(save({"json": text})), dtype=torch.uint8)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"error": ["builtins:eval", ["1"]]},
+        {"error": ["os:system", ["true"]]},
+        {"error": ["sgsst_core.scene.camera:Camera", []]},
+        {"error": ["worker.ranks.messages:import_module", ["antigravity"]]},
+        {"error": ["worker.processes:kill", [[]]]},
+        {"object": ["pathlib:Path", {}]},
+        {"object": ["worker.ranks.rank:RankProcess", {}]},
+        {"object": ["sgsst_core.planning.plan:Decision", {"__class__": 1}]},
+        {"object": ["sgsst_core.planning.plan:Decision.__init__", {}]},
+        {"call": ["os.system", "true"]},
+        {"tensor": ["7", "cpu"]},
+        {"tuple": [], "list": []},
+        {},
+    ],
+    ids=str,
+)
+def test_a_message_names_nothing_else(value: Any) -> None:
+    with pytest.raises(ValueError, match="not a message of this program"):
+        decode(message(value))
+
+
+@pytest.mark.parametrize("data", [b"", b"\x80\x05N.", struct.pack("<Q", 2**60) + b"{}", b"\x00" * 64])
+def test_bytes_that_are_no_message(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a message of this program"):
+        decode(torch.tensor(list(data), dtype=torch.uint8))

@@ -1,0 +1,115 @@
+"""Sockets of a job on several ranks: on one machine, other machines can reach none of them."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from ipaddress import IPv6Address, ip_address
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import torch
+import torch.distributed as dist
+
+from sgsst_core.parallel.collectives import Collectives
+from tests.worker.ranks.faults import small_request
+from tests.worker.ranks.spawn import on_ranks
+from tests.worker.ranks.test_attempts import command, start
+
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a process's sockets are read in Linux's /proc"),
+]
+
+
+def listening(process: psutil.Process) -> list[str]:
+    """Addresses on which a process accepts connections or datagrams."""
+    found = []
+    for socket in process.net_connections("inet"):
+        if socket.status == psutil.CONN_LISTEN or (socket.type.name == "SOCK_DGRAM" and not socket.raddr):
+            address = ip_address(socket.laddr.ip)
+            mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
+            found.append(str(mapped or address))
+    return found
+
+
+@pytest.mark.slow
+def test_a_job_of_one_machine_listens_on_loopback_only(tmp_path: Path, tiny_installed: Path) -> None:
+    process = start(command(small_request(tmp_path, 400)))
+    try:
+        driver = psutil.Process(process.pid)
+        family = [driver, *driver.children(recursive=True)]
+        sockets = {f"{each.name()} {each.pid}": listening(each) for each in family}
+    finally:
+        process.terminate()
+        process.communicate(timeout=120)
+    ranks = [found for name, found in sockets.items() if "RankProcess" in name]
+    assert [len(found) >= 2 for found in ranks] == [True, True], f"ranks without sockets of their group: {sockets}"
+    for daemon in ("raylet", "gcs_server"):
+        assert any(daemon in name and found for name, found in sockets.items()), sockets
+    elsewhere = {name: found for name, found in sockets.items() if not all(map(_is_loopback, found))}
+    assert elsewhere == {}
+
+
+def _is_loopback(address: str) -> bool:
+    return ip_address(address).is_loopback
+
+
+def own_sockets(collectives: Collectives) -> list[str]:
+    """Addresses that a rank listens on while it is in its group."""
+    collectives.all_gather(None)
+    return listening(psutil.Process())
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
+def test_ranks_listen_on_the_address_of_their_job_alone(host: str) -> None:
+    """127.0.0.2 is that of a cluster's interface here."""
+    first, second = on_ranks(2, own_sockets, host=host)
+    assert host in first, "the ranks' store"
+    assert {"127.0.0.1", host} >= {*first, *second}
+
+
+class Evil:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.path),)
+
+
+def send_raw(data: bytes, *, broadcast: bool) -> None:
+    """Send bytes in the place of a message: their number, then they themselves, as long as the longest message is."""
+    size, message = torch.tensor([len(data)]), torch.frombuffer(bytearray(data), dtype=torch.uint8)
+    if broadcast:
+        dist.broadcast(size, 0)
+        dist.broadcast(message, 0)
+        return
+    sizes = [torch.empty_like(size) for _ in range(2)]
+    dist.all_gather(sizes, size)
+    padded = torch.zeros(int(max(sizes)), dtype=torch.uint8)
+    padded[: len(data)] = message
+    dist.all_gather([torch.empty_like(padded) for _ in range(2)], padded)
+
+
+def receive(collectives: Collectives, path: Path, broadcast: bool) -> str:
+    """Error of the rank that receives a pickle from the other one."""
+    if collectives.rank == (0 if broadcast else 1):
+        send_raw(pickle.dumps(Evil(path)), broadcast=broadcast)
+        return ""
+    try:
+        collectives.broadcast(lambda: None) if broadcast else collectives.all_gather(None)
+    except Exception as error:
+        return str(error)
+    return "nothing was raised"
+
+
+@pytest.mark.parametrize("broadcast", [False, True], ids=["all_gather", "broadcast"])
+def test_a_pickle_from_another_rank_is_not_opened(tmp_path: Path, broadcast: bool) -> None:
+    answers = on_ranks(2, receive, tmp_path / "made", broadcast)
+    assert not (tmp_path / "made").exists()
+    assert "not a message of this program" in answers[1 if broadcast else 0]
