@@ -1,4 +1,4 @@
-"""A PostgreSQL server for tests and benchmarks, where its programs are installed."""
+"""PostgreSQL server for tests and benchmarks, if PostgreSQL is installed."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from sqlalchemy import create_engine, text
 
 
 def is_installed() -> bool:
-    """Whether its programs are there."""
+    """Return whether the programs of PostgreSQL are installed."""
     return _programs() is not None
 
 
 @contextmanager
 def server(*, durable: bool = False) -> Iterator[str]:
-    """The URL of a server that ends with the block, without the name of a database.
+    """Run a server within the block. Yields its URL without a database name.
 
     Args:
-        durable: commits are on the disk before they are answered, as they should be where time is measured.
+        durable: Whether commits are on disk before they are acknowledged, as is needed for realistic timing.
     """
     programs = _programs()
     assert programs is not None
     folder = Path(tempfile.mkdtemp(prefix="sgsst-pg-"))
     user: dict[str, Any] = {}
-    if os.geteuid() == 0:  # it refuses to run as root
+    if os.geteuid() == 0:  # PostgreSQL refuses to run as root
         shutil.chown(folder, "postgres")
         user = {"user": "postgres", "group": "postgres", "extra_groups": []}
     with socket.socket() as probe:
@@ -50,7 +50,7 @@ def server(*, durable: bool = False) -> Iterator[str]:
 
 
 def fresh_database(url: str) -> str:
-    """The URL of an empty database on a server."""
+    """Create an empty database on a server and return its URL."""
     name = f"t{os.urandom(6).hex()}"
     engine = create_engine(f"{url}/postgres", isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:

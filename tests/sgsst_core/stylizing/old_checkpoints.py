@@ -1,4 +1,4 @@
-"""Checkpoints of a version before, made of present ones."""
+"""Checkpoints of earlier format versions, made from present ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sgsst_core.stylizing.checkpoint import _digest
 
 
 def of_version_4(path: Path) -> None:
-    """Rewrite a checkpoint as version 4 of its format had it: without the memory of a GPU."""
+    """Rewrite a checkpoint in version 4 of the format, without GPU memory."""
     metadata, tensors = _parts(path)
     history, plan = json.loads(metadata["history"]), json.loads(metadata["plan"])
     for record in history:
@@ -24,7 +24,7 @@ def of_version_4(path: Path) -> None:
 
 
 def of_version_3(path: Path, decision: str | None = None) -> None:
-    """Rewrite a checkpoint as version 3 of its format had it: without what a plan did not say then."""
+    """Rewrite a checkpoint in version 3 of the format, without the fields that plans lacked then."""
     of_version_4(path)
     metadata, tensors = _parts(path)
     plan = json.loads(metadata["plan"])
@@ -37,7 +37,7 @@ def of_version_3(path: Path, decision: str | None = None) -> None:
 
 
 def _parts(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata without the digest, and tensors."""
+    """Return metadata without the digest, and tensors."""
     with safe_open(path, "pt") as file:
         metadata = file.metadata()
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
