@@ -6,10 +6,10 @@ There are ten hosts made of namespaces (`benchmarks.cluster_hosts`), each with i
 for the API, two for dispatchers, one for Ray's head, three Ray nodes that compute, PostgreSQL, and S3 (moto's server).
 Services that end are restarted, and a killed host returns with an empty disk, as in a real cluster.
 
-Counted are accepted jobs that do not succeed (lost), jobs published twice, and results that differ from those of `sgsst
-stylize` on one rank (bit by bit for jobs on one rank, by color for jobs on two). Also counted are files left behind,
-reads that no API process answered while the database was up, and for each kind of fault the seconds until a job makes
-steps again.
+The benchmark counts accepted jobs that do not succeed (lost), jobs published twice, and results that differ from those
+of `sgsst stylize` on one rank (bit by bit for jobs on one rank, by color for jobs on two). It also counts files left
+behind and reads that no API process answered while the database was up, and measures for each kind of fault the seconds
+until a job makes steps again.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ class Run:
     # --- through the API -------------------------------------------------------------------------------------------
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request to any API process that answers, again and again while none does."""
+        """Send a request to any API process that answers, retrying while none does."""
         deadline = time.monotonic() + PATIENCE
         while True:
             for url in self.cluster.urls:

@@ -52,7 +52,7 @@ class DaemonFault:
 
 
 def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
-    """Yield random faults, with each place in turn."""
+    """Yield random faults that cycle through all places in the code where one can happen."""
     for number, place in enumerate(itertools.cycle(get_args(Place))):
         if number % 10 < DAEMONS:
             yield DaemonFault(chance.choice(["raylet", "gcs_server"]), chance.randint(3, 12))

@@ -53,7 +53,7 @@ def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience
 
 
 def _stored() -> dict[str, Any]:
-    """Return the stored results of earlier runs, without the machine, which is described again."""
+    """Return the results of earlier runs, without their machine, which every run describes itself."""
     path = RESULTS / "fleet.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return {name: known[name] for name in ("simulated", "database") if name in known}

@@ -2,10 +2,10 @@
 
 python -m benchmarks.service_kills [--kills 100] [--rank-kills 6] [--seed 0]
 
-`sgsst serve` runs with its defaults except for `SETTINGS`. Counted are accepted jobs that do not succeed (lost),
-results that are reported or stored twice (published twice), and PLY files that are not bit-identical to that of `sgsst
-stylize` with the same seed (different). A job on two ranks adds in another order, so its colors are compared with one
-rank's instead.
+`sgsst serve` runs with its defaults except for `SETTINGS`. The benchmark counts accepted jobs that do not succeed
+(lost), results that are reported or stored twice (published twice), and PLY files that are not bit-identical to that of
+`sgsst stylize` with the same seed (different). A job on two ranks adds in another order, so its colors are compared
+with one rank's instead.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Run:
     everything_back: list[float] = field(default_factory=list)
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request, again and again while the API is down."""
+        """Send a request, retrying while the API is down."""
         deadline = time.monotonic() + _PATIENCE
         while True:
             try:

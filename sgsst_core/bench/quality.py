@@ -68,7 +68,7 @@ class Outcome:
     seconds: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the values as JSON-serializable ones, without the colors."""
+        """Return the fields except the colors as JSON-serializable values."""
         ranges = {"short": self.short, "long": self.long}
         return {
             "name": self.name,

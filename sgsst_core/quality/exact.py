@@ -1,7 +1,7 @@
-"""Exact loss and gradient of a job, without its approximations, to measure these against.
+"""Exact loss and gradient of a job, as the reference for measuring its approximations.
 
 Features are float32, every Gaussian with any blend weight in a view counts, and blend weights are recomputed at each
-use. float32 itself is within 1e-6 of the float64 reference (tests/sgsst_core/test_sos.py).
+use. float32 itself is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def uncached_rasterizer(stylizer: Stylizer) -> Rasterizer:
 
 
 def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
-    """Make a rasterizer of another scene with the job's settings, which caches in the memory that the job leaves."""
+    """Make a rasterizer of another scene with the job's settings, whose cache fits beside the job's in memory."""
     settings, job = stylizer.settings, uncached_rasterizer(stylizer)
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.uncached:
@@ -153,7 +153,7 @@ class ExactTwin(ExactLoss):
         """Compute dE/dsh_dc [N, 3] for colors [N, 3] of the whole scene.
 
         Returns:
-            The gradient, and the seconds that it took, without those for the view's targets.
+            The gradient, and the seconds it took, not counting the view's targets.
         """
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
         gradient = torch.zeros_like(sh_dc)

@@ -466,5 +466,5 @@ def _large_coefficients(values: Tensor | StoredHarmonics) -> _Look:
 
 
 def _parts(count: int) -> list[slice]:
-    """Return slices of `count` rows."""
+    """Split `count` rows into slices."""
     return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]

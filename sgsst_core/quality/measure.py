@@ -68,7 +68,7 @@ class Measurements:
 
     @property
     def moments(self) -> list[int]:
-        """Steps after which the job is measured; empty if measurements may take no time."""
+        """Steps after which the job is measured; empty if measuring is off."""
         stylizer = self._stylizer
         return self.level.moments(stylizer.total) if stylizer.settings.measure else []
 

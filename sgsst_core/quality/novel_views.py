@@ -214,7 +214,7 @@ class NovelViews:
     def _choose(
         self, parents: list[tuple[Camera, Camera]], most: int
     ) -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
-        """Choose the views and pairs to measure, evenly spread; views from inside something are dropped."""
+        """Choose the views and pairs to measure, evenly spread; views from inside an object are dropped."""
         count = len(self.cameras)
         pairs = {gap: view_pairs(count, gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
         # Views start with the first ones of the short pairs: these are rendered anyway and spread just as evenly.
@@ -242,7 +242,7 @@ class NovelViews:
     def _is_clear(
         self, camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], tuple[float, float | None]]
     ) -> bool:
-        """Return whether a novel camera sees about what its neighbors see, not the inside of something."""
+        """Return whether a novel camera sees much the same as its neighbors, not the inside of an object."""
         (covered, depth), *others = (outlook(view) for view in (camera, *parents))
         return (
             covered > 0

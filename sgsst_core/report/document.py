@@ -65,7 +65,8 @@ def build_report(
         stylizer: Job after its last step.
         sources: Origin of the job's inputs.
         stopped: Return value of `run`.
-        before, after: Loss of the unstylized and the stylized scene on the stylizer's `evaluation_views`.
+        before: Loss of the unstylized scene on the stylizer's `evaluation_views`.
+        after: Loss of the stylized scene on the same views.
         findings: Findings about scene, views and style.
     """
     return {
@@ -176,7 +177,7 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
 
 
 def _refined_json(plan: Plan) -> dict[str, Any] | None:
-    """Return how Gaussians were split, with the effect on unstylized renders; None without --refine."""
+    """Return how Gaussians were split, with the effect on unstylized renders; None if refinement was not requested."""
     made = plan.refinement
     if made is None:
         return None
@@ -231,7 +232,7 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
 
     The extra seconds are a mean over first visits. If the phase has other first visits, the job's first step is
     skipped, because it prepares the style too. If no view recurs, or a step takes several views (its record names only
-    one), the first value is the median without known preparation, and the second is None.
+    one), the first value is the median over all steps, not counting their recorded preparation, and the second is None.
     """
     again: list[float] = []
     first: list[float] = []

@@ -70,7 +70,7 @@ class Case:
         name: Description of what is extreme.
         group: Part of the method under stress.
         measure: Definition of the error.
-        run: Function that runs the measurement: True for full size, False for a version that takes at most seconds.
+        run: Function that runs the measurement, in full size if its argument is true, or else within a few seconds.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Measurement:
 
 
 def measure(case: Case, *, full: bool = False) -> Measurement:
-    """Run a case, in full size or in a version that takes at most seconds."""
+    """Run a case, in full size or in a version that takes a few seconds at most."""
     peak, started = _peak_memory(), time.perf_counter()
     result = case.run(full)
     return Measurement(result, time.perf_counter() - started, _peak_memory() - peak)

@@ -1,4 +1,4 @@
-"""Whole jobs that are small enough to run hundreds of them, to test combinations of scene, style and settings.
+"""Whole jobs so small that hundreds of them can be run, to test combinations of scene, style and settings.
 
 The cases and the random search (`benchmarks.stability_search`) apply the same bounds: finite colors, steps no longer
 than Adam's, bit-identical repetition, a loss that does not rise, and loss and gradient of the last image as in float64.
@@ -257,7 +257,10 @@ def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> fl
 
 
 def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, content: Tensor) -> bool:
-    """Return whether rounding of the features by delta, (d + delta)^2, explains the content term."""
+    """Return whether rounding errors of the features explain the content term.
+
+    With differences d that are off by delta, the term is the mean of (d + delta)^2.
+    """
     most = 2 * job.settings.content_weight * _feature_rounding(job, content) ** 2
     return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in found.terms.items())
 
