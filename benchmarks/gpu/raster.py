@@ -57,7 +57,7 @@ def _passes(rasterizer: Rasterizer, camera: Camera, place: str, repeats: int, fo
 
 def _operands(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(2)
-    scene: Scene = rasterizer.scene  # every rasterizer has a scene
+    scene: Scene = rasterizer.scene  # type: ignore[attr-defined]  # every rasterizer has a scene
     colors = torch.rand((len(scene), 3), generator=generator)
     pixels = torch.randn((camera.height, camera.width, 3), generator=generator)
     return colors.to(rasterizer.device), pixels.to(rasterizer.device)
